@@ -72,12 +72,12 @@ KERNELS = {
     "hypotheses": ("tails_of_hypotheses",),
     "level": ("solve_level",),
     "model": ("linearised", "residuals"),
-    "off_tangent": ("clear_of_sections", "risk_beyond", "risk_off_tangent"),
+    "off_tangent": ("forms_of_hypotheses", "risk_beyond", "risk_off_tangent"),
     "ranges": ("reduced_equations", "misfits", "iterated_points", "dilutions", "iterated_along"),
     "reading": ("decoded_fields", "placed_fields", "line_ends"),
     "robust": ("reweighted",),
-    "screens": ("suspicions", "clock_medians"),
-    "search": ("radii_of_balls", "points_in_balls", "best_points"),
+    "screens": ("suspicions", "clock_medians", "falls_of_cn0", "clock_steps", "holds"),
+    "search": ("radii_of_balls", "points_in_balls", "best_points", "clear_of_sections"),
     "windows": ("window_ages", "decayed_sums"),
 }
 NAMES = [(module, name) for module, names in KERNELS.items() for name in names]

@@ -24,7 +24,6 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.protection.level import Asked, Errors
-from railfix.integrity.protection.open_places import one_after_the_other
 from railfix.integrity.raim.model import LinearModel, ModelArrays, compact
 from railfix.positioning.normal_equations import inverse_3x3
 
@@ -32,6 +31,26 @@ from railfix.positioning.normal_equations import inverse_3x3
 NO_EFFECT: Final = 1e-6
 #: Separations below this share of sigma are none.
 _SAME: Final = 1e-9
+
+
+def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats, Masks]:
+    """Leave out a group of channels, each from what those before it leave.
+
+    `columns`, shape (T, n, n + c): projector of the residuals, and what changes alike. Returns the row of each member
+    and that over its part of the projector, shapes (T, m, n + c), 0 where nothing checks it, and which are checked.
+    Without the group the columns are less by ``rows[..., :n]^T scaled``.
+    """
+    at = np.arange(len(columns))
+    place = np.argsort(~members, axis=1, kind="stable")[:, : int(members.sum(axis=1).max(initial=0))]
+    rows = columns[at[:, None], place] * members[at[:, None], place][..., None]
+    scaled, checked = np.empty_like(rows), np.empty(place.shape, dtype=bool)
+    for k in range(place.shape[1]):
+        row, later = rows[:, k], rows[:, k + 1 :]
+        share = row[at, place[:, k]]
+        checked[:, k] = share > LEAST_REDUNDANCY
+        scaled[:, k] = row / np.where(checked[:, k], share, np.inf)[:, None]
+        later -= np.take_along_axis(later, place[:, None, k, None], axis=2) * scaled[:, k, None]
+    return rows, scaled, checked
 
 
 @dataclass(frozen=True)

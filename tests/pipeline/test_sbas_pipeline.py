@@ -20,7 +20,6 @@ from railfix.core.reasons import Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
-from railfix.integrity.raim import constrained_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config, parse_config
@@ -28,7 +27,7 @@ from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
 from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.results import State
-from railfix.pipeline.solve import fault_free, place_on_line
+from railfix.pipeline.solve import fault_free, line_model, place_on_line
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import single_point
@@ -170,12 +169,10 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     ranges = one.ranges()
     point = single_point(ranges, one.anchor_ecef_m)
     place = place_on_line(ranges, index, point, config)
-    scale = np.ones(len(ranges))
+    scale, model_on_line = np.ones(len(ranges)), line_model(ranges, antennas, place.constrained)
     ranges, place, raim = fault_free(
-        ranges, antennas, place, scale, ranges.weight > 0, config.model_copy(update={"screens": ()})
+        ranges, antennas, place, model_on_line, scale, ranges.weight > 0, config.model_copy(update={"screens": ()})
     )
-    section = np.maximum(place.constrained.section, 0)
-    model_on_line = constrained_model(ranges, index.trajectory, place.constrained.arc_m, section=section)
     nothing = (np.zeros(len(ranges)), np.zeros(len(ranges)))
     offset = cast("MapOffset", SimpleNamespace(beyond_m=nothing, seen=None))
 

@@ -1,4 +1,4 @@
-"""Distance to parts of a line off a tangent, risk there."""
+"""Risk of places of a line off its tangent."""
 
 from __future__ import annotations
 
@@ -8,61 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.core.constants import ALONG, CLEAR_M, FAN_OUT, LEAST_REDUNDANCY, ON_TANGENT_M
+from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.kernels.compiling import inner, kernel
-from railfix.kernels.search import points_within
-
-
-@kernel
-def clear_of_sections(
-    ecef_m: Floats,
-    tangent: Floats,
-    across: Floats,
-    length_m: Floats,
-    stretches: tuple[Indices, Floats, Indices],
-    section: Indices,
-) -> Floats:
-    """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
-
-    Parameters
-    ----------
-    ecef_m, tangent, across, length_m : ndarray
-        Of the line: points (P, 3), the others of its sections.
-    stretches
-        `SearchIndex.stretches`.
-    section : ndarray of int, shape (S,)
-    """
-    clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
-    nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)
-    middle = np.empty(3)
-    for s in range(len(section)):
-        here, length = section[s], length_m[section[s]]
-        for a in range(3):
-            middle[a] = ecef_m[here, a] + 0.5 * length * tangent[here, a]
-        reach = CLEAR_M + 0.5 * length + longest
-        centre = middle[0], middle[1], middle[2]
-        nodes, below, held = points_within(ecef_m, stretches, centre, reach, nodes, below)
-        for at in range(held):
-            v = nodes[at]
-            if v >= sections or v == here:
-                continue
-            off, nearest, low, high = False, np.inf, np.inf, -np.inf
-            for end in (v, v + 1):
-                ahead, aside, square = 0.0, 0.0, 0.0
-                for a in range(3):
-                    away = ecef_m[end, a] - ecef_m[here, a]
-                    ahead += away * tangent[here, a]
-                    aside += away * across[here, a]
-                for a in range(3):
-                    square += (ecef_m[end, a] - ecef_m[here, a] - ahead * tangent[here, a]) ** 2
-                beside, least = math.sqrt(square), max(max(ahead - length, -ahead), 0.0)
-                nearest = min(nearest, math.sqrt(least * least + aside * aside))
-                off |= least < ALONG * math.sqrt(least * least + square) and beside > ON_TANGENT_M
-                low, high = min(low, ahead), max(high, ahead)
-            if off or min(high, length) - max(low, 0.0) > ON_TANGENT_M:
-                clear[s] = min(clear[s], nearest - length_m[v])
-        clear[s] = max(clear[s], 0.0)
-    return clear
 
 
 @inner
@@ -93,21 +40,35 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
 
 
 @inner
-def _tail_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, slope: Floats, clear_m: float) -> float:
-    """Return the tail of a form by its own matrix and slope."""
-    sx, sy, sz = slope[0], slope[1], slope[2]
+def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, float]:
+    """Return the place at which a form is lowest, the diagonal of the cofactors of its matrix, 1 over the determinant.
+
+    Forms are `constant`, `slope` (3), and the matrix by its elements xx, xy, xz, yy, yz, zz. The last number is 0 where
+    the matrix is singular.
+    """
+    sx, sy, sz = form[1], form[2], form[3]
+    xx, xy, xz, yy, yz, zz = form[4], form[5], form[6], form[7], form[8], form[9]
     c_xx, c_yy, c_zz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     c_xy, c_xz, c_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
     det = xx * c_xx + xy * c_xy + xz * c_xz
     mean = (xx + yy + zz) / 3.0
     if not det > 1e-12 * mean * mean * mean:
-        return 1.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     inverse = 1.0 / det
     x = (c_xx * sx + c_xy * sy + c_xz * sz) * inverse
     y = (c_xy * sx + c_yy * sy + c_yz * sz) * inverse
     z = (c_xz * sx + c_yz * sy + c_zz * sz) * inverse
+    return x, y, z, c_xx, c_yy, c_zz, inverse
+
+
+@inner
+def _tail_of(form: Floats, clear_m: float) -> float:
+    """Return the tail of a form by its own matrix and slope."""
+    x, y, z, c_xx, c_yy, _, inverse = _lowest(form)
+    if inverse == 0.0:
+        return 1.0
     gap = max(clear_m - math.sqrt(x * x + y * y), 0.0)
-    excess = gap * gap / ((c_xx + c_yy) * inverse) - max(x * sx + y * sy + z * sz, 0.0)
+    excess = gap * gap / ((c_xx + c_yy) * inverse) - max(x * form[1] + y * form[2] + z * form[3], 0.0)
     if excess > 1400.0:
         return 0.0
     return 0.5 * math.erfc(math.sqrt(0.5 * excess)) if excess > 0.0 else 1.0
@@ -122,53 +83,158 @@ class _Residuals(NamedTuple):
 
 
 @inner
-def _of_sides(
-    used: Indices,
-    sides: Masks,
-    side_prior: float,
-    residuals: _Residuals,
-    slope: Floats,
-    matrix: Floats,
-    clear_m: float,
-) -> float:
-    """Return the sum of the tails with the channels of each side left out, one after the other."""
+def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> None:
+    """Write the form without the channels i and j (-1: none), from that of all."""
     projector, residual, rows = residuals
-    total, n = 0.0, len(used)
+    for k in range(10):
+        form[k] = every[k]
+    if i < 0:
+        return
+    a = projector[i, i]
+    fx, fy, fz = rows[i, 0], rows[i, 1], rows[i, 2]
+    if j < 0:
+        w = 1.0 / a if a > LEAST_REDUNDANCY else 0.0
+        own = w * residual[i]
+        form[0] -= own * residual[i]
+        form[1] -= own * fx
+        form[2] -= own * fy
+        form[3] -= own * fz
+        form[4] -= w * fx * fx
+        form[5] -= w * fx * fy
+        form[6] -= w * fx * fz
+        form[7] -= w * fy * fy
+        form[8] -= w * fy * fz
+        form[9] -= w * fz * fz
+        return
+    b, c = projector[j, i], projector[j, j]
+    det = a * c - b * b
+    if not (min(a, c) > LEAST_REDUNDANCY and det > LEAST_REDUNDANCY * a * c):
+        return
+    gx, gy, gz = rows[j, 0], rows[j, 1], rows[j, 2]
+    w = 1.0 / det
+    a, b, c = a * w, b * w, c * w
+    one, two = residual[i], residual[j]
+    own_i, own_j = c * one - b * two, a * two - b * one
+    form[0] -= own_i * one + own_j * two
+    form[1] -= own_i * fx + own_j * gx
+    form[2] -= own_i * fy + own_j * gy
+    form[3] -= own_i * fz + own_j * gz
+    ix, iy, iz = c * fx - b * gx, c * fy - b * gy, c * fz - b * gz
+    jx, jy, jz = a * gx - b * fx, a * gy - b * fy, a * gz - b * fz
+    form[4] -= ix * fx + jx * gx
+    form[5] -= ix * fy + jx * gy
+    form[6] -= ix * fz + jx * gz
+    form[7] -= iy * fy + jy * gy
+    form[8] -= iy * fz + jy * gz
+    form[9] -= iz * fz + jz * gz
+
+
+@inner
+def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, form: Floats) -> bool:
+    """Write the form without the channels of a side, left out one after the other; return whether it has two."""
+    projector, residual, rows = residuals
+    n, count = len(used), 0
     member, work = np.empty(n, dtype=np.intp), np.empty((n, n + 4))
-    left, s, m = np.empty(3), np.empty(3), np.empty((3, 3))
-    for c in range(len(sides)):
-        count = 0
-        for i in range(n):
-            if sides[c, used[i]]:
-                member[count] = i
-                count += 1
-        if count < 2 or side_prior == 0.0:
+    for k in range(10):
+        form[k] = every[k]
+    for i in range(n):
+        if side[used[i]]:
+            member[count] = i
+            count += 1
+    for a in range(count):
+        for b in range(count):
+            work[a, b] = projector[max(member[a], member[b]), min(member[a], member[b])]
+        work[a, count] = residual[member[a]]
+        for b in range(3):
+            work[a, count + 1 + b] = rows[member[a], b]
+    for a in range(count):
+        if not work[a, a] > LEAST_REDUNDANCY:
             continue
+        x, y, z = work[a, count + 1] / work[a, a], work[a, count + 2] / work[a, a], work[a, count + 3] / work[a, a]
+        form[0] -= work[a, count] * (work[a, count] / work[a, a])
+        form[1] -= work[a, count] * x
+        form[2] -= work[a, count] * y
+        form[3] -= work[a, count] * z
+        form[4] -= work[a, count + 1] * x
+        form[5] -= work[a, count + 1] * y
+        form[6] -= work[a, count + 1] * z
+        form[7] -= work[a, count + 2] * y
+        form[8] -= work[a, count + 2] * z
+        form[9] -= work[a, count + 3] * z
+        for later in range(a + 1, count):
+            ratio = work[later, a] / work[a, a]
+            for column in range(a, count + 4):
+                work[later, column] -= ratio * work[a, column]
+    return count > 1
+
+
+@inner
+def _whiten(
+    model: Any, t: int, noise: float, sigma_m: tuple[float, float], used: Indices, residuals: Any, every: Floats
+) -> int:
+    """Write channels in use, their residuals, and the form of all of them; return how many there are.
+
+    The map error is taken alike in all horizontal directions: another place has another tangent.
+    """
+    root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
+    projector, residual, rows = residuals
+    n, channels = 0, root_weight.shape[1]
+    for m in range(channels):
+        if root_weight[t, m] > 0.0:
+            used[n] = m
+            n += 1
+    asked, spread_of, of_map = np.zeros(clock_covariance_m2.shape[1]), np.empty((n, 3)), np.zeros(3)
+    pull, step, with_map = np.zeros(3), np.empty(3), np.empty((3, 3))
+    # The map error alike in all horizontal directions, and the place that the residuals ask for then.
+    normal = _inverse(covariance_m2[t])
+    of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
+    of_map[2] = (noise / sigma_m[1]) ** 2
+    for a in range(3):
+        for b in range(3):
+            normal[a, b] -= map_prior[a, b]
+            with_map[a, b] = normal[a, b] + (of_map[a] if a == b else 0.0)
+    covariance = _inverse(with_map)
+    for i in range(n):
+        m = used[i]
+        asked[clock[m]] += root_weight[t, m] * misfit[t, m]
         for a in range(3):
-            s[a] = slope[a]
+            pull[a] += misfit[t, m] * design[t, m, a]
+    for a in range(3):
+        step[a] = pull[0] * covariance[0, a] + pull[1] * covariance[1, a] + pull[2] * covariance[2, a]
+    for a in range(4):
+        every[a] = 0.0
+    for i in range(n):
+        m = used[i]
+        of_clock = 0.0
+        for g in range(len(asked)):
+            of_clock += clock_covariance_m2[t, clock[m], g] * asked[g]
+        residual[i] = misfit[t, m] - root_weight[t, m] * of_clock
+        for a in range(3):
+            residual[i] -= design[t, m, a] * step[a]
+            value = 0.0
             for b in range(3):
-                m[a, b] = matrix[a, b]
-        for a in range(count):
-            for b in range(count):
-                work[a, b] = projector[max(member[a], member[b]), min(member[a], member[b])]
-            work[a, count] = residual[member[a]]
-            for b in range(3):
-                work[a, count + 1 + b] = rows[member[a], b]
-        for a in range(count):
-            if not work[a, a] > LEAST_REDUNDANCY:
-                continue
-            for b in range(3):
-                left[b] = work[a, count + 1 + b] / work[a, a]
-            for b in range(3):
-                s[b] -= work[a, count] * left[b]
-                for d in range(3):
-                    m[b, d] -= work[a, count + 1 + b] * left[d]
-            for later in range(a + 1, count):
-                ratio = work[later, a] / work[a, a]
-                for column in range(a, count + 4):
-                    work[later, column] -= ratio * work[a, column]
-        total += side_prior * _tail_of(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2], s, clear_m)
-    return total
+                value += design[t, m, b] * covariance[b, a]
+            spread_of[i, a] = value
+            rows[i, a] = value * of_map[a] / noise
+            every[1 + a] += rows[i, a] * misfit[t, m] / noise
+        residual[i] /= noise
+        every[0] += residual[i] * misfit[t, m] / noise
+        for j in range(i + 1):
+            k = used[j]
+            value = -root_weight[t, m] * root_weight[t, k] * clock_covariance_m2[t, clock[m], clock[k]]
+            for a in range(3):
+                value -= spread_of[i, a] * design[t, k, a]
+            projector[i, j], projector[j, i] = value, value
+        projector[i, i] += 1.0
+    at = 4
+    for a in range(3):
+        for b in range(a, 3):
+            value = 0.0
+            for k in range(3):
+                value += normal[a, k] * covariance[k, b]
+            every[at] = value * of_map[b] / noise**2
+            at += 1
+    return n
 
 
 @kernel
@@ -213,78 +279,24 @@ def risk_off_tangent(
     ndarray, shape (T,)
         Summed over no fault, one faulty satellite, two and those of a side.
     """
-    root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
-    epochs, channels = root_weight.shape
-    clocks, total = clock_covariance_m2.shape[1], np.empty(epochs)
-    used, prior, leverage = np.empty(channels, dtype=np.intp), np.empty(channels), np.empty(channels)
-    projector, effect, residual = np.empty((channels, channels)), np.empty((channels, channels)), np.empty(channels)
-    rows, spread_of, asked = np.empty((channels, 3)), np.empty((channels, 3)), np.empty(clocks)
-    pull, step, slope, of_map, form = np.empty(3), np.empty(3), np.empty(3), np.zeros(3), np.empty(3)
-    with_map = np.empty((3, 3))
+    epochs, channels = model.root_weight.shape
+    used, total, leverage = np.empty(channels, dtype=np.intp), np.empty(epochs), np.empty(channels)
+    effect, matrix, every, form = np.empty((channels, channels)), np.empty((3, 3)), np.empty(10), np.empty(10)
+    residuals = _Residuals(np.empty((channels, channels)), np.empty(channels), np.empty((channels, 3)))
+    projector, _, rows = residuals
     for t in range(epochs):
-        n, noise = 0, scale[t]
-        for m in range(channels):
-            if root_weight[t, m] > 0.0:
-                used[n], prior[n] = m, likely[m]
-                n += 1
-        # The map error alike in all horizontal directions, and the place that the residuals ask for then.
-        normal = _inverse(covariance_m2[t])
-        of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
-        of_map[2] = (noise / sigma_m[1]) ** 2
+        n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
+        at = 4
         for a in range(3):
-            for b in range(3):
-                normal[a, b] -= map_prior[a, b]
-                with_map[a, b] = normal[a, b] + (of_map[a] if a == b else 0.0)
-        covariance = _inverse(with_map)
-        for g in range(clocks):
-            asked[g] = 0.0
-        for a in range(3):
-            pull[a] = slope[a] = 0.0
-        for i in range(n):
-            m = used[i]
-            asked[clock[m]] += root_weight[t, m] * misfit[t, m]
-            for a in range(3):
-                pull[a] += misfit[t, m] * design[t, m, a]
-        for a in range(3):
-            step[a] = pull[0] * covariance[0, a] + pull[1] * covariance[1, a] + pull[2] * covariance[2, a]
-        constant = 0.0
-        for i in range(n):
-            m = used[i]
-            of_clock = 0.0
-            for g in range(clocks):
-                of_clock += clock_covariance_m2[t, clock[m], g] * asked[g]
-            residual[i] = misfit[t, m] - root_weight[t, m] * of_clock
-            for a in range(3):
-                residual[i] -= design[t, m, a] * step[a]
-                value = 0.0
-                for b in range(3):
-                    value += design[t, m, b] * covariance[b, a]
-                spread_of[i, a] = value
-                rows[i, a] = value * of_map[a] / noise
-                slope[a] += rows[i, a] * misfit[t, m] / noise
-            residual[i] /= noise
-            constant += residual[i] * misfit[t, m] / noise
-            for j in range(i + 1):
-                k = used[j]
-                value = -root_weight[t, m] * root_weight[t, k] * clock_covariance_m2[t, clock[m], clock[k]]
-                for a in range(3):
-                    value -= spread_of[i, a] * design[t, k, a]
-                projector[i, j], projector[j, i] = value, value
-            projector[i, i] += 1.0
-        matrix = np.empty((3, 3))
-        for a in range(3):
-            for b in range(3):
-                value = 0.0
-                for k in range(3):
-                    value += normal[a, k] * covariance[k, b]
-                matrix[a, b] = value * of_map[b] / noise**2
-
+            for b in range(a, 3):
+                matrix[a, b] = matrix[b, a] = every[at]
+                at += 1
         # The largest tau of one channel and of two.
         of_all = _inverse(matrix)
         spread, start, one, two = of_all[0, 0] + of_all[1, 1], 0.0, 0.0, 0.0
         for a in range(3):
             for b in range(3):
-                start += slope[a] * of_all[a, b] * slope[b]
+                start += every[1 + a] * of_all[a, b] * every[1 + b]
         start = math.sqrt(max(start, 0.0))
         singles, squares = 0.0, 0.0
         for i in range(n):
@@ -294,8 +306,8 @@ def risk_off_tangent(
             for j in range(i + 1):
                 effect[i, j] = x * rows[j, 0] + y * rows[j, 1] + z * rows[j, 2]
             leverage[i] = effect[i, i]
-            singles += prior[i]
-            squares += prior[i] * prior[i]
+            singles += likely[used[i]]
+            squares += likely[used[i]] * likely[used[i]]
             if projector[i, i] > LEAST_REDUNDANCY:
                 one = max(one, leverage[i] / projector[i, i])
         for i in range(n):
@@ -306,74 +318,82 @@ def risk_off_tangent(
                 tau = (c * leverage[i] + a * leverage[j] - 2.0 * b * effect[i, j]) / det
                 regular = det > LEAST_REDUNDANCY * a * c and min(a, c) > LEAST_REDUNDANCY
                 two = max(two, tau if regular else 0.0)
-        root, residuals = math.sqrt(max(constant, 0.0)), _Residuals(projector, residual, rows)
-        of_sides = _of_sides(used[:n], sides[t], side_prior, residuals, slope, matrix, clear_m[t])
+        root, of_sides = math.sqrt(max(every[0], 0.0)), 0.0
+        for c in range(sides.shape[1]):
+            if side_prior > 0.0 and _without_side(sides[t, c], used[:n], residuals, every, form):
+                of_sides += side_prior * _tail_of(form, clear_m[t])
         total[t] = of_sides + 2.0 * _tail(clear_m[t], spread, start, root, 0.0)
         total[t] += singles * _tail(clear_m[t], spread, start, root, one)
         total[t] += 0.5 * (singles * singles - squares) * _tail(clear_m[t], spread, start, root, two)
         if total[t] <= enough:
             continue
-        s, r, u = slope[0], slope[1], slope[2]
-        m_xx, m_xy, m_xz = matrix[0, 0], matrix[0, 1], matrix[0, 2]
-        m_yy, m_yz, m_zz = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-        spent = of_sides
-        # One hypothesis after the other: none, each channel (j = -1), each pair.
-        for i in range(-1, n):
-            for j in range(-1, i if i >= 0 else 0):
-                if i < 0:
-                    p = 2.0
-                elif j < 0:
-                    p = prior[i]
-                else:
-                    p = prior[i] * prior[j]
-                if p == 0.0:
-                    continue
-                sx, sy, sz = s, r, u
-                xx, xy, xz, yy, yz, zz = m_xx, m_xy, m_xz, m_yy, m_yz, m_zz
-                if i >= 0:
-                    a = projector[i, i]
-                    fx, fy, fz = rows[i, 0], rows[i, 1], rows[i, 2]
-                    if j < 0:
-                        w = 1.0 / a if a > LEAST_REDUNDANCY else 0.0
-                        own = w * residual[i]
-                        sx -= own * fx
-                        sy -= own * fy
-                        sz -= own * fz
-                        xx -= w * fx * fx
-                        xy -= w * fx * fy
-                        xz -= w * fx * fz
-                        yy -= w * fy * fy
-                        yz -= w * fy * fz
-                        zz -= w * fz * fz
-                    else:
-                        b, c = projector[j, i], projector[j, j]
-                        gx, gy, gz = rows[j, 0], rows[j, 1], rows[j, 2]
-                        det = a * c - b * b
-                        if min(a, c) > LEAST_REDUNDANCY and det > LEAST_REDUNDANCY * a * c:
-                            w = 1.0 / det
-                            a, b, c = a * w, b * w, c * w
-                            one, two = residual[i], residual[j]
-                            own_i, own_j = c * one - b * two, a * two - b * one
-                            sx -= own_i * fx + own_j * gx
-                            sy -= own_i * fy + own_j * gy
-                            sz -= own_i * fz + own_j * gz
-                            ix, iy, iz = c * fx - b * gx, c * fy - b * gy, c * fz - b * gz
-                            jx, jy, jz = a * gx - b * fx, a * gy - b * fy, a * gz - b * fz
-                            xx -= ix * fx + jx * gx
-                            xy -= ix * fy + jx * gy
-                            xz -= ix * fz + jx * gz
-                            yy -= iy * fy + jy * gy
-                            yz -= iy * fz + jy * gz
-                            zz -= iz * fz + jz * gz
-                form[0], form[1], form[2] = sx, sy, sz
-                spent += p * _tail_of(xx, xy, xz, yy, yz, zz, form, clear_m[t])
+        spent = of_sides + 2.0 * _tail_of(every, clear_m[t])
+        for i in range(n):
+            for j in range(-1, i):
+                p = likely[used[i]] * (likely[used[j]] if j >= 0 else 1.0)
+                if p > 0.0:
+                    _without(i, j, residuals, every, form)
+                    spent += p * _tail_of(form, clear_m[t])
         total[t] = spent
     return total
 
 
 @kernel
+def forms_of_hypotheses(
+    model: Any, scale: Floats, likely: Floats, sides: Masks, side_prior: float, sigma_m: tuple[float, float]
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return the forms without fault, and without each channel, each pair and each side: K of them.
+
+    Parameters are those of `risk_off_tangent`.
+
+    Returns
+    -------
+    prior : ndarray, shape (T, K)
+        0 for what is no hypothesis.
+    form : ndarray, shape (T, K, 10)
+        See `_lowest`.
+    lowest_m, depth, widest_m2 : ndarray, shape (T, K)
+        Distance of the place at which each is lowest, by how much it is lower there, and the trace of the inverse of
+        its matrix; NaN where that is singular.
+    """
+    epochs, channels = model.root_weight.shape
+    most = 0
+    for t in range(epochs):
+        count = 0
+        for m in range(channels):
+            count += model.root_weight[t, m] > 0.0
+        most = max(most, count)
+    width = 1 + most * (most + 1) // 2 + sides.shape[1]
+    prior, form = np.zeros((epochs, width)), np.zeros((epochs, width, 10))
+    lowest, depth, widest = np.empty((epochs, width)), np.empty((epochs, width)), np.empty((epochs, width))
+    used, every = np.empty(channels, dtype=np.intp), np.empty(10)
+    residuals = _Residuals(np.empty((channels, channels)), np.empty(channels), np.empty((channels, 3)))
+    for t in range(epochs):
+        n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
+        prior[t, 0], at = 2.0, 1  # noise passes on either side
+        _without(-1, -1, residuals, every, form[t, 0])
+        for i in range(n):
+            for j in range(-1, i):
+                prior[t, at] = likely[used[i]] * (likely[used[j]] if j >= 0 else 1.0)
+                _without(i, j, residuals, every, form[t, at])
+                at += 1
+        for c in range(sides.shape[1]):
+            if _without_side(sides[t, c], used[:n], residuals, every, form[t, at]):
+                prior[t, at] = side_prior
+            at += 1
+        for k in range(width):
+            one = form[t, k]
+            x, y, z, c_xx, c_yy, c_zz, inverse = _lowest(one)
+            singular = np.nan if inverse == 0.0 else 0.0
+            lowest[t, k], widest[t, k] = math.sqrt(x * x + y * y + z * z) + singular, (c_xx + c_yy + c_zz) * inverse
+            depth[t, k] = max(x * one[1] + y * one[2] + z * one[3], 0.0)
+    return prior, form, lowest, depth, widest
+
+
+@kernel
 def risk_beyond(
-    forms: Any,
+    prior: Floats,
+    form: Floats,
     radius_m: Floats,
     first: Indices,
     start_m: Floats,
@@ -385,8 +405,8 @@ def risk_beyond(
 
     Parameters
     ----------
-    forms : Forms
-        Sums of squared residuals over the place d, ``q(d) = constant - 2 d . slope + d^T matrix d``, with their priors.
+    prior, form : ndarray
+        Of `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` over the place d.
     radius_m : ndarray, shape (T, K)
         A hypothesis counts where a place beyond the level is nearer.
     first : ndarray of int, shape (T + 1,)
@@ -396,7 +416,6 @@ def risk_beyond(
     beyond_m : ndarray, shape (P,)
         Distance of the sections beyond the level; others infinite.
     """
-    prior, constant, slope, matrix = forms
     epochs, hypotheses = prior.shape
     spent = np.zeros(epochs)
     for t in range(epochs):
@@ -406,18 +425,20 @@ def risk_beyond(
         for k in range(hypotheses):
             if not (prior[t, k] > 0.0 and radius_m[t, k] > nearest):
                 continue
-            sx, sy, sz, m = slope[t, k, 0], slope[t, k, 1], slope[t, k, 2], matrix[t, k]
+            sx, sy, sz = form[t, k, 1], form[t, k, 2], form[t, k, 3]
+            xx, xy, xz = form[t, k, 4], form[t, k, 5], form[t, k, 6]
+            yy, yz, zz = form[t, k, 7], form[t, k, 8], form[t, k, 9]
             least, beyond = np.inf, np.inf
             for p in range(first[t], first[t + 1]):
                 x, y, z = start_m[p, 0], start_m[p, 1], start_m[p, 2]
                 a, b, c = tangent[p, 0], tangent[p, 1], tangent[p, 2]
-                gx = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z - sx
-                gy = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z - sy
-                gz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z - sz
-                value = constant[t, k] + x * (gx - sx) + y * (gy - sy) + z * (gz - sz)
+                gx = xx * x + xy * y + xz * z - sx
+                gy = xy * x + yy * y + yz * z - sy
+                gz = xz * x + yz * y + zz * z - sz
+                value = form[t, k, 0] + x * (gx - sx) + y * (gy - sy) + z * (gz - sz)
                 rise = 2.0 * (a * gx + b * gy + c * gz)
-                curvature = a * (m[0, 0] * a + m[0, 1] * b + m[0, 2] * c) + b * (m[1, 0] * a + m[1, 1] * b)
-                curvature += b * m[1, 2] * c + c * (m[2, 0] * a + m[2, 1] * b + m[2, 2] * c)
+                curvature = a * (xx * a + xy * b + xz * c) + b * (xy * a + yy * b)
+                curvature += b * yz * c + c * (xz * a + yz * b + zz * c)
                 step = min(max(-0.5 * rise / curvature, 0.0), length_m[p]) if curvature > 0.0 else 0.0
                 value += step * (rise + step * curvature)
                 least = min(least, value)

@@ -1,4 +1,4 @@
-"""Levels of satellites after jumps of their codes; medians over the channels of a clock."""
+"""Levels of satellites after jumps of their codes; medians over the channels of a clock; signs of interference."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.kernels.compiling import kernel
+from railfix.kernels.compiling import inner, kernel
 
 #: A suspicion that there is none of: NaT as a number.
 NEVER = np.iinfo(np.int64).min
+_NS = 1_000_000_000
 
 
 @kernel
@@ -73,3 +74,130 @@ def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int
                     if clock[m] == c:
                         result[t, m] = median
     return result
+
+
+@inner
+def _put_in(ordered: Floats, count: int, value: float) -> int:
+    """Put a value in order among those so far; return their new number."""
+    at = count
+    while at > 0 and ordered[at - 1] > value:
+        ordered[at] = ordered[at - 1]
+        at -= 1
+    ordered[at] = value
+    return count + 1
+
+
+@inner
+def _deviation(values: Floats, count: int) -> float:
+    """Return the standard deviation of some values."""
+    total = square = 0.0
+    for k in range(count):
+        total += values[k]
+    for k in range(count):
+        square += (values[k] - total / count) ** 2
+    return math.sqrt(square / count)
+
+
+@kernel
+def falls_of_cn0(
+    now_s: Floats,
+    cn0_dbhz: Floats,
+    before: tuple[Floats, Floats, Floats],
+    decay: float,
+    silence_s: float,
+    known_after_s: float,
+    least: int,
+) -> tuple[Floats, Floats, Floats, tuple[Floats, Floats, Floats]]:
+    """Return the falls of C/N0 below the recent peaks: the statistics of `PowerSigns`, shape (T,), and the new state.
+
+    `before`: peaks, beginnings and last observations of `PowerState`, shape (K,); `decay` of a peak in a second.
+    """
+    epochs, channels = cn0_dbhz.shape
+    peak, first, last = before[0].copy(), before[1].copy(), before[2].copy()
+    fall, spread, difference = np.full(epochs, math.nan), np.full(epochs, math.nan), np.full(epochs, math.nan)
+    seen, falls = np.empty(channels), np.empty(channels)
+    for t in range(epochs):
+        count = compared = 0
+        now = now_s[t]
+        for m in range(channels):
+            value = cn0_dbhz[t, m]
+            if not math.isfinite(value):
+                continue
+            seen[count], count = value, count + 1
+            peak[m] = max(peak[m], value + decay * now)
+            if not now - last[m] <= silence_s:
+                first[m] = now
+            last[m] = now
+            if now - first[m] >= known_after_s:
+                compared = _put_in(falls, compared, peak[m] - decay * now - value)
+        if compared >= least:
+            fall[t] = (falls[(compared - 1) // 2] + falls[compared // 2]) / 2.0
+            spread[t] = _deviation(falls, compared)
+        if count >= least:
+            difference[t] = _deviation(seen, count)
+    return fall, spread, difference, (peak, first, last)
+
+
+@kernel
+def clock_steps(
+    time_ns: Integers,
+    break_before: Masks,
+    code_m: Floats,
+    rate_mps: Floats,
+    before: tuple[Floats, Floats, Integers],
+    longest_s: float,
+    least: int,
+) -> tuple[Floats, tuple[Floats, Floats, Integers]]:
+    """Return the median change of codes (T, K) against Dopplers, shape (T,), and the last ones of each channel.
+
+    `before`: codes, Dopplers and their times so far, shape (K,). Nothing is compared across a break, nor after
+    `longest_s`; NaN below `least` channels.
+    """
+    epochs, channels = code_m.shape
+    code, rate, since = before[0].copy(), before[1].copy(), before[2].copy()
+    step, changes = np.full(epochs, math.nan), np.empty(channels)
+    for t in range(epochs):
+        count = finite = 0
+        for m in range(channels):
+            if break_before[t]:
+                code[m] = math.nan
+            if not (math.isfinite(code_m[t, m]) and math.isfinite(rate_mps[t, m])):
+                continue
+            passed = time_ns[t] - since[m]
+            dt = passed // _NS + (passed % _NS) / _NS
+            change = code_m[t, m] - code[m] - (rate_mps[t, m] + rate[m]) / 2.0 * dt
+            if since[m] != NEVER and dt <= longest_s and not math.isnan(change):
+                count = _put_in(changes, count, change)
+                finite += math.isfinite(change)
+            code[m], rate[m], since[m] = code_m[t, m], rate_mps[t, m], time_ns[t]
+        if count > 0 and finite >= least:
+            step[t] = (changes[(count - 1) // 2] + changes[count // 2]) / 2.0
+    return step, (code, rate, since)
+
+
+@kernel
+def holds(
+    time_ns: Integers,
+    signs: Masks,
+    time_before: int,
+    before: tuple[Integers, Integers],
+    hold_ns: Integers,
+    release_s: Floats,
+) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
+    """Return which conditions have held for their time, which count still, and the state: see `held`.
+
+    `before`: how long each has held, and when it last counted, shape (C,).
+    """
+    epochs, conditions = signs.shape
+    run, last, previous = before[0].copy(), before[1].copy(), time_before
+    counts, stays = np.zeros((epochs, conditions), dtype=np.bool_), np.zeros((epochs, conditions), dtype=np.bool_)
+    for t in range(epochs):
+        for c in range(conditions):
+            run[c] = run[c] + min(time_ns[t] - previous, max(hold_ns[c] // 2, 0)) if signs[t, c] else 0
+            counts[t, c] = signs[t, c] and run[c] >= hold_ns[c]
+            if counts[t, c]:
+                last[c] = time_ns[t]
+            passed = time_ns[t] - last[c]
+            stays[t, c] = last[c] != NEVER and passed // _NS + (passed % _NS) / _NS <= release_s[c]
+        previous = time_ns[t]
+    return counts, stays, (run, last)

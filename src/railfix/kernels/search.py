@@ -1,4 +1,4 @@
-"""Points near a position, and the best of them."""
+"""Points near a position, and the best of them; distances to parts of a line off its tangent."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.core.constants import FAN_OUT, ROTATION_GRADIENT
+from railfix.core.constants import ALONG, CLEAR_M, FAN_OUT, ON_TANGENT_M, ROTATION_GRADIENT
 from railfix.kernels.compiling import inner, kernel
 
 #: Half the inverse of the shortest range to a navigation satellite, rounded down (GLONASS at the zenith) [1/m].
@@ -247,3 +247,55 @@ def best_points(
             excess[t] = (lowest - own) / max(1.0, own / freedom[t])
         begin = end
     return chosen, least, excess, other
+
+
+@kernel
+def clear_of_sections(
+    ecef_m: Floats,
+    tangent: Floats,
+    across: Floats,
+    length_m: Floats,
+    stretches: tuple[Indices, Floats, Indices],
+    section: Indices,
+) -> Floats:
+    """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
+
+    Parameters
+    ----------
+    ecef_m, tangent, across, length_m : ndarray
+        Of the line: points (P, 3), the others of its sections.
+    stretches
+        `SearchIndex.stretches`.
+    section : ndarray of int, shape (S,)
+    """
+    clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
+    nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)
+    middle = np.empty(3)
+    for s in range(len(section)):
+        here, length = section[s], length_m[section[s]]
+        for a in range(3):
+            middle[a] = ecef_m[here, a] + 0.5 * length * tangent[here, a]
+        reach = CLEAR_M + 0.5 * length + longest
+        centre = middle[0], middle[1], middle[2]
+        nodes, below, held = points_within(ecef_m, stretches, centre, reach, nodes, below)
+        for at in range(held):
+            v = nodes[at]
+            if v >= sections or v == here:
+                continue
+            off, nearest, low, high = False, np.inf, np.inf, -np.inf
+            for end in (v, v + 1):
+                ahead, aside, square = 0.0, 0.0, 0.0
+                for a in range(3):
+                    away = ecef_m[end, a] - ecef_m[here, a]
+                    ahead += away * tangent[here, a]
+                    aside += away * across[here, a]
+                for a in range(3):
+                    square += (ecef_m[end, a] - ecef_m[here, a] - ahead * tangent[here, a]) ** 2
+                beside, least = math.sqrt(square), max(max(ahead - length, -ahead), 0.0)
+                nearest = min(nearest, math.sqrt(least * least + aside * aside))
+                off |= least < ALONG * math.sqrt(least * least + square) and beside > ON_TANGENT_M
+                low, high = min(low, ahead), max(high, ahead)
+            if off or min(high, length) - max(low, 0.0) > ON_TANGENT_M:
+                clear[s] = min(clear[s], nearest - length_m[v])
+        clear[s] = max(clear[s], 0.0)
+    return clear

@@ -22,6 +22,7 @@ import numpy as np
 from railfix import kernels
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection.open_places import Forms
+from railfix.integrity.raim.model import ModelArrays
 from railfix.io import read_navigation, read_observations
 from railfix.kernels.compiling import resolved_once
 from railfix.pipeline.config import parse_config
@@ -31,8 +32,8 @@ from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 _Settings: TypeAlias = tuple[tuple[dict[str, Any], int], ...]
-#: Settings and numbers of epochs that together call every kernel of single epochs but `risk_beyond`; the second has too
-#: few satellites for 3-D positions.
+#: Settings and numbers of epochs that together call every kernel of single epochs but those of `_look_beyond`; the
+#: second has too few satellites for 3-D positions.
 _STAGES: Final[_Settings] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
@@ -116,9 +117,14 @@ def _process(settings: _Settings) -> None:
 
 def _look_beyond() -> None:
     """Look for places beyond a level: the line does not turn where these epochs are."""
-    forms = Forms(*(np.zeros((1, 1, *of_place)) for of_place in ((), (), (3,), (3, 3))))
+    nothing, clock = np.zeros((1, 1)), np.zeros(1, dtype=np.intp)
+    model = ModelArrays(
+        nothing, clock, np.zeros((1, 1, 1)), np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.zeros((3, 3)), nothing
+    )
+    one, sides = np.ones(1), np.zeros((1, 2, 1), dtype=np.bool_)
+    forms = Forms(*kernels.off_tangent.forms_of_hypotheses(model, one, one, sides, 0.0, (1.0, 1.0)))
     sections = np.zeros(2, dtype=np.intp), np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1), np.zeros(1)
-    kernels.off_tangent.risk_beyond(forms, np.zeros((1, 1)), *sections)
+    kernels.off_tangent.risk_beyond(forms.prior, forms.form, np.zeros(forms.prior.shape), *sections)
 
 
 def _first_epochs(log: Path, count: int) -> Observations:

@@ -244,6 +244,11 @@ class Channels:
         """Satellite and signal, shape (K,)."""
         return np.char.add(self.satellite, self.signal)
 
+    @cached_property
+    def clock_number(self) -> Indices:
+        """Number of the receiver clock of each channel, shape (K,)."""
+        return np.array([self.clocks.index(letter) for letter in self.clock.tolist()], dtype=np.intp)
+
 
 class ChannelBook:
     """Channels of observations under some settings, computed once for each set of channels."""

@@ -65,6 +65,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     observations: Observations
     channels: Channels
     satellites: SatelliteStates
+    anchor_arc_m: Floats  #: Of the point of the line nearest to the approximate place, shape (T,).
     #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
@@ -159,7 +160,7 @@ def correct_ranges(
     clean = code + states.clock_m - states.group_delay_m
     if isinstance(fixes, SatelliteCorrections):
         clean = clean + np.nan_to_num(fixes.fast_m)
-    anchor = _anchor(antennas, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
+    anchor, anchor_arc = _anchor(antennas, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
     seen, frequency = SeenFrom.of(anchor, states.position_ecef_m), channels.frequency_hz
     if isinstance(sbas, SbasCorrections) and isinstance(fixes, SatelliteCorrections):
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
@@ -197,25 +198,27 @@ def correct_ranges(
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=noise), beyond)
     bound, bias = np.zeros(code.shape), np.zeros(code.shape)
     if error_model is not None:
-        bound, bias = _by_error_model(error_model, seen, cn0, antennas)
+        bound, bias = _by_error_model(error_model, seen, cn0, antennas, anchor_arc)
         bound = np.hypot(bound, nominal) if error_model.covers == "local" or sbas is not None else bound
     uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma) & np.isfinite(bound))
     return CorrectedRanges(
         observations=obs, channels=channels, time=obs.time, break_before=obs.break_before, satellite=satellite,
         signal=signal, frequency_hz=frequency, code_m=code, doppler_hz=obs.doppler_hz[:, columns], cn0_dbhz=cn0,
-        satellites=states, anchor_ecef_m=anchor, elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg,
-        ionosphere_m=delays.ionosphere_m, troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma,
-        nominal_m=nominal, unmodelled_m=unmodelled, bound_sigma_m=bound, bias_m=bias,
+        satellites=states, anchor_ecef_m=anchor, anchor_arc_m=anchor_arc, elevation_deg=seen.elevation_deg,
+        azimuth_deg=seen.azimuth_deg, ionosphere_m=delays.ionosphere_m, troposphere_m=delays.troposphere_m,
+        corrected_code_m=clean, sigma_m=sigma, nominal_m=nominal, unmodelled_m=unmodelled, bound_sigma_m=bound,
+        bias_m=bias,
         reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason), second=second, base=base,
     )  # fmt: skip
 
 
-def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, antennas: AntennaRows) -> tuple[Floats, Floats]:
+def _by_error_model(
+    model: ErrorModel, seen: SeenFrom, cn0: Floats, antennas: AntennaRows, arc_m: Floats
+) -> tuple[Floats, Floats]:
     """Return overbounding sigma and bias of the ranges by the error model: shapes (T, K) [m]."""
 
     def front_deg(index: SearchIndex, rows: slice) -> Floats:
-        arc, _ = index.trajectory.nearest(seen.receiver_ecef_m[rows])
-        return index.trajectory.body_azimuth_deg(arc)
+        return index.trajectory.body_azimuth_deg(arc_m[rows])
 
     turned = seen.azimuth_deg - antennas.each(front_deg)[:, None]
     sigma, bias = model.at(seen.elevation_deg, turned, cn0)
@@ -225,8 +228,8 @@ def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, antennas: An
 _ANCHOR_WEIGHT: Final = np.array(1.0 / ANCHOR_SIGMA_M**2)
 
 
-def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> Floats:
-    """Return an approximate place of the antenna, good to some hundred metres, shape (T, 3) [m].
+def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> tuple[Floats, Floats]:
+    """Return an approximate place of the antenna, good to some hundred metres, shape (T, 3), and its arc length [m].
 
     The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
     the middle of the line at every epoch so that no epoch depends on another; the 3-D position
@@ -235,15 +238,18 @@ def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> Floats:
     middle = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(ranges.code_m[rows]), axis=0))
     point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
-    solved = np.isfinite(anchor[:, 0])
+    arc, solved = np.full(len(anchor), np.nan), np.isfinite(anchor[:, 0])
     for index, found in antennas.split(solved.nonzero()[0]):
         distance, vertex = index.tree.query(anchor[found])
         beside = np.asarray(distance) < BESIDE_THE_LINE_M
-        anchor[found[beside]] = index.trajectory.ecef_m[np.asarray(vertex)[beside]]
+        own, vertex = found[beside], np.asarray(vertex)[beside]
+        anchor[own], arc[own] = index.trajectory.ecef_m[vertex], index.arc_of_points_m[vertex]
     for index, rest in antennas.split((~solved).nonzero()[0]):
         best = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
         anchor[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
-    return anchor
+    for index, off in antennas.split(np.isnan(arc).nonzero()[0]):
+        arc[off], _ = index.trajectory.nearest(anchor[off])
+    return anchor, arc
 
 
 @lru_cache

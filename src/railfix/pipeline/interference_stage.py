@@ -83,7 +83,7 @@ def _motion_inputs(
     corrected: CorrectedRanges, solution: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
     """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
-    code, reason, clocks = corrected.code_m[rows], corrected.reason[rows], list(corrected.clocks)
+    code, reason = corrected.code_m[rows], corrected.reason[rows]
     near, off_line = solution.point.ecef_m[rows], np.empty(len(rows))
     first = 0
     for index, own in antennas.split(rows):
@@ -92,7 +92,7 @@ def _motion_inputs(
         off_line[part] = np.where((arc > 0.0) & (arc < index.trajectory.arc_m[-1]), offset, np.nan)
     return MotionInputs(
         time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
-        group=np.array([clocks.index(letter) for letter in corrected.channels.clock.tolist()], dtype=np.intp),
+        group=corrected.channels.clock_number,
         near_ecef_m=near, sat_ecef_m=corrected.satellites.position_ecef_m[rows],
         sat_velocity_mps=corrected.satellites.velocity_ecef_mps[rows],
         code_m=np.where((reason & _NOT_ITS_SIGNAL) == 0, code, np.nan),

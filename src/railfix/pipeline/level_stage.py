@@ -186,20 +186,27 @@ def judged(
     unavailable. Where a check has failed, or ranges and map contradict each other: alarm. Epochs that lose their
     coordinates (`has`) lose the level; where it reaches a stretch of `Config.no_level_m` it is infinite.
     """
-    values = {}
-    kept = has.all()
-    for name, value in vars(protection.level).items():
-        values[name] = value if kept or value.dtype != np.float64 else np.where(has, value, np.nan)
+    level, verdict = protection.level, protection.status
+    if config.no_level_m or not has.all():
+        level = _where_it_holds(level, has, chainage_m, config)
+        verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
+    verdict = np.where(_ALARMING[status], int(LevelStatus.ALARM), verdict)
+    doubtful = status == int(Status.AMBIGUOUS)
+    verdict = np.where(doubtful & (verdict == int(LevelStatus.AVAILABLE)), int(LevelStatus.UNAVAILABLE), verdict)
+    return changed(protection, level=level, status=verdict.astype(np.int8))
+
+
+def _where_it_holds(level: ProtectionLevel, has: Masks, chainage_m: Floats, config: Config) -> ProtectionLevel:
+    """Return the levels without those of epochs without coordinates, and infinite ones in stretches without any."""
+    values = {
+        name: np.where(has, value, np.nan) if value.dtype == np.float64 else value
+        for name, value in vars(level).items()
+    }
     for start, end in config.no_level_m:
         near = (chainage_m + values["level_m"] > start) & (chainage_m - values["level_m"] < end)
         values["level_m"] = np.where(near, np.inf, values["level_m"])
         values["cause"] = np.where(near, int(Cause.UNBOUNDED), values["cause"]).astype(np.int8)
-    level = ProtectionLevel(**values)
-    verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    verdict = np.where(_ALARMING[status], int(LevelStatus.ALARM), verdict)
-    doubtful = status == int(Status.AMBIGUOUS)
-    verdict = np.where(doubtful & (verdict == int(LevelStatus.AVAILABLE)), int(LevelStatus.UNAVAILABLE), verdict)
-    return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind, basis=protection.basis)
+    return ProtectionLevel(**values)
 
 
 #: Unknowns of the position.

@@ -49,7 +49,6 @@ from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
     SCREENS,
-    AntennaRanges,
     ObservationScreen,
     PairedEpochs,
     PairScreen,
@@ -420,13 +419,13 @@ class EpochProcessor:
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name])
         return LineReferences(features=self._features.get(name), units=self.units, balises=self.balises)
 
-    def _pair(self, ranges: Mapping[str, AntennaRanges]) -> PairedEpochs | None:
+    def _pair(self, ranges: Mapping[str, CorrectedRanges]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""
         if len(ranges) < 2 or not self.setup.spacing_known:
             return None
         front, rear = ranges["front"], ranges["rear"]
         return pair_antennas(
-            front, rear, front.anchor_ecef_m, self.trajectories["front"], self.trajectories["rear"],
+            front, rear, front.anchor_arc_m, self.trajectories["front"], self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )  # fmt: skip
 

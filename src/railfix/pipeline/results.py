@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings, changed
 from railfix.core.reasons import Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.gnss.orbits import SatelliteStates
@@ -296,7 +296,6 @@ def patched(result: Rows, epochs: Indices, part: Rows) -> Rows:
     """Return a result with some epochs replaced, by index; every field has the epochs on axis 0."""
     values = {}
     for item in fields(result):
-        array = np.array(getattr(result, item.name))
+        values[item.name] = array = np.array(getattr(result, item.name))
         array[epochs] = getattr(part, item.name)
-        values[item.name] = array
-    return replace(result, **values)
+    return changed(result, **values)

@@ -155,7 +155,7 @@ def solve(
         corrected = corrected.rejected(lasting, Reason.LASTING_ERROR)
         on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
     robust, robust_sums = robust_scale([noise.robust for noise in noises])
-    ranges, place, raim = fault_free(ranges, antennas, place, robust, on_line.kept, config)
+    ranges, place, raim = fault_free(ranges, antennas, place, model, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     model = model_again(model, ranges, antennas, constrained, np.flatnonzero(raim.excluded.any(axis=1)))
     off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, Final
+from functools import lru_cache
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed, kernel_array
@@ -116,6 +116,11 @@ class PointStatus(IntEnum):
     DILUTION = 3
 
 
+@lru_cache
+def _of_residuals(limits: SinglePointLimits) -> RaimLimits:
+    return RaimLimits(false_alarm=limits.false_alarm)
+
+
 def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
     """Return the `PointStatus` of each position, every constellation with a clock of its own, shape (T,).
 
@@ -123,7 +128,7 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
     """
     test = detect(
         point.wsse, point.residual_m, ranges.n_used - ranges.n_clocks - 3, scale=noise_scale,
-        limits=RaimLimits(false_alarm=limits.false_alarm),
+        limits=_of_residuals(limits),
     )  # fmt: skip
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
     over = ~(position_dilution(ranges, point.ecef_m) <= limits.dilution_limit)
@@ -141,14 +146,20 @@ def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
 
 
 def fault_free(
-    ranges: Ranges, antennas: AntennaRows, place: Place, scale: Floats, agreeing: Masks, config: Config
+    ranges: Ranges,
+    antennas: AntennaRows,
+    place: Place,
+    model: LinearModel,
+    scale: Floats,
+    agreeing: Masks,
+    config: Config,
 ) -> tuple[Ranges, Place, RaimResult]:
     """Return ranges and positions without the satellites that RAIM excludes, and its verdict on each epoch.
 
     Of two satellites that disagree with the rest, the rest can be the faulty ones: a pair of which the robust fit of
     the epoch keeps a range (`agreeing`, shape (T, K)) is not believed. Where a fault stays unresolved, the position is
-    that of the ranges that the robust fit keeps; its status says that a check has failed. `scale`: noise scale of the
-    receiver, shape (T,). Without "raim" among the screens nothing is tested.
+    that of the ranges that the robust fit keeps; its status says that a check has failed. `model` is that of the
+    positions; `scale`: noise scale of the receiver, shape (T,). Without "raim" among the screens nothing is tested.
     """
     limits, constrained = config.raim, place.constrained
     test = detect(constrained.wsse, constrained.residual_m, redundancy_of(ranges), limits=limits, scale=scale)
@@ -158,85 +169,50 @@ def fault_free(
         statistic=test.statistic, threshold=test.threshold, excluded=np.zeros(ranges.code_m.shape, dtype=bool),
         own_error_m=np.full(ranges.code_m.shape, np.nan), protection_level_m=np.full(len(ranges), np.nan),
     )  # fmt: skip
-    for index, failing in antennas.split((test.detected & on).nonzero()[0]):
-        ranges, place, raim = _faults_excluded(ranges, index, place, raim, failing, scale, agreeing, config)
-    return ranges, place, raim
-
-
-def _faults_excluded(
-    ranges: Ranges,
-    index: SearchIndex,
-    place: Place,
-    raim: RaimResult,
-    failing: Indices,
-    scale: Floats,
-    agreeing: Masks,
-    config: Config,
-) -> tuple[Ranges, Place, RaimResult]:
-    """Return the same with the failing epochs of one antenna looked into."""
-    limits, constrained = config.raim, place.constrained
-    arc, section = constrained.arc_m[failing], constrained.section[failing]
-    model = constrained_model(ranges.take(failing), index.trajectory, arc, section=section)
-    exclusion = exclude(model, limits=limits, scale=scale[failing])
-    raim = _with_exclusion(raim, failing, exclusion, np.arange(len(failing)))
-    unresolved = (exclusion.outcome == Outcome.UNRESOLVED).nonzero()[0]
-    if len(unresolved):
-        epochs = failing[unresolved]
-        second = _second_attempt(ranges, index, place, epochs, model.take(unresolved), scale, config)
-        raim = _with_exclusion(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
+    failing = (test.detected & on).nonzero()[0]
+    if not len(failing):
+        return ranges, place, raim
+    exclusion = exclude(model.take(failing), limits=limits, scale=scale[failing])
+    _put(raim, failing, exclusion)
+    for index, epochs in antennas.split(failing[exclusion.outcome == Outcome.UNRESOLVED]):
+        second = _second_attempt(ranges, index, place, epochs, model.take(epochs), scale, config)
+        _put(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
     if limits.mode == "chi_square":
-        raim = _by_robust_fit(raim, ranges, agreeing, failing, limits.min_redundancy)
+        _by_robust_fit(raim, ranges, agreeing, failing, limits.min_redundancy)
     changed = failing[raim.excluded[failing].any(axis=1)]
     if not len(changed):
         return ranges, place, raim
     ranges = without(ranges, raim.excluded)
-    place = solved_again(ranges, index, place, changed, config)
+    for index, epochs in antennas.split(changed):
+        place = solved_again(ranges, index, place, epochs, config)
     # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
     recheck = detect(
         place.constrained.wsse[changed], place.constrained.residual_m[changed], redundancy_of(ranges)[changed],
         limits=limits, scale=scale[changed],
     )  # fmt: skip
-    outcome = np.where(recheck.detected, Outcome.UNRESOLVED, raim.outcome[changed])
-    return ranges, place, replace(raim, outcome=_put(raim.outcome, changed, outcome))
+    raim.outcome[changed[recheck.detected]] = Outcome.UNRESOLVED
+    return ranges, place, raim
 
 
-def _by_robust_fit(
-    raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int
-) -> RaimResult:
-    """Return the result with the ranges that the robust fit rejects excluded where no exclusion is believed."""
+def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices | slice = slice(None)) -> None:
+    """Write some rows of an exclusion of `epochs` into a result."""
+    at = epochs[rows]
+    for name in ("outcome", "excluded", "own_error_m"):
+        getattr(raim, name)[at] = getattr(exclusion, name)[rows]
+
+
+def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
+    """Exclude the ranges that the robust fit rejects where no exclusion is believed."""
     pair = raim.outcome[failing] == Outcome.EXCLUDED_TWO
     contradicted = pair & (raim.excluded[failing] & agreeing[failing]).any(axis=1)
     unresolved = contradicted | (raim.outcome[failing] == Outcome.UNRESOLVED)
     epochs = failing[unresolved]
     if not len(epochs):
-        return raim
+        return
     rejected = (ranges.weight[epochs] > 0) & ~agreeing[epochs]
     rest = without(ranges.take(epochs), rejected)
-    rejected &= (redundancy_of(rest) >= min_redundancy)[:, None]
-    return replace(
-        raim,
-        outcome=_put(raim.outcome, epochs, np.full(len(epochs), Outcome.UNRESOLVED, dtype=np.int8)),
-        excluded=_put(raim.excluded, epochs, rejected),
-        own_error_m=_put(raim.own_error_m, epochs, np.full(rejected.shape, np.nan)),
-    )
-
-
-def _put(array: NDArray[Any], rows: Indices, values: NDArray[Any]) -> NDArray[Any]:
-    """Return a copy of an array with some rows replaced."""
-    copy = array.copy()
-    copy[rows] = values
-    return copy
-
-
-def _with_exclusion(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices) -> RaimResult:
-    """Return the result with some rows of an exclusion of `epochs` put in."""
-    at = epochs[rows]
-    return replace(
-        raim,
-        outcome=_put(raim.outcome, at, exclusion.outcome[rows]),
-        excluded=_put(raim.excluded, at, exclusion.excluded[rows]),
-        own_error_m=_put(raim.own_error_m, at, exclusion.own_error_m[rows]),
-    )
+    raim.outcome[epochs], raim.own_error_m[epochs] = Outcome.UNRESOLVED, np.nan
+    raim.excluded[epochs] = rejected & (redundancy_of(rest) >= min_redundancy)[:, None]
 
 
 def _second_attempt(

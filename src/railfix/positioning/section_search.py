@@ -94,6 +94,11 @@ class SearchIndex:
         middles, radii = zip(*self.levels, strict=True)
         return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 
+    @cached_property
+    def arc_of_points_m(self) -> Floats:
+        """Arc length of each point, the least of those that a line has there, shape (V,) [m]."""
+        return self.trajectory.nearest(self.trajectory.ecef_m)[0]
+
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
         """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
 
@@ -105,7 +110,7 @@ class SearchIndex:
         unknown = np.isnan(self._clear_m[section])
         if unknown.any():
             new = np.unique(section[unknown])
-            self._clear_m[new] = kernels.off_tangent.clear_of_sections(
+            self._clear_m[new] = kernels.search.clear_of_sections(
                 line.ecef_m, line.tangent, line.across, line.length_m, self.stretches, new
             )
         return np.asarray(self._clear_m[section])

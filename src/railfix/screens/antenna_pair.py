@@ -14,8 +14,9 @@ Multipath below the difference that these explain is not detected.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import Final, Literal, NamedTuple
 
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Strings, medians
+from railfix.core.arrays import Floats, Strings, changed, medians
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -73,11 +74,15 @@ class AntennaPairScreened(Screened):
     """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m]."""
 
     expected_m: Floats  #: Pseudorange of the rear antenna less that of the front one, from the spacing; shape (P, C).
-    #: What the errors of the angles explain; within it nothing is rejected, whatever the limit; shape (P, C).
-    ambiguity_m: Floats
     #: Clock of the rear receiver less that of the front one, as taken out; 0 where common; shape (P, C).
     clock_m: Floats
     clocks: str  #: How the clocks were treated, in words.
+    zone: Callable[[], Floats]  #: Returns `ambiguity_m`.
+
+    @cached_property
+    def ambiguity_m(self) -> Floats:
+        """What the errors of the angles explain; within it nothing is rejected, whatever the limit; shape (P, C)."""
+        return self.zone()
 
 
 class Spacing(NamedTuple):
@@ -228,15 +233,21 @@ def antenna_pair_screen(
         separate = np.abs(medians(raw))[:, None] > SEPARATE_CLOCKS_M
         clock = np.broadcast_to(np.where(separate, np.nan, 0.0), raw.shape)
     metric = raw - clock
-    relative = np.asarray(azimuth_deg) - np.asarray(spacing.heading_deg, dtype=np.float64)[..., None]
-    zone = ambiguity_m(
-        elevation_deg, relative, np.asarray(spacing.spacing_m, dtype=np.float64)[..., None],
-        elevation_error_deg=limits.elevation_error_deg, azimuth_error_deg=limits.azimuth_error_deg,
+    heading, length = (np.asarray(a, dtype=np.float64)[..., None] for a in (spacing.heading_deg, spacing.spacing_m))
+
+    def zone() -> Floats:
+        return ambiguity_m(
+            elevation_deg, np.asarray(azimuth_deg) - heading, length, elevation_error_deg=limits.elevation_error_deg,
+            azimuth_error_deg=limits.azimuth_error_deg,
+        )  # fmt: skip
+
+    screened = AntennaPairScreened(
+        metric=metric, reject=np.abs(metric) > limits.limit_m, expected_m=expected, clock_m=clock,
+        clocks=CLOCKS[limits.clocks], zone=zone,
     )  # fmt: skip
-    return AntennaPairScreened(
-        metric=metric, reject=np.abs(metric) > np.maximum(limits.limit_m, zone), expected_m=expected,
-        ambiguity_m=zone, clock_m=clock, clocks=CLOCKS[limits.clocks],
-    )  # fmt: skip
+    if screened.reject.any():
+        screened = changed(screened, reject=screened.reject & (np.abs(metric) > screened.ambiguity_m))
+    return screened
 
 
 class AntennaPairScreen(PairScreen[AntennaPairLimits]):

@@ -290,7 +290,7 @@ def on_pairs(screened: Screened, shape: tuple[int, ...], epochs: Indices, channe
 def pair_antennas(
     front: AntennaRanges,
     rear: AntennaRanges,
-    front_anchor_ecef_m: Floats,
+    front_anchor_arc_m: Floats,
     front_path: Trajectory,
     rear_path: Trajectory,
     *,
@@ -298,7 +298,7 @@ def pair_antennas(
 ) -> PairedEpochs:
     """Return the epochs of two antennas matched by their time tags, with the places of both on the line."""
     at_front, at_rear = pair_epochs(front.time, rear.time, tolerance_s=tolerance_s)
-    front_arc, _ = front_path.nearest(front_anchor_ecef_m[at_front])
+    front_arc = front_anchor_arc_m[at_front]
     rear_arc = rear_path.arc_of_body(front_path.body_at(front_arc))
     return PairedEpochs(
         front_epoch=at_front, rear_epoch=at_rear, front_ecef_m=front_path.at_arc(front_arc),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, medians
+from railfix import kernels
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, kernel_array
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 
@@ -155,17 +155,12 @@ def held(
         run, last = np.zeros(conditions, dtype=np.int64), np.full(conditions, _NEVER)
     if not len(time):
         return signs, signs, state
-    hold = np.round(hold_s * 1e9).astype(np.int64)
-    before = time[0] if np.isnat(state.time) else state.time
-    step = np.diff(np.concatenate([[before], time])).astype(np.int64)[:, None]
-    total = np.cumsum(np.minimum(step, np.maximum(hold // 2, 0)), axis=0)
-    # lengths of runs: total so far less the total at the last epoch at which the condition did not hold
-    start = _running(np.maximum, -run, np.where(signs, np.iinfo(np.int64).min, total))[1:]
-    length = total - start
-    counts = signs & (length >= hold)
-    latest = _running(np.fmax, last, np.where(counts, time[:, None], _NEVER))[1:]
-    stays = seconds(time[:, None] - latest) <= release_s
-    return counts, stays, HeldState(time=time[-1], run_ns=np.where(signs[-1], length[-1], 0), last=latest[-1])
+    first = time[0] if np.isnat(state.time) else state.time
+    counts, stays, (run, latest) = kernels.screens.holds(
+        time.astype(np.int64), np.ascontiguousarray(signs), int(first.astype(np.int64)), (run, last.view(np.int64)),
+        np.round(hold_s * 1e9).astype(np.int64), kernel_array(release_s),
+    )  # fmt: skip
+    return counts, stays, HeldState(time=time[-1], run_ns=run, last=latest.view("datetime64[ns]"))
 
 
 _MINUTE_S: Final = 60.0
@@ -207,42 +202,21 @@ def power_signs(
     stays is seen for minutes. `channel` names satellite and signal, one signal of each satellite at an epoch. The gain
     is in the receiver's unit, + for more gain; NaN where unknown.
     """
-    seen, now = np.isfinite(cn0_dbhz), seconds(time - GPS_EPOCH)[:, None]
-    peak, first, last = _rearrange(state, channel)
-    decay = limits.peak_decay_db_per_min / _MINUTE_S
-    peaks = _running(np.maximum, peak, np.where(seen, cn0_dbhz + decay * now, -np.inf))[1:]
-    lasts = _running(np.fmax, last, np.where(seen, now, np.nan))
-    begun = seen & ~(now - lasts[:-1] <= _LONGEST_SILENCE_S)
-    firsts = _running(np.fmax, first, np.where(begun, now, np.nan))[1:]
-    compared = seen & (now - firsts >= limits.known_after_s)
-    fall = np.where(compared, peaks - decay * now - cn0_dbhz, np.nan)
-    enough = compared.sum(axis=1) >= limits.least_satellites
-    forgotten = _GAIN_DECAY_PER_MIN / _MINUTE_S * now[:, 0]
-    logarithm = np.log(np.where(gain > 0, gain, np.nan))
+    now = seconds(time - GPS_EPOCH)
+    fall, spread, difference, (peak, first, last) = kernels.screens.falls_of_cn0(
+        now, kernel_array(cn0_dbhz), _rearrange(state, channel), limits.peak_decay_db_per_min / _MINUTE_S,
+        _LONGEST_SILENCE_S, limits.known_after_s, limits.least_satellites,
+    )  # fmt: skip
+    logarithm, forgotten = np.log(np.where(gain > 0, gain, np.nan)), _GAIN_DECAY_PER_MIN / _MINUTE_S * now
     gains = np.fmax.accumulate(np.concatenate([[state.gain], logarithm + forgotten]))[1:]
     signs = PowerSigns(
-        fall_db=np.where(enough, medians(fall), np.nan),
-        spread_db=np.where(enough, _deviation(fall), np.nan),
-        difference_db=np.where(seen.sum(axis=1) >= limits.least_satellites, _deviation(cn0_dbhz), np.nan),
+        fall_db=fall, spread_db=spread, difference_db=difference,
         gain_fall=1.0 - np.exp(logarithm + forgotten - gains),
-    )
+    )  # fmt: skip
     if not len(time):
         return signs, state
-    after = PowerState(channel=channel, peak_db=peaks[-1], first_s=firsts[-1], last_s=lasts[-1], gain=float(gains[-1]))
+    after = PowerState(channel=channel, peak_db=peak, first_s=first, last_s=last, gain=float(gains[-1]))
     return signs, after
-
-
-def _running(larger: np.ufunc, before: NDArray[Any], values: NDArray[Any]) -> NDArray[Any]:
-    """Return the largest values so far (T + 1, K) of those before, (K,), and of T epochs, (T, K)."""
-    return np.asarray(larger.accumulate(np.concatenate([before[None], values]), axis=0))
-
-
-def _deviation(values: Floats) -> Floats:
-    """Return the standard deviation of each row over what is not NaN, shape (T,)."""
-    has = np.isfinite(values)
-    count = np.maximum(has.sum(axis=1), 1)
-    mean = np.where(has, values, 0.0).sum(axis=1) / count
-    return np.asarray(np.sqrt(np.where(has, (values - mean[:, None]) ** 2, 0.0).sum(axis=1) / count))
 
 
 def _rearrange(state: PowerState, channel: Strings) -> tuple[Floats, Floats, Floats]:

@@ -7,7 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, medians
+from railfix import kernels
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.integrity.interference.limits import InterferenceLimits
@@ -211,6 +212,8 @@ def _length(covariance: Floats) -> Floats:
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
     """Return the last good fix before each epoch, and the last one of all."""
+    if len(good) == 1:
+        return start, fixes if good[0] else start
     time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))
     everything = Fix(time, *numbers)
     row = np.where(np.concatenate([[True], good]), np.arange(len(good) + 1), 0)
@@ -255,21 +258,11 @@ def _clock_jump(
         since = np.full(channels, np.datetime64("NaT", "ns"))
         _, here, there = np.intersect1d(inputs.channel, state.channel, return_indices=True)
         code[here], rate[here], since[here] = state.code_m[there], state.rate_mps[there], state.since[there]
-    codes, rates = np.concatenate([code[None], inputs.code_m]), np.concatenate([rate[None], inputs.rate_mps])
-    has = np.isfinite(codes) & np.isfinite(rates)
-    when = np.concatenate([since[None], np.where(has[1:], inputs.time[:, None], np.datetime64("NaT", "ns"))])
-    row = np.maximum.accumulate(np.where(has, np.arange(len(codes))[:, None], 0), axis=0)
-    before, column = row[:-1], np.arange(channels)
-    dt = seconds(inputs.time[:, None] - when[before, column])
-    broken = np.cumsum(np.concatenate([[0], inputs.break_before]))
-    near = (dt <= limits.longest_gap_s) & (broken[1:, None] == broken[before])
-    change = codes[1:] - codes[before, column] - (rates[1:] + rates[before, column]) / 2.0 * dt
-    change = np.where(near, change, np.nan)
-    enough = np.isfinite(change).sum(axis=1) >= limits.least_satellites
-    step = np.where(enough, medians(change), np.nan)
-    last = row[-1]
-    kept = np.where(broken[-1] == broken[last], 0.0, np.nan)  # nothing is compared across a break
-    after = codes[last, column] + kept, rates[last, column], when[last, column]
+    step, (code, rate, since_ns) = kernels.screens.clock_steps(
+        inputs.time.astype(np.int64), inputs.break_before, kernel_array(inputs.code_m), kernel_array(inputs.rate_mps),
+        (code, rate, since.view(np.int64)), limits.longest_gap_s, limits.least_satellites,
+    )  # fmt: skip
+    after = code, rate, since_ns.view("datetime64[ns]")
     return np.asarray(step - np.round(step / _MILLISECOND_M) * _MILLISECOND_M), after
 
 

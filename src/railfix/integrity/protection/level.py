@@ -24,7 +24,7 @@ from scipy.special import comb
 
 from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
-from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, Allocation, RiskBudget, allocate
+from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import constrained_model
 from railfix.positioning.normal_equations import Ranges
@@ -227,22 +227,27 @@ class Asked(NamedTuple):
     bounds: Indices  # (5,) first place of no fault, one fault, two, more; their number
 
 
+class _Names(NamedTuple):
+    """What the hypotheses of a block leave out, and the risk of each part."""
+
+    asked: Asked
+    share: Floats  # (T, 4)
+    letters: Strings  # after the channels: constellations, then the sides, a wrong map, and none
+    pairs: Indices  # (K, 2), the last of none
+
+
 def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: Errors) -> dict[str, NDArray[Any]]:
     """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(model.used.sum(axis=1).max())
-    channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(
-        model.arrays, of_block, asked := _list_hypotheses(plan, rows, n)
-    )
-    share = np.array([plan.fault_free, plan.one, plan.two, plan.more])[:, rows].T.copy()
+    # a plan of few epochs is kept, and so is what follows from it
+    every = len(rows) == len(plan.beyond) <= FEW
+    asked, share, letters, pairs = _names_of_few(plan, n) if every else _names(plan, rows, n)
+    channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(model.arrays, of_block, asked)
     level, spender, part, k, worst = kernels.level.solve_level(
         offset, sigma, weight, asked.bounds, share, plan.reserved[rows]
     )
-
     one, two = worst[:, 1], worst[:, 2]
-    # After the channels: constellations, then the sides, a wrong map, and none.
-    letters = np.array([*plan.groups, *[""] * (len(plan.shared) + 1)])
-    pairs = np.concatenate([_pairs(n) if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
     infinite = np.full(len(rows), Cause.BUDGET)
     if (unchecked := np.isinf(level) & (plan.fault_free[rows] > 0)).any():
         infinite[unchecked] = _find_unchecked(plan, asked, np.where(np.isinf(sigma), weight, 0.0), n)[unchecked]
@@ -297,16 +302,25 @@ def _places(kinds: tuple[int, ...], most: tuple[int, ...], n: int) -> tuple[Indi
     return first, np.array([*bounds, place])
 
 
-def _list_hypotheses(plan: Allocation, rows: Indices, n: int) -> Asked:
+@lru_cache(maxsize=REMEMBERED)
+def _names_of_few(plan: Allocation, n: int) -> _Names:
+    return _names(plan, np.arange(len(plan.beyond)), n)
+
+
+def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
     """Return the hypotheses of some epochs, of n channels in use at most: none, then one fault, two, more."""
     order = plan.order[rows]
     kinds = tuple(shared.kind for shared in plan.shared)
     first, bounds = _places(kinds, tuple(order.max(axis=0).tolist()), n)
-    return Asked(
+    asked = Asked(
         prior=plan.prior[rows], members=plan.members[rows],
         wrong_map=np.array([shared.wrong_map for shared in plan.shared]), shared_prior=plan.shared_prior[rows],
         order=order, k_false_alarm=plan.k_false_alarm[rows], first=first, bounds=bounds,
     )  # fmt: skip
+    share = np.array([plan.fault_free, plan.one, plan.two, plan.more])[:, rows].T.copy()
+    letters = np.array([*plan.groups, *[""] * (len(plan.shared) + 1)])
+    pairs = _pairs(n) if first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp)
+    return _Names(asked, share, letters, np.concatenate([pairs, [[-1, -1]]]))
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:

@@ -8,7 +8,6 @@ residuals, a quadratic form in the place, is evaluated along the line where a bo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import chain
 from typing import Final, NamedTuple
 
@@ -16,12 +15,10 @@ import numpy as np
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Masks, over_blocks
-from railfix.core.constants import ALONG, LEAST_REDUNDANCY
+from railfix.core.constants import ALONG
 from railfix.integrity.protection.risk import RiskBudget, one_sided_k
 from railfix.integrity.raim import LinearModel
-from railfix.integrity.raim.model import Compact, compact
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.normal_equations import inverse_3x3
 from railfix.positioning.section_search import SearchIndex
 
 _FURTHEST_M: Final = 5000.0  #: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
@@ -31,98 +28,26 @@ _NEGLIGIBLE: Final = 0.01  #: Share of the risk of a sample below which places a
 class Forms(NamedTuple):
     """Sum of squared residuals in variances, over the place d from the position, under K hypotheses, T epochs.
 
-    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position.
+    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position. The map error is taken
+    alike in all horizontal directions: another place has another tangent.
     """
 
-    prior: Floats  # (T, K)
-    constant: Floats  # (T, K)
-    slope: Floats  # (T, K, 3) [1/m]
-    matrix: Floats  # (T, K, 3, 3) [1/m^2]
-
-    def beside(self, *others: Forms) -> Forms:
-        """Return these and other hypotheses of the same epochs together."""
-        return Forms(*(np.concatenate(arrays, axis=1) for arrays in zip(self, *others, strict=True)))
+    prior: Floats  # (T, K), 0 for what is no hypothesis
+    form: Floats  # (T, K, 10): constant, slope [1/m], upper triangle of the matrix [1/m^2]
+    lowest_m: Floats  # (T, K) distance of the place at which each is lowest; NaN where singular
+    depth: Floats  # (T, K) by how much it is lower there
+    widest_m2: Floats  # (T, K) trace of the inverse of the matrix, which is above its largest eigenvalue
 
     def radius_m(self, risk: float) -> Floats:
         """Return the distance within which the open places of each hypothesis lie, shape (T, K); 0 without a prior.
 
         Beyond them all have 1 % of the risk, the same for each.
         """
-        covariance = inverse_3x3(self.matrix)
-        centre = np.einsum("tkij,tkj->tki", covariance, self.slope)
-        form = np.maximum(np.einsum("tki,tki->tk", centre, self.slope), 0.0)
-        # The trace of a covariance is above its largest eigenvalue.
-        widest = np.trace(covariance, axis1=2, axis2=3)
-        each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(self.prior, axis=1, keepdims=True), 1)
-        sigmas = np.maximum(one_sided_k(each / np.where(self.prior > 0, self.prior, 1.0)), 0.0)
-        radius = np.linalg.norm(centre, axis=2) + np.sqrt((form + sigmas**2) * widest)
-        radius = np.where(self.prior > 0, np.nan_to_num(radius, nan=_FURTHEST_M), 0.0)
-        return np.asarray(np.minimum(radius, _FURTHEST_M))
-
-
-def whiten_residuals(model: LinearModel, plan: float, height: float, scale: Floats) -> tuple[Compact, Floats, Forms]:
-    """Return the residuals of n channels with the map error in the noise, their design, and the form without fault (K =
-    1).
-
-    The map error is taken alike in all horizontal directions: another place has another tangent. The design, shape (T,
-    n, 3) [1/m], is the decrease of the residuals by a step along, across and up.
-    """
-    normal = np.linalg.inv(model.covariance_m2) - model.prior
-    prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])
-    covariance = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)
-    whole = replace(model, covariance_m2=covariance)
-    parts = compact(whole)
-    spread = covariance @ prior
-    design = np.take_along_axis(model.design @ spread, parts.channel[..., None], axis=1) / scale[:, None, None]
-    misfit = np.take_along_axis(model.misfit, parts.channel, axis=1) / scale[:, None]
-    parts = replace(parts, residual=parts.residual / scale[:, None])
-    none = Forms(
-        prior=np.full((len(scale), 1), 2.0),  # noise passes on either side
-        constant=np.einsum("tn,tn->t", misfit, parts.residual)[:, None],
-        slope=np.einsum("tni,tn->ti", design, misfit)[:, None],
-        matrix=(normal @ spread / scale[:, None, None] ** 2)[:, None],
-    )
-    return parts, design, none
-
-
-def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, prior: float) -> Forms:
-    """Return the forms without the channels of each side (T, S, M), K = S; prior 0 with fewer than two in use."""
-    n, forms = parts.channel.shape[1], []
-    columns = np.concatenate([parts.projector, parts.residual[..., None], design], axis=2)
-    for c in range(sides.shape[1]):
-        members = np.take_along_axis(sides[:, c], parts.channel, axis=1) & parts.used
-        rows, scaled, _ = one_after_the_other(columns, members)
-        residual, own = rows[..., n], rows[..., n + 1 :]
-        forms.append(
-            Forms(
-                prior=np.where(members.sum(axis=1) > 1, prior, 0.0)[:, None],
-                constant=none.constant - np.einsum("tm,tm->t", residual, scaled[..., n])[:, None],
-                slope=none.slope - np.einsum("tm,tmi->ti", residual, scaled[..., n + 1 :])[:, None],
-                matrix=none.matrix - np.einsum("tmi,tmj->tij", own, scaled[..., n + 1 :])[:, None],
-            )
-        )
-    empty = Forms(none.prior[:, :0], none.constant[:, :0], none.slope[:, :0], none.matrix[:, :0])
-    return empty.beside(*forms)
-
-
-def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats, Masks]:
-    """Leave out a group of channels, each from what those before it leave.
-
-    `columns`, shape (T, n, n + c): projector of the residuals, and what changes alike. Returns the row of each member
-    and that over its part of the projector, shapes (T, m, n + c), 0 where nothing checks it, and which are checked.
-    Without the group the columns are less by ``rows[..., :n]^T scaled``.
-    """
-    at = np.arange(len(columns))
-    place = np.argsort(~members, axis=1, kind="stable")[:, : int(members.sum(axis=1).max(initial=0))]
-    rows = columns[at[:, None], place] * members[at[:, None], place][..., None]
-    scaled, checked = np.empty_like(rows), np.empty(place.shape, dtype=bool)
-    for k in range(place.shape[1]):
-        row, later = rows[:, k], rows[:, k + 1 :]
-        share = row[at, place[:, k]]
-        checked[:, k] = share > LEAST_REDUNDANCY
-        scaled[:, k] = row / np.where(checked[:, k], share, np.inf)[:, None]
-        later -= np.take_along_axis(later, place[:, None, k, None], axis=2) * scaled[:, k, None]
-    return rows, scaled, checked
+        possible = self.prior > 0
+        each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(possible, axis=1, keepdims=True), 1)
+        sigmas = np.maximum(one_sided_k(each / np.where(possible, self.prior, 1.0)), 0.0)
+        radius = self.lowest_m + np.sqrt((self.depth + sigmas**2) * self.widest_m2)
+        return np.where(possible, np.fmin(radius, _FURTHEST_M), 0.0)
 
 
 _BOUND_SIZE: Final = 200_000  #: Numbers that a block of epochs by channels squared holds.
@@ -165,15 +90,11 @@ def places_beyond_the_level(
         near = block[bound > risk.risk_per_sample]
         for index, own in antennas.split(near):
             for some in np.array_split(own, 1 + 9 * len(own) // size):
-                parts, design, none = whiten_residuals(model.take(some), *sigmas, np.maximum(scale[some], 1.0))
-                prior = np.where(parts.used, likely[parts.channel], 0.0)
-                forms = [
-                    _without_one(parts, design, none, prior),
-                    without_sides(parts, design, none, sides[some], risk.side_prior),
-                ]
-                if parts.channel.shape[1] > 1:
-                    forms.append(_without_two(parts, design, none, prior))
-                spent = _risk_of_block(index, arc_m[some], level_m[some], none.beside(*forms), risk)
+                noise = np.maximum(scale[some], 1.0)
+                forms = kernels.off_tangent.forms_of_hypotheses(
+                    model.take(some).arrays, noise, likely, np.ascontiguousarray(sides[some]), risk.side_prior, sigmas
+                )
+                spent = _risk_of_block(index, arc_m[some], level_m[some], Forms(*forms), risk)
                 result[some] = spent > risk.risk_per_sample
 
     over_blocks(fill, (rows[first : first + size] for first in range(0, len(rows), size)))
@@ -184,42 +105,7 @@ def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Fo
     """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
     radius = forms.radius_m(risk.risk_per_sample)
     sections = _around(index, arc_m, level_m, radius.max(axis=1))
-    return kernels.off_tangent.risk_beyond(forms, radius, *sections)
-
-
-def _without_one(parts: Compact, design: Floats, none: Forms, prior: Floats) -> Forms:
-    """Forms with each channel left out, K = n."""
-    share = np.einsum("tii->ti", parts.projector)
-    checked = share > LEAST_REDUNDANCY
-    inverse = np.where(checked, 1.0 / np.where(checked, share, 1.0), 0.0)
-    return Forms(
-        prior=prior,
-        constant=none.constant - inverse * parts.residual**2,
-        slope=none.slope - (inverse * parts.residual)[..., None] * design,
-        matrix=none.matrix - inverse[..., None, None] * design[..., None] * design[..., None, :],
-    )
-
-
-def _without_two(parts: Compact, design: Floats, none: Forms, prior: Floats) -> Forms:
-    """Forms with each pair of channels left out."""
-    i, j = np.triu_indices(parts.channel.shape[1], 1)
-    share = np.einsum("tii->ti", parts.projector)
-    a, b, c = share[:, i], parts.projector[:, i, j], share[:, j]
-    product = a * c
-    determinant = product - b * b
-    checked = (np.minimum(a, c) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
-    inverse = np.where(checked, 1.0 / np.where(checked, determinant, 1.0), 0.0)
-    one, two = parts.residual[:, i], parts.residual[:, j]
-    own_one, own_two = (c * one - b * two) * inverse, (a * two - b * one) * inverse
-    first, second = design[:, i], design[:, j]
-    move_one = (c[..., None] * first - b[..., None] * second) * inverse[..., None]
-    move_two = (a[..., None] * second - b[..., None] * first) * inverse[..., None]
-    return Forms(
-        prior=prior[:, i] * prior[:, j],
-        constant=none.constant - one * own_one - two * own_two,
-        slope=none.slope - own_one[..., None] * first - own_two[..., None] * second,
-        matrix=none.matrix - move_one[..., None] * first[..., None, :] - move_two[..., None] * second[..., None, :],
-    )
+    return kernels.off_tangent.risk_beyond(forms.prior, forms.form, radius, *sections)
 
 
 def _around(

@@ -179,6 +179,7 @@ def set_sums(prior: Floats, most: int) -> Floats:
 #: Shared faults at a time that may be hypotheses; the probability of more is taken off the risk.
 _MOST_SHARED: Final = 3
 FEW: Final = 2  #: Epochs of two antennas, live: their allocation is kept.
+REMEMBERED: Final = 512  #: Such allocations: satellites come and go behind obstacles.
 _MOST_SETS: Final = 46_376  #: Sets of a class that are left out one by one at most: four of 34 satellites.
 
 
@@ -195,9 +196,9 @@ class Shared(NamedTuple):
         return len(self.events) + self.wrong_map
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Allocation:
-    """Allocation of the risk, T epochs."""
+    """Allocation of the risk, T epochs; equal to itself alone."""
 
     prior: Floats  # (T, M), 0 where not used
     groups: tuple[str, ...]  # letters of the C constellations with a prior of their own
@@ -250,7 +251,7 @@ class _Same:
         return isinstance(other, _Same) and other.risk is self.risk
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=REMEMBERED)
 def _of_few_epochs(
     risk: _Same, systems: tuple[str, ...], used: bytes, out: bytes, sides: bytes, count: int, wrong_map: bool
 ) -> Allocation:
