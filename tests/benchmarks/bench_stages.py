@@ -47,7 +47,7 @@ STAGES: Final = (
     ("lasting errors", "railfix.pipeline.solution", "lasting_errors"),
     ("fault detection", "railfix.pipeline.solution", "fault_free"),
     ("test of the map", "railfix.pipeline.solution", "map_offset"),
-    ("linear model", "railfix.pipeline.solution", "line_model"),
+    ("linear model", "railfix.pipeline.solve", "line_model"),
     ("protection level", "railfix.pipeline.solution", "protection_levels"),
     ("open places", "railfix.pipeline.level_stage", "places_beyond_the_level"),
     ("results", "railfix.pipeline.processor", "antenna_results"),
