@@ -77,21 +77,31 @@ def _tail_of(form: Floats, clear_m: float) -> float:
 class _Residuals(NamedTuple):
     """Residuals of the channels in use, their projector, and their change with the place."""
 
-    projector: Floats
-    residual: Floats
-    rows: Floats
+    projector: Floats  # (M, M)
+    residual: Floats  # (M,)
+    rows: Floats  # (3, M)
+    whitened: Floats  # (4, M): root of the weight and design, work space
+    clock: Indices  # (M,), work space
+
+
+@inner
+def _work_space(channels: int) -> _Residuals:
+    """Return arrays for some channels."""
+    clock = np.empty(channels, dtype=np.intp)
+    projector, whitened = np.empty((channels, channels)), np.empty((4, channels))
+    return _Residuals(projector, np.empty(channels), np.empty((3, channels)), whitened, clock)
 
 
 @inner
 def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> None:
     """Write the form without the channels i and j (-1: none), from that of all."""
-    projector, residual, rows = residuals
+    projector, residual, rows, _, _ = residuals
     for k in range(10):
         form[k] = every[k]
     if i < 0:
         return
     a = projector[i, i]
-    fx, fy, fz = rows[i, 0], rows[i, 1], rows[i, 2]
+    fx, fy, fz = rows[0, i], rows[1, i], rows[2, i]
     if j < 0:
         w = 1.0 / a if a > LEAST_REDUNDANCY else 0.0
         own = w * residual[i]
@@ -110,7 +120,7 @@ def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> Non
     det = a * c - b * b
     if not (min(a, c) > LEAST_REDUNDANCY and det > LEAST_REDUNDANCY * a * c):
         return
-    gx, gy, gz = rows[j, 0], rows[j, 1], rows[j, 2]
+    gx, gy, gz = rows[0, j], rows[1, j], rows[2, j]
     w = 1.0 / det
     a, b, c = a * w, b * w, c * w
     one, two = residual[i], residual[j]
@@ -132,7 +142,7 @@ def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> Non
 @inner
 def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, form: Floats) -> bool:
     """Write the form without the channels of a side, left out one after the other; return whether it has two."""
-    projector, residual, rows = residuals
+    projector, residual, rows, _, _ = residuals
     n, count = len(used), 0
     member, work = np.empty(n, dtype=np.intp), np.empty((n, n + 4))
     for k in range(10):
@@ -146,7 +156,7 @@ def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, for
             work[a, b] = projector[max(member[a], member[b]), min(member[a], member[b])]
         work[a, count] = residual[member[a]]
         for b in range(3):
-            work[a, count + 1 + b] = rows[member[a], b]
+            work[a, count + 1 + b] = rows[b, member[a]]
     for a in range(count):
         if not work[a, a] > LEAST_REDUNDANCY:
             continue
@@ -177,14 +187,17 @@ def _whiten(
     The map error is taken alike in all horizontal directions: another place has another tangent.
     """
     root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
-    projector, residual, rows = residuals
-    n, channels = 0, root_weight.shape[1]
-    for m in range(channels):
+    projector, residual, rows, whitened, group = residuals
+    roots, along, across, up = whitened[0], whitened[1], whitened[2], whitened[3]
+    n, asked, of_map, with_map = 0, np.zeros(clock_covariance_m2.shape[1]), np.zeros(3), np.empty((3, 3))
+    x = y = z = 0.0
+    for m in range(root_weight.shape[1]):
         if root_weight[t, m] > 0.0:
-            used[n] = m
+            used[n], group[n], roots[n] = m, clock[m], root_weight[t, m]
+            along[n], across[n], up[n] = design[t, m, 0], design[t, m, 1], design[t, m, 2]
+            asked[clock[m]] += roots[n] * misfit[t, m]
+            x, y, z = x + misfit[t, m] * along[n], y + misfit[t, m] * across[n], z + misfit[t, m] * up[n]
             n += 1
-    asked, spread_of, of_map = np.zeros(clock_covariance_m2.shape[1]), np.empty((n, 3)), np.zeros(3)
-    pull, step, with_map = np.zeros(3), np.empty(3), np.empty((3, 3))
     # The map error alike in all horizontal directions, and the place that the residuals ask for then.
     normal = _inverse(covariance_m2[t])
     of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
@@ -194,37 +207,23 @@ def _whiten(
             normal[a, b] -= map_prior[a, b]
             with_map[a, b] = normal[a, b] + (of_map[a] if a == b else 0.0)
     covariance = _inverse(with_map)
-    for i in range(n):
-        m = used[i]
-        asked[clock[m]] += root_weight[t, m] * misfit[t, m]
-        for a in range(3):
-            pull[a] += misfit[t, m] * design[t, m, a]
-    for a in range(3):
-        step[a] = pull[0] * covariance[0, a] + pull[1] * covariance[1, a] + pull[2] * covariance[2, a]
     for a in range(4):
         every[a] = 0.0
     for i in range(n):
-        m = used[i]
-        of_clock = 0.0
+        m, of_clock, clocks = used[i], 0.0, clock_covariance_m2[t, group[i]]
         for g in range(len(asked)):
-            of_clock += clock_covariance_m2[t, clock[m], g] * asked[g]
-        residual[i] = misfit[t, m] - root_weight[t, m] * of_clock
+            of_clock += clocks[g] * asked[g]
         for a in range(3):
-            residual[i] -= design[t, m, a] * step[a]
-            value = 0.0
-            for b in range(3):
-                value += design[t, m, b] * covariance[b, a]
-            spread_of[i, a] = value
-            rows[i, a] = value * of_map[a] / noise
-            every[1 + a] += rows[i, a] * misfit[t, m] / noise
-        residual[i] /= noise
+            rows[a, i] = along[i] * covariance[0, a] + across[i] * covariance[1, a] + up[i] * covariance[2, a]
+        s0, s1, s2 = rows[0, i], rows[1, i], rows[2, i]
+        residual[i] = (misfit[t, m] - roots[i] * of_clock - (x * s0 + y * s1 + z * s2)) / noise
         every[0] += residual[i] * misfit[t, m] / noise
-        for j in range(i + 1):
-            k = used[j]
-            value = -root_weight[t, m] * root_weight[t, k] * clock_covariance_m2[t, clock[m], clock[k]]
-            for a in range(3):
-                value -= spread_of[i, a] * design[t, k, a]
-            projector[i, j], projector[j, i] = value, value
+        for a in range(3):
+            rows[a, i] *= of_map[a] / noise
+            every[1 + a] += rows[a, i] * misfit[t, m] / noise
+        for j in range(n):
+            of_place = s0 * along[j] + s1 * across[j] + s2 * up[j]
+            projector[i, j] = -roots[i] * roots[j] * clocks[group[j]] - of_place
         projector[i, i] += 1.0
     at = 4
     for a in range(3):
@@ -281,9 +280,10 @@ def risk_off_tangent(
     """
     epochs, channels = model.root_weight.shape
     used, total, leverage = np.empty(channels, dtype=np.intp), np.empty(epochs), np.empty(channels)
-    effect, matrix, every, form = np.empty((channels, channels)), np.empty((3, 3)), np.empty(10), np.empty(10)
-    residuals = _Residuals(np.empty((channels, channels)), np.empty(channels), np.empty((channels, 3)))
-    projector, _, rows = residuals
+    own, taus, effect = np.empty(channels), np.empty(channels), np.empty((channels, channels))
+    matrix, every, form = np.empty((3, 3)), np.empty(10), np.empty(10)
+    residuals = _work_space(channels)
+    projector, rows = residuals.projector, residuals.rows
     for t in range(epochs):
         n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
         at = 4
@@ -300,24 +300,25 @@ def risk_off_tangent(
         start = math.sqrt(max(start, 0.0))
         singles, squares = 0.0, 0.0
         for i in range(n):
-            x = rows[i, 0] * of_all[0, 0] + rows[i, 1] * of_all[1, 0] + rows[i, 2] * of_all[2, 0]
-            y = rows[i, 0] * of_all[0, 1] + rows[i, 1] * of_all[1, 1] + rows[i, 2] * of_all[2, 1]
-            z = rows[i, 0] * of_all[0, 2] + rows[i, 1] * of_all[1, 2] + rows[i, 2] * of_all[2, 2]
+            x = rows[0, i] * of_all[0, 0] + rows[1, i] * of_all[1, 0] + rows[2, i] * of_all[2, 0]
+            y = rows[0, i] * of_all[0, 1] + rows[1, i] * of_all[1, 1] + rows[2, i] * of_all[2, 1]
+            z = rows[0, i] * of_all[0, 2] + rows[1, i] * of_all[1, 2] + rows[2, i] * of_all[2, 2]
             for j in range(i + 1):
-                effect[i, j] = x * rows[j, 0] + y * rows[j, 1] + z * rows[j, 2]
-            leverage[i] = effect[i, i]
+                effect[i, j] = x * rows[0, j] + y * rows[1, j] + z * rows[2, j]
+            leverage[i], own[i] = effect[i, i], projector[i, i]
             singles += likely[used[i]]
             squares += likely[used[i]] * likely[used[i]]
-            if projector[i, i] > LEAST_REDUNDANCY:
-                one = max(one, leverage[i] / projector[i, i])
+            if own[i] > LEAST_REDUNDANCY:
+                one = max(one, leverage[i] / own[i])
         for i in range(n):
-            a = projector[i, i]
+            a = own[i]
             for j in range(i):
-                b, c = projector[i, j], projector[j, j]
+                b, c = projector[i, j], own[j]
                 det = a * c - b * b
                 tau = (c * leverage[i] + a * leverage[j] - 2.0 * b * effect[i, j]) / det
-                regular = det > LEAST_REDUNDANCY * a * c and min(a, c) > LEAST_REDUNDANCY
-                two = max(two, tau if regular else 0.0)
+                taus[j] = tau if det > LEAST_REDUNDANCY * a * c and min(a, c) > LEAST_REDUNDANCY else 0.0
+            for j in range(i):
+                two = max(two, taus[j])
         root, of_sides = math.sqrt(max(every[0], 0.0)), 0.0
         for c in range(sides.shape[1]):
             if side_prior > 0.0 and _without_side(sides[t, c], used[:n], residuals, every, form):
@@ -367,7 +368,7 @@ def forms_of_hypotheses(
     prior, form = np.zeros((epochs, width)), np.zeros((epochs, width, 10))
     lowest, depth, widest = np.empty((epochs, width)), np.empty((epochs, width)), np.empty((epochs, width))
     used, every = np.empty(channels, dtype=np.intp), np.empty(10)
-    residuals = _Residuals(np.empty((channels, channels)), np.empty(channels), np.empty((channels, 3)))
+    residuals = _work_space(channels)
     for t in range(epochs):
         n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
         prior[t, 0], at = 2.0, 1  # noise passes on either side
