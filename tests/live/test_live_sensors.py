@@ -20,7 +20,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.settings import write_toml
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
-from railfix.live import watches
+from railfix.live import console
 from railfix.live.console import SensorWatch
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import passing_rows
@@ -335,7 +335,7 @@ def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, t
 def test_the_watch_of_the_sensors_speaks_once_and_forgets(
     case: Ride, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(watches, "WATCHED_NS", 70_000_000_000)
+    monkeypatch.setattr(console, "WATCHED_NS", 70_000_000_000)
     engine = engine_of(case, tmp_path, sensor_wait_s=0.2)
     outputs, said = live(case, engine, latency_s=0.05), list[str]()
     watch = SensorWatch(engine.processor, said.append)
