@@ -276,18 +276,22 @@ def _work_space(
     pairs = sources * (sources - 1) // 2
     most = 3 * channels + sensors
     size = channels + layout.COMBINED + sensors
+    lanes = whole_lanes(size)
     shapes = {
         "mean": (room, width), "spread": (room, width, width), "now": (room,), "before": (room,),
         "design": (room, most, 4), "value": (room, most), "innovation": (room, most), "sensed": (room, sensors, 6),
-        "cross": (room, size, width), "root": (room, size), "own": (room, size, size),
-        "information": (room, size, size), "after": (room, size, size), "change": (room, size),
+        "cross": (room, size, whole_lanes(width)), "root": (room, size), "own": (room, size, lanes),
+        "information": (room, size, lanes), "after": (room, size, lanes), "change": (room, lanes),
         "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
-        "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
+        "new_covariance": (room, unknowns, whole_lanes(unknowns)), "log_before": (room,), "log_after": (room,),
         "evidence": (room,), "code_evidence": (room,), "joined": (5, room), "branch": (room + pairs, 4),
         "beyond": (room,), "variance": (most,), "masked": (most,),
-        "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
-        "diagonal": (size,), "with_clock": (size,),
-        "ordered": (most,), "part": (4,), "gain": (size, unknowns + 1), "less": (size, unknowns),
+        "system": (1, size, lanes), "factor": (size, lanes), "lower": (size, lanes), "right": (max(size, room),),
+        "diagonal": (lanes,), "with_clock": (lanes,),
+        "ordered": (most,), "part": (layout.MOTION,), "scaled": (size,),
+        "normal": (layout.MOTION, layout.MOTION + 1), "motion": (layout.MOTION, layout.MOTION + 1),
+        "joint": (layout.MOTION, lanes), "less": (whole_lanes(unknowns + 1),),
+        "found": (size, whole_lanes(unknowns + 3)),
         "stepped": (width, unknowns), "faded": (unknowns,), "share": (room, size, 6), "sight": (channels, 7),
         "bend": (2,), "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
     }  # fmt: skip
@@ -299,6 +303,11 @@ def _work_space(
     )  # fmt: skip
     listed = (np.empty(length, dtype=np.intp) for length in (channels, channels, channels, sensors, 4))
     return layout.Rows(*listed), work
+
+
+def whole_lanes(size: int) -> int:
+    """Return a length as whole vectors of the processor (`railfix.kernels.tracking.algebra`)."""
+    return -(-size // layout.LANES) * layout.LANES
 
 
 def _sources(state: TrackState) -> list[str]:

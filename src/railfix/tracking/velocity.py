@@ -70,23 +70,27 @@ def compute_velocity(
     sat = np.where(np.isfinite(sat_ecef_m), sat_ecef_m, 2.6e7)
     distance, sight = range_with_rotation(sat, receiver)
     previous, _ = range_with_rotation(np.where(has[1][..., None], before_ecef_m, 2.6e7), receiver)
-    motion = np.where(np.isnan(sat_velocity_mps), 0.0, sat_velocity_mps)
-    moving = (sight * motion).sum(axis=-1)
-    moving += _TURN * (motion[..., 0] * receiver[..., 1] - motion[..., 1] * receiver[..., 0])
-    stretch = 1.0 + moving / SPEED_OF_LIGHT
-    gradient = -sight.copy()
-    gradient[..., 1] += _TURN * sat[..., 0]
-    gradient[..., 0] -= _TURN * sat[..., 1]
-    up = enu_axes(*geodetic_from_ecef(near)[:2])[:, 2]
     dt = interval_s[:, None]
-    by_phase = _fit(-sight, (measured[1] - distance + previous) / dt, variance[1] / dt**2, has[1], up)
-    rate = measured[2] - moving / stretch
-    by_doppler = _fit(gradient / stretch[..., None], rate, variance[2], has[2], up)
-    phase = np.asarray(np.isfinite(by_phase[0][:, 0]))
-    velocity = np.where(phase[:, None], by_phase[0], by_doppler[0])
+    up = enu_axes(*geodetic_from_ecef(near)[:2])[:, 2]
+    velocity, covariance = _fit(-sight, (measured[1] - distance + previous) / dt, variance[1] / dt**2, has[1], up)
+    phase = np.asarray(np.isfinite(velocity[:, 0]))
+    other = (~phase).nonzero()[0]
+    if len(other):
+        sat, receiver, sight = sat[other], receiver[other], sight[other]
+        motion = np.where(np.isnan(sat_velocity_mps[other]), 0.0, sat_velocity_mps[other])
+        moving = (sight * motion).sum(axis=-1)
+        moving += _TURN * (motion[..., 0] * receiver[..., 1] - motion[..., 1] * receiver[..., 0])
+        stretch = 1.0 + moving / SPEED_OF_LIGHT
+        gradient = -sight
+        gradient[..., 1] += _TURN * sat[..., 0]
+        gradient[..., 0] -= _TURN * sat[..., 1]
+        rate = measured[2, other] - moving / stretch
+        velocity[other], covariance[other] = _fit(
+            gradient / stretch[..., None], rate, variance[2, other], has[2, other], up[other]
+        )
     return Velocity(
         velocity_mps=np.where(known[:, None], velocity, np.nan),
-        covariance=np.where(phase[:, None, None], by_phase[1], by_doppler[1]),
+        covariance=covariance,
         age_s=np.where(phase, 0.5 * interval_s, 0.0),
     )
 

@@ -46,6 +46,8 @@ CHORD_M: Final = 0.5
 #: Shares of a sensor's variance, and of that of what it measures, that no weight takes away: two sensors of the same
 #: combination, or a wheel and phases before the speed is known, keep it regular.
 SENSOR_FLOOR: Final = 1e-6
+#: Share of their own information below which phases or Dopplers say nothing that others do not.
+LEAST_PIVOT: Final = 1e-12
 UNKNOWN_FLOOR: Final = 1e-10
 
 # Clocks.

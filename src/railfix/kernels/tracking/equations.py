@@ -255,9 +255,6 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
     width = spread.shape[1]
     n = width - OF_EPOCH
     size = nc + COMBINED + ns
-    for i in range(size):
-        for k in range(6):
-            unknown[i, k], share[i, k] = 0, 0.0
     for i in range(nc):
         k = rows.codes[i]
         unknown[i, 0], share[i, 0] = ARC, design[h, i, 0]
@@ -266,6 +263,9 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
         unknown[i, 3], share[i, 3] = UP, design[h, i, 2]
         unknown[i, 4], share[i, 4] = active.offset[epochs.offset[k]], 1.0
         unknown[i, 5], share[i, 5] = active.satellite[epochs.slot[k]], epochs.code_sigma_m[t, k]
+    for i in range(nc, size):
+        for k in range(6):
+            unknown[i, k], share[i, k] = 0, 0.0
     unknown[nc, 0], share[nc, 0] = n + CODE_CLOCK, 1.0
     unknown[nc + C_WAY, 0], share[nc + C_WAY, 0] = ARC, 1.0
     unknown[nc + C_WAY, 1], share[nc + C_WAY, 1] = n + PREVIOUS_ARC, -1.0
@@ -293,7 +293,18 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
             unknown[i, 4] = ACCELERATION
         share[i, 4] = sensed[h, j, 4]
         unknown[i, 5], share[i, 5] = n + MAP_LENGTH_ERROR, sensed[h, j, 5]
-    for i in range(size):
+    for i in range(nc):
+        offset, satellite = unknown[i, 4], unknown[i, 5]
+        along, right, up, sigma = share[i, 0], share[i, 2], share[i, 3], share[i, 5]
+        for c in range(width):
+            cross[h, i, c] = (
+                along * (spread[h, ARC, c] + spread[h, CODE_PLACE, c])
+                + right * spread[h, RIGHT, c]
+                + up * spread[h, UP, c]
+                + spread[h, offset, c]
+                + sigma * spread[h, satellite, c]
+            )
+    for i in range(nc, size):
         for c in range(width):
             cross[h, i, c] = 0.0
         for k in range(6):
@@ -302,24 +313,32 @@ def combine(epochs: Epochs, t: int, active: Active, rows: Rows, work: Work, h: i
                 row = unknown[i, k]
                 for c in range(width):
                     cross[h, i, c] += coefficient * spread[h, row, c]
-    for i in range(size):
-        for j in range(i, size):
-            total = 0.0
-            for k in range(6):
-                total += share[j, k] * cross[h, i, unknown[j, k]]
-            own[h, i, j] = total
     gnss = nc + rows.counts[1] + rows.counts[2]
-    for j in range(ns):
-        i = nc + COMBINED + j
-        own[h, i, i] += SENSOR_FLOOR * work.variance[gnss + j] + UNKNOWN_FLOOR * own[h, i, i]
     for i in range(size):
-        root[h, i] = math.sqrt(own[h, i, i])
-    for i in range(size):
-        for j in range(i + 1, size):
-            own[h, i, j] /= root[h, i] * root[h, j]
-            own[h, j, i] = own[h, i, j]
-        own[h, i, i] = 1.0
-        for c in range(width):
-            cross[h, i, c] /= root[h, i]
+        total = 0.0
         for k in range(6):
-            share[i, k] /= root[h, i]
+            total += share[i, k] * cross[h, i, unknown[i, k]]
+        if i >= nc + COMBINED:
+            total += SENSOR_FLOOR * work.variance[gnss + i - nc - COMBINED] + UNKNOWN_FLOOR * total
+        root[h, i] = math.sqrt(total)
+        scale = 1.0 / root[h, i]
+        for c in range(width):
+            cross[h, i, c] *= scale
+        for k in range(6):
+            share[i, k] *= scale
+    for i in range(size):
+        along, right, up = cross[h, i, ARC] + cross[h, i, CODE_PLACE], cross[h, i, RIGHT], cross[h, i, UP]
+        for j in range(i + 1, nc):
+            own[h, i, j] = own[h, j, i] = (
+                share[j, 0] * along
+                + share[j, 2] * right
+                + share[j, 3] * up
+                + share[j, 4] * cross[h, i, unknown[j, 4]]
+                + share[j, 5] * cross[h, i, unknown[j, 5]]
+            )
+        for j in range(max(i + 1, nc), size):
+            total = 0.0
+            for k in range(3 if j < nc + COMBINED else 6):
+                total += share[j, k] * cross[h, i, unknown[j, k]]
+            own[h, i, j] = own[h, j, i] = total
+        own[h, i, i] = 1.0

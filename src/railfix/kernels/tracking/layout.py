@@ -16,6 +16,11 @@ OF_EPOCH = 7
 #: Combinations of phases and Dopplers after the clock of the codes.
 C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
 COMBINED = 7
+#: Those of phases and Dopplers, and their order with clock and drift first, from the way on.
+MOTION = 6
+CLOCKS_FIRST = 1, 5, 0, 4, 2, 3
+#: Numbers in a vector of the processor: rows of the matrices in the work space are whole vectors.
+LANES = 8
 #: Kinds of sensors, and their columns: wheel, radar, force, place, balises in turn, and one for each range to a unit.
 SENSORS = 7
 #: Sources of sub-filters after the sensors: all Dopplers, all phases, codes of satellites ahead, behind, the map; and
@@ -253,7 +258,11 @@ class Work(NamedTuple):
     part: Floats
     source: Masks
     met: Masks
-    gain: Floats
+    scaled: Floats
+    normal: Floats
+    motion: Floats
+    joint: Floats
+    found: Floats
     less: Floats
     stepped: Floats
     faded: Floats

@@ -157,13 +157,13 @@ def code_shift(rows: Rows, work: Work, h: int) -> float:
     clock = root[h, nc]
     for i in range(nc):
         for j in range(i, nc):
-            system[h, i, j] = (
+            system[0, i, j] = (
                 root[h, i] * root[h, j] * own[h, i, j]
                 + clock * (root[h, i] * own[h, i, nc] + root[h, j] * own[h, j, nc])
                 + clock * clock
             )
-        system[h, i, i] += work.variance[i] / min(work.weight[h, i], 1.0)
-    factorise(system, h, nc, factor)
+        system[0, i, i] += work.variance[i] / min(work.weight[h, i], 1.0)
+    factorise(system, 0, nc, factor)
     # both solved forward: the products of U'^-1 by the design with itself and with the values are what is wanted
     score, information = 0.0, 0.0
     for i in range(nc):

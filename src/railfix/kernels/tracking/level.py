@@ -62,7 +62,7 @@ from railfix.kernels.tracking.layout import (
     Work,
 )
 from railfix.kernels.tracking.prediction import add_bend, predict
-from railfix.kernels.tracking.update import apply_update, first_weights, mean_weights, reweight
+from railfix.kernels.tracking.update import apply_update, first_weights, fit, mean_weights, weigh_residuals
 
 
 @borrowing
@@ -163,8 +163,10 @@ def _update(inputs: Inputs, t: int, rows: Rows, best: int, work: Work, h: int) -
     size = rows.counts[0] + COMBINED + rows.counts[3]
     invert(work.own, h, size, work.factor, work.lower, work.information, h)
     first_weights(rows, work.masked, parameters.degrees, 0.0, 0.0, work, h, h)
-    reweight(rows, work.masked, parameters.degrees, parameters.level_passes, work, h, h, h)
-    apply_update(rows, work, h)
+    for _ in range(parameters.level_passes - 1):
+        fit(rows, work.masked, work, h, h, h)
+        weigh_residuals(rows, work.masked, parameters.degrees, work, h)
+    apply_update(rows, work.masked, work, h)
 
 
 @borrowing

@@ -9,7 +9,7 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing, borrowing_kernel, by_reference
-from railfix.kernels.tracking.algebra import invert, restart
+from railfix.kernels.tracking.algebra import invert, log_determinant, restart
 from railfix.kernels.tracking.branches import keep_hypotheses, leading, reweigh
 from railfix.kernels.tracking.constants import (
     ACROSS_DOUBT,
@@ -214,7 +214,8 @@ def _update(inputs: Inputs, t: int, state: KernelState, rows: Rows, work: Work) 
                 for i in range(gnss + rows.counts[3]):
                     work.innovation[h, i] = work.value[h, i]
             combine(epochs, t, active, rows, work, h)
-            work.log_before[h] = invert(work.own, h, size, work.factor, work.lower, work.information, h)
+            invert(work.own, h, size, work.factor, work.lower, work.information, h)
+            work.log_before[h] = log_determinant(work.factor, size)
             if turn == 0:
                 first_weights(rows, work.variance, parameters.degrees, 0.0, 0.0, work, h, h)
                 if h == going:
@@ -226,7 +227,7 @@ def _update(inputs: Inputs, t: int, state: KernelState, rows: Rows, work: Work) 
         for h in range(count):
             if turn == 0 and doubtful:
                 second_start(parameters, rows, work, h, room)
-            apply_update(rows, work, h)
+            apply_update(rows, work.variance, work, h)
             furthest = max(furthest, abs(new_mean[h, ARC] - work.now[h]))
         if furthest < MOVED_M:
             break

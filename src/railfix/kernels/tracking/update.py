@@ -6,12 +6,34 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
-from railfix.kernels.tracking.algebra import factorise, invert, invert_factor, median, multiply, square
+from railfix.kernels.tracking.algebra import (
+    add_rows,
+    factorise,
+    invert,
+    invert_factor,
+    log_determinant,
+    median,
+    solve_forward,
+    square,
+    whole_lanes,
+)
 from railfix.kernels.tracking.constants import (
+    CODE_CLOCK_SIGMA_M,
     FREEDOM_PLACE_M2,
     FREEDOM_SPEED_M2PS2,
+    LEAST_PIVOT,
 )
-from railfix.kernels.tracking.layout import C_RIGHT, C_SPEED, C_WAY, COMBINED, Parameters, Rows, Work
+from railfix.kernels.tracking.layout import (
+    C_RIGHT,
+    C_SPEED,
+    C_WAY,
+    CLOCKS_FIRST,
+    COMBINED,
+    MOTION,
+    Parameters,
+    Rows,
+    Work,
+)
 
 
 @borrowing
@@ -73,91 +95,102 @@ def first_weights(
 
 
 @borrowing
-def reweight(
-    rows: Rows, variance: Floats, degrees: tuple[float, float], passes: int, work: Work, h: int, by: int, to: int
-) -> float:
-    """Rounds of reweighting; return log det of the covariance of the combinations after the epoch."""
+def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> None:
+    """Fit the combinations at the weights in row `to`: change, residuals and variances of what is fitted."""
     design, value, root, information, system = work.design, work.value, work.root, work.information, work.system
     change, weight, right, diagonal, with_clock = work.change, work.weight, work.right, work.diagonal, work.with_clock
     residual, spread, factor, lower = work.residual, work.fitted, work.factor, work.lower
     nc, nph, ns = rows.counts[0], rows.counts[1], rows.counts[3]
     gnss, size = nc + nph + rows.counts[2], nc + COMBINED + ns
-    log_determinant = 0.0
     clock = root[h, nc]
     part = work.part
-    for turn in range(passes):
-        for i in range(size):
-            right[i] = 0.0
-            for j in range(i, size):
-                system[to, i, j] = information[by, i, j]
-        for i in range(nc):
-            w = weight[to, i] / variance[i]
-            a = root[h, i] * w
-            system[to, i, i] += a * root[h, i]
-            system[to, i, nc] += a * clock
-            system[to, nc, nc] += w * clock * clock
-            right[i] += a * value[h, i]
-            right[nc] += w * clock * value[h, i]
-        for i in range(nc, gnss):
-            base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
-            w = weight[to, i] / variance[i]
+    width, end = lower.shape[1], whole_lanes(size)
+    for i in range(size):
+        right[i] = 0.0
+        for j in range(end):
+            system[0, i, j] = information[by, i, j]
+    for i in range(nc):
+        w = weight[to, i] / variance[i]
+        a = root[h, i] * w
+        system[0, i, i] += a * root[h, i]
+        system[0, i, nc] += a * clock
+        system[0, nc, nc] += w * clock * clock
+        right[i] += a * value[h, i]
+        right[nc] += w * clock * value[h, i]
+    for i in range(nc, gnss):
+        base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
+        w = weight[to, i] / variance[i]
+        for c in range(4):
+            part[c] = design[h, i, c] * root[h, base + c]
+        for c in range(4):
+            a = w * part[c]
+            right[base + c] += a * value[h, i]
+            for e in range(c, 4):
+                system[0, base + c, base + e] += a * part[e]
+    for j in range(ns):
+        i, k = gnss + j, nc + COMBINED + j
+        a = root[h, k] * weight[to, i] / variance[i]
+        system[0, k, k] += a * root[h, k]
+        right[k] += a * value[h, i]
+    factorise(system, 0, size, factor)
+    invert_factor(factor, size, lower)
+    for i in range(end):
+        change[to, i] = diagonal[i] = with_clock[i] = 0.0
+    for k in range(size):
+        right[k] *= lower[k, k]
+        for i in range(k + 1, size):
+            right[i] -= factor[k, i] * right[k]
+        for i in range(k + 1):
+            diagonal[i] += lower[k, i] * lower[k, i]
+    add_rows(change, to * change.shape[1], 1.0, right, (0, 1), lower, (0, width, size), end)
+    add_rows(with_clock, 0, 1.0, lower, (nc * width + nc, width), lower, (nc * width, width, size - nc), end)
+    for i in range(nc):
+        residual[to, i] = value[h, i] - root[h, i] * change[to, i] - clock * change[to, nc]
+        spread[to, i] = (
+            root[h, i] * root[h, i] * diagonal[i]
+            + 2.0 * root[h, i] * clock * with_clock[i]
+            + clock * clock * with_clock[nc]
+        )
+    for i in range(nc, gnss):
+        base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
+        fitted, variance_of_fit = 0.0, 0.0
+        for c in range(4):
+            part[c] = design[h, i, c] * root[h, base + c]
+            fitted += part[c] * change[to, base + c]
+        for k in range(base, size):
+            along = 0.0
             for c in range(4):
-                part[c] = design[h, i, c] * root[h, base + c]
-            for c in range(4):
-                a = w * part[c]
-                right[base + c] += a * value[h, i]
-                for e in range(c, 4):
-                    system[to, base + c, base + e] += a * part[e]
-        for j in range(ns):
-            i, k = gnss + j, nc + COMBINED + j
-            a = root[h, k] * weight[to, i] / variance[i]
-            system[to, k, k] += a * root[h, k]
-            right[k] += a * value[h, i]
-        log_determinant = -factorise(system, to, size, factor)
-        invert_factor(factor, size, lower)
-        for i in range(size):
-            change[to, i] = 0.0
-            diagonal[i] = with_clock[i] = 0.0
-        for k in range(size):
-            solved = right[k] / factor[k, k]
-            for i in range(k + 1, size):
-                right[i] -= factor[k, i] * solved
-            for i in range(k + 1):
-                change[to, i] += solved * lower[k, i]
-                diagonal[i] += lower[k, i] * lower[k, i]
-        for k in range(nc, size):
-            for i in range(nc + 1):
-                with_clock[i] += lower[k, nc] * lower[k, i]
-        for i in range(nc):
-            residual[to, i] = value[h, i] - root[h, i] * change[to, i] - clock * change[to, nc]
-            spread[to, i] = (
-                root[h, i] * root[h, i] * diagonal[i]
-                + 2.0 * root[h, i] * clock * with_clock[i]
-                + clock * clock * with_clock[nc]
-            )
-        for i in range(nc, gnss):
-            base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
-            fitted, variance_of_fit = 0.0, 0.0
-            for c in range(4):
-                part[c] = design[h, i, c] * root[h, base + c]
-                fitted += part[c] * change[to, base + c]
-            for k in range(base, size):
-                along = 0.0
-                for c in range(4):
-                    along += lower[k, base + c] * part[c]
-                variance_of_fit += along * along
-            residual[to, i] = value[h, i] - fitted
-            spread[to, i] = variance_of_fit
-        for j in range(ns):
-            i, k = gnss + j, nc + COMBINED + j
-            residual[to, i] = value[h, i] - root[h, k] * change[to, k]
-            spread[to, i] = root[h, k] * root[h, k] * diagonal[k]
-        if turn < passes - 1:
-            for i in range(gnss + ns):
-                relative = (residual[to, i] ** 2 + spread[to, i]) / variance[i]
-                weight[to, i] = weight_of(relative, residual[to, i] > 0.0 and i < nc, degrees)
-    square(lower, size, work.after, to)
-    return log_determinant
+                along += lower[k, base + c] * part[c]
+            variance_of_fit += along * along
+        residual[to, i] = value[h, i] - fitted
+        spread[to, i] = variance_of_fit
+    for j in range(ns):
+        i, k = gnss + j, nc + COMBINED + j
+        residual[to, i] = value[h, i] - root[h, k] * change[to, k]
+        spread[to, i] = root[h, k] * root[h, k] * diagonal[k]
+
+
+@borrowing
+def weigh_residuals(rows: Rows, variance: Floats, degrees: tuple[float, float], work: Work, to: int) -> None:
+    """Write the weights that follow from the residuals of a fit and their variances."""
+    weight, residual, nc = work.weight, work.residual, rows.counts[0]
+    for i in range(nc + rows.counts[1] + rows.counts[2] + rows.counts[3]):
+        relative = (residual[to, i] ** 2 + work.fitted[to, i]) / variance[i]
+        weight[to, i] = weight_of(relative, residual[to, i] > 0.0 and i < nc, degrees)
+
+
+@borrowing
+def reweight(
+    rows: Rows, variance: Floats, degrees: tuple[float, float], passes: int, work: Work, h: int, by: int, to: int
+) -> float:
+    """Rounds of reweighting; return log det of the covariance of the combinations after the epoch."""
+    size = rows.counts[0] + COMBINED + rows.counts[3]
+    fit(rows, variance, work, h, by, to)
+    for _ in range(passes - 1):
+        weigh_residuals(rows, variance, degrees, work, to)
+        fit(rows, variance, work, h, by, to)
+    square(work.lower, size, work.after, to)
+    return -log_determinant(work.factor, size)
 
 
 @borrowing
@@ -250,36 +283,136 @@ def second_start(parameters: Parameters, rows: Rows, work: Work, h: int, other: 
 
 
 @borrowing
-def apply_update(rows: Rows, work: Work, h: int) -> None:
-    """Write mean and covariance of the compact unknowns after the epoch, and behind them the mean of the old place."""
-    mean, spread, cross, system = work.mean, work.spread, work.cross, work.system
-    own, after, change, gain, less = work.own, work.after, work.change, work.gain, work.less
-    new_mean, new_covariance = work.new_mean, work.new_covariance
-    size, n = rows.counts[0] + COMBINED + rows.counts[3], new_covariance.shape[1]
-    multiply(work.information, h, cross[h], size, n + 1, gain)
-    for i in range(size):
-        for j in range(size):
-            system[h, i, j] = own[h, i, j] - after[h, i, j]
-    multiply(system, h, gain, size, n, less)
-    for c in range(n + 1):
-        new_mean[h, c] = mean[h, c]
-    for i in range(size):
+def _whiten_motion(rows: Rows, variance: Floats, work: Work, h: int) -> None:
+    """Write six rows that say what phases and Dopplers say at their weights, each with a variance of 1.
+
+    The factor of their normal matrix, over the standard deviations of the combinations, into `motion`, and behind it
+    the values. Clocks come first: where one begins anew, its variance is in one row alone. A row of what is not
+    measured is 0.
+    """
+    design, root, motion, normal = work.design, work.root, work.motion, work.normal
+    nc, nph = rows.counts[0], rows.counts[1]
+    for k in range(MOTION):
+        for c in range(MOTION + 1):
+            normal[k, c] = motion[k, c] = 0.0
+    for i in range(nc, nc + nph + rows.counts[2]):
+        base = 0 if i < nc + nph else C_RIGHT - C_WAY
+        w = work.weight[h, i] / variance[i]
+        for c in range(4):
+            a = w * design[h, i, c]
+            normal[base + c, MOTION] += a * work.value[h, i]
+            for e in range(4):
+                normal[base + c, base + e] += a * design[h, i, e]
+    for r in range(MOTION):
+        k = CLOCKS_FIRST[r]
+        work.part[r] = normal[k, k]
+    for r in range(MOTION):
+        k = CLOCKS_FIRST[r]
+        if normal[k, k] <= LEAST_PIVOT * work.part[r]:
+            continue
+        scale = 1.0 / math.sqrt(normal[k, k])
+        for q in range(r, MOTION):
+            motion[r, CLOCKS_FIRST[q]] = scale * normal[k, CLOCKS_FIRST[q]]
+        motion[r, MOTION] = scale * normal[k, MOTION]
+        for q in range(r + 1, MOTION):
+            a = motion[r, CLOCKS_FIRST[q]]
+            for c in range(MOTION + 1):
+                normal[CLOCKS_FIRST[q], c] -= a * motion[r, c]
+    for r in range(MOTION):
+        for c in range(MOTION):
+            motion[r, c] *= root[h, nc + C_WAY + c]
+
+
+@borrowing
+def apply_update(rows: Rows, variance: Floats, work: Work, h: int) -> None:
+    """Write mean and covariance of the compact unknowns after the epoch, and behind them the mean of the old place.
+
+    With Y the covariance of the weighted measurements with the unknowns, S = U' U that of their innovations without the
+    clock of the codes, X = U'^-1 Y, e = U'^-1 of what the clock adds to them, over its variance q after them::
+
+        P - X' X + X' e e' X / q        x + X' (U'^-1 v - e e' U'^-1 v / q)
+    """
+    own, root, cross, system, motion, joint = work.own, work.root, work.cross, work.system, work.motion, work.joint
+    nc, ns, n, found = rows.counts[0], rows.counts[3], work.new_covariance.shape[1], work.found
+    gnss, size, scaled = nc + rows.counts[1] + rows.counts[2], nc + MOTION + ns, work.scaled
+    first, sensors, width = nc + C_WAY, nc + COMBINED, found.shape[1]
+    end = whole_lanes(sensors + ns)
+    _whiten_motion(rows, variance, work, h)
+    for i in range(nc):
+        found[i, n + 1] = math.sqrt(work.weight[h, i] / variance[i])
+        found[i, n + 2] = found[i, n + 1] * work.value[h, i]
+        a = scaled[i] = found[i, n + 1] * root[h, i]
         for c in range(n + 1):
-            new_mean[h, c] += gain[i, c] * change[h, i]
-    for pair in range((n + 1) // 2):  # two rows at a time
-        c = min(2 * pair, n - 2)
-        for e in range(c + 2):
-            new_covariance[h, c, e], new_covariance[h, c + 1, e] = spread[h, c, e], spread[h, c + 1, e]
-        for i in range(0, size - 1, 2):
-            p, q, r, s = gain[i, c], gain[i + 1, c], gain[i, c + 1], gain[i + 1, c + 1]
-            for e in range(c + 2):
-                x, y = less[i, e], less[i + 1, e]
-                new_covariance[h, c, e] -= p * x + q * y
-                new_covariance[h, c + 1, e] -= r * x + s * y
-        if size % 2:
-            p, r = gain[size - 1, c], gain[size - 1, c + 1]
-            for e in range(c + 2):
-                new_covariance[h, c, e] -= p * less[size - 1, e]
-                new_covariance[h, c + 1, e] -= r * less[size - 1, e]
-        for e in range(c + 1):
-            new_covariance[h, e, c], new_covariance[h, e, c + 1] = new_covariance[h, c, e], new_covariance[h, c + 1, e]
+            found[i, c] = a * cross[h, i, c]
+        for c in range(n + 3, width):
+            found[i, c] = 0.0
+        for j in range(i + 1):
+            system[0, j, i] = a * scaled[j] * own[h, i, j]
+        system[0, i, i] += 1.0
+    for r in range(MOTION):
+        i = nc + r
+        for c in range(end):
+            joint[r, c] = 0.0
+        for c in range(width):
+            found[i, c] = 0.0
+        of, at = (r * motion.shape[1], 1), h * own.shape[1] + first
+        add_rows(joint, r * joint.shape[1], 1.0, motion, of, own, (at * own.shape[2], own.shape[2], MOTION), end)
+        add_rows(found, i * width, 1.0, motion, of, cross, (at * cross.shape[2], cross.shape[2], MOTION), width)
+        for j in range(nc):
+            system[0, j, i] = scaled[j] * joint[r, j]
+        for q in range(r + 1):
+            total = 0.0
+            for k in range(MOTION):
+                total += motion[q, k] * joint[r, first + k]
+            system[0, nc + q, i] = total
+        system[0, i, i] += 1.0
+        found[i, n + 1], found[i, n + 2] = 0.0, motion[r, MOTION]
+    for j in range(ns):
+        i, k = nc + MOTION + j, sensors + j
+        weight = math.sqrt(work.weight[h, gnss + j] / variance[gnss + j])
+        found[i, n + 1], found[i, n + 2] = 0.0, weight * work.value[h, gnss + j]
+        a = scaled[k] = weight * root[h, k]
+        for c in range(n + 1):
+            found[i, c] = a * cross[h, k, c]
+        for c in range(n + 3, width):
+            found[i, c] = 0.0
+        for c in range(nc):
+            system[0, c, i] = scaled[c] * a * own[h, k, c]
+        for r in range(MOTION):
+            system[0, nc + r, i] = a * joint[r, k]
+        for c in range(sensors, k + 1):
+            system[0, c - 1, i] = scaled[c] * a * own[h, k, c]
+        system[0, i, i] += 1.0
+    factorise(system, 0, size, work.factor)
+    solve_forward(work.factor, size, found)
+    _take_off(work, h, size, n)
+
+
+@borrowing
+def _take_off(work: Work, h: int, size: int, n: int) -> None:
+    """Take off what `apply_update` has found: X, the clock of the codes and the values, behind S in `factor`."""
+    mean, spread, new_mean, new_covariance = work.mean, work.spread, work.new_mean, work.new_covariance
+    less, found = work.less, work.found
+    known, sum_of_values = CODE_CLOCK_SIGMA_M**-2.0, 0.0
+    for c in range(n + 1):
+        new_mean[h, c], less[c] = mean[h, c], 0.0
+    for i in range(size):
+        e, v = found[i, n + 1], found[i, n + 2]
+        known += e * e
+        sum_of_values += e * v
+        for c in range(n + 1):
+            new_mean[h, c] += v * found[i, c]
+            less[c] += e * found[i, c]
+    for c in range(n + 1):
+        new_mean[h, c] -= sum_of_values / known * less[c]
+    known, width, row = 1.0 / math.sqrt(known), found.shape[1], new_covariance.shape[2]
+    for c in range(n):
+        less[c] *= known
+    for c in range(n):
+        end, at = whole_lanes(c + 1), (h * n + c) * row
+        for e in range(end):
+            new_covariance[h, c, e] = spread[h, c, e]
+        add_rows(new_covariance, at, 1.0, less, (c, 1), less, (0, 0, 1), end)
+        add_rows(new_covariance, at, -1.0, found, (c, width), found, (0, width, size), end)
+        for e in range(c):
+            new_covariance[h, e, c] = new_covariance[h, c, e]

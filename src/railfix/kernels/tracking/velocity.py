@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from railfix.core.arrays import Floats, Masks
-from railfix.kernels.compiling import kernel
-from railfix.kernels.tracking.algebra import invert, median
+from railfix.kernels.compiling import borrowing, kernel
+from railfix.kernels.tracking.algebra import median
 
 #: Standard deviation of the vertical velocity [m/s].
 CLIMB_MPS = 0.3
@@ -18,6 +18,22 @@ DEGREES = 4.0
 PASSES = 8
 REDUNDANT = 2
 AGREEING = 0.9
+
+
+@borrowing
+def _invert(matrix: Floats) -> None:
+    """Invert a positive definite matrix of 4 rows in its place."""
+    for k in range(4):
+        pivot = 1.0 / matrix[k, k]
+        matrix[k, k] = 1.0
+        for c in range(4):
+            matrix[k, c] *= pivot
+        for a in range(4):
+            if a != k:
+                share = matrix[a, k]
+                matrix[a, k] = 0.0
+                for c in range(4):
+                    matrix[a, c] -= share * matrix[k, c]
 
 
 @kernel
@@ -45,8 +61,7 @@ def fitted_velocities(
     velocity, covariance = np.full((epochs, 3), np.nan), np.full((epochs, 3, 3), np.nan)
     row, rest, information = np.empty((channels, 4)), np.empty((1, channels)), np.empty(channels)
     weight, square, ordered = np.empty(channels), np.empty(channels), np.empty(channels)
-    prior, normal, inverse = np.empty((4, 4)), np.empty((1, 4, 4)), np.empty((1, 4, 4))
-    factor, lower, right, solved = np.empty((4, 4)), np.zeros((4, 4)), np.empty(4), np.empty(4)
+    prior, normal, right, solved = np.empty((4, 4)), np.empty((4, 4)), np.empty(4), np.empty(4)
     for t in range(epochs):
         count = 0
         for k in range(channels):
@@ -67,18 +82,18 @@ def fitted_velocities(
             for a in range(4):
                 right[a] = 0.0
                 for b in range(4):
-                    normal[0, a, b] = prior[a, b]
+                    normal[a, b] = prior[a, b]
             for k in range(count):
                 for a in range(4):
                     scaled = row[k, a] * weight[k] * information[k]
                     right[a] += scaled * (rest[0, k] - clock)
-                    for b in range(a, 4):
-                        normal[0, a, b] += scaled * row[k, b]
-            invert(normal, 0, 4, factor, lower, inverse, 0)
+                    for b in range(4):
+                        normal[a, b] += scaled * row[k, b]
+            _invert(normal)
             for a in range(4):
                 solved[a] = 0.0
                 for b in range(4):
-                    solved[a] += inverse[0, a, b] * right[b]
+                    solved[a] += normal[a, b] * right[b]
             for k in range(count):
                 misfit = rest[0, k] - clock
                 for a in range(4):
@@ -94,5 +109,5 @@ def fitted_velocities(
         for a in range(3):
             velocity[t, a] = solved[a]
             for b in range(3):
-                covariance[t, a, b] = inverse[0, a, b] * max(size / (count - 3), 1.0)
+                covariance[t, a, b] = normal[a, b] * max(size / (count - 3), 1.0)
     return velocity, covariance
