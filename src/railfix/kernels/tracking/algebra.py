@@ -30,8 +30,11 @@ def _add_rows_plain(
 
 
 @intrinsic
-def _add_rows(_: Any, target: Any, at: Any, by: Any, left: Any, of: Any, source: Any, rows: Any, width: Any) -> Any:
+def _add_rows(
+    _: Any, target: Any, at: Any, by: Any, left: Any, of: Any, source: Any, rows: Any, width: Any
+) -> Any:
     """Sums of rows in vectors of the processor: of loops numba asks at each row whether arrays overlap."""
+    del at, by, of, rows, width  # of these types
     pair, three = (types.UniTuple(types.intp, size) for size in (2, 3))
     signature = types.void(target, types.intp, types.float64, left, pair, source, three, types.intp)
 
