@@ -286,12 +286,11 @@ def _work_space(
         "new_covariance": (room, unknowns, whole_lanes(unknowns)), "log_before": (room,), "log_after": (room,),
         "evidence": (room,), "code_evidence": (room,), "joined": (5, room), "branch": (room + pairs, 4),
         "beyond": (room,), "variance": (most,), "masked": (most,),
-        "system": (1, size, lanes), "factor": (size, lanes), "lower": (size, lanes), "right": (max(size, room),),
-        "diagonal": (lanes,), "with_clock": (lanes,),
+        "system": (1, size, lanes), "factor": (size, lanes), "lower": (2 * lanes + 1, lanes), "pivots": (3, lanes),
+        "right": (max(size, room),), "diagonal": (size,), "with_clock": (lanes,),
         "ordered": (most,), "part": (layout.MOTION,), "scaled": (size,),
         "normal": (layout.MOTION, layout.MOTION + 1), "motion": (layout.MOTION, layout.MOTION + 1),
-        "joint": (layout.MOTION, lanes), "less": (whole_lanes(unknowns + 1),),
-        "found": (size, whole_lanes(unknowns + 3)),
+        "joint": (layout.MOTION, lanes), "found": (size + 1, whole_lanes(unknowns + 3)),
         "stepped": (width, unknowns), "faded": (unknowns,), "share": (room, size, 6), "sight": (channels, 7),
         "bend": (2,), "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
     }  # fmt: skip
@@ -301,6 +300,7 @@ def _work_space(
         ranked=np.empty(room, dtype=np.intp), kept=np.empty(room, dtype=np.intp),
         unknown=np.zeros((room, size, 6), dtype=np.intp),
     )  # fmt: skip
+    work.lower[lanes:-1], work.pivots[2] = np.eye(lanes), 1.0
     listed = (np.empty(length, dtype=np.intp) for length in (channels, channels, channels, sensors, 4))
     return layout.Rows(*listed), work
 

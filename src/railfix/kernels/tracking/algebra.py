@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import numba
 from llvmlite import ir
@@ -15,39 +15,50 @@ from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.layout import LANES
 
-Pair: TypeAlias = tuple[int, int]
 _SHORT: Final = ir.IntType(32)
 _VECTOR: Final = ir.VectorType(ir.DoubleType(), LANES)
 
 
 def _add_rows_plain(
-    target: Floats, at: int, by: float, left: Floats, of: Pair, source: Floats, rows: tuple[int, int, int], width: int
+    target: Floats,
+    origin: Floats,
+    by: Floats,
+    left: Floats,
+    source: Floats,
+    places: tuple[int, int, int, int, int],
+    rows: tuple[int, int, int, int],
+    width: int,
 ) -> None:
-    begin, stride, count = rows
-    for k in range(count):
-        row = slice(begin + k * stride, begin + k * stride + width)
-        target.reshape(-1)[at : at + width] += by * left.reshape(-1)[of[0] + k * of[1]] * source.reshape(-1)[row]
+    (at, start, scale, first, begin), (step, stride, low, high) = places, rows
+    total = origin.reshape(-1)[start : start + width].copy()
+    for k in range(low, high):
+        row = begin + k * stride
+        share = by.reshape(-1)[scale + k] * left.reshape(-1)[first + k * step]
+        total += share * source.reshape(-1)[row : row + width]
+    target.reshape(-1)[at : at + width] = total
 
 
 @intrinsic
 def _add_rows(
-    _: Any, target: Any, at: Any, by: Any, left: Any, of: Any, source: Any, rows: Any, width: Any
+    _: Any, target: Any, origin: Any, by: Any, left: Any, source: Any, places: Any, rows: Any, width: Any
 ) -> Any:
     """Sums of rows in vectors of the processor: of loops numba asks at each row whether arrays overlap."""
-    del at, by, of, rows, width  # of these types
-    pair, three = (types.UniTuple(types.intp, size) for size in (2, 3))
-    signature = types.void(target, types.intp, types.float64, left, pair, source, three, types.intp)
+    del places, rows, width  # of these types
+    five, four = (types.UniTuple(types.intp, size) for size in (5, 4))
+    signature = types.void(target, origin, by, left, source, five, four, types.intp)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        target, at, by, left, of, source, rows, width = (
-            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
-            for kind, value in zip(signature.args, arguments, strict=True)
+        target, origin, by, left, source = (
+            context.make_array(kind)(context, builder, value).data
+            for kind, value in zip(signature.args[:5], arguments[:5], strict=True)
         )
-        (first, step), (begin, stride, count) = (cgutils.unpack_tuple(builder, value) for value in (of, rows))
+        at, start, scale, first, begin = cgutils.unpack_tuple(builder, arguments[5])
+        step, stride, low, high = cgutils.unpack_tuple(builder, arguments[6])
+        width = arguments[7]
         number = width.type
 
-        def vector_at(data: Any, start: Any, column: Any, k: int) -> Any:
-            offset = builder.add(builder.add(start, column), number(k * LANES))
+        def vector_at(data: Any, place: Any, column: Any, k: int) -> Any:
+            offset = builder.add(builder.add(place, column), number(k * LANES))
             return builder.bitcast(builder.gep(data, [offset]), _VECTOR.as_pointer())
 
         def add_columns(column: Any, vectors: int) -> None:
@@ -55,25 +66,26 @@ def _add_rows(
             ways, none = 4 // vectors, _VECTOR([0.0] * LANES)
             totals = [[cgutils.alloca_once_value(builder, none) for _ in range(vectors)] for _ in range(ways)]
             for k, total in enumerate(totals[0]):
-                builder.store(builder.load(vector_at(target, at, column, k), align=8), total)
+                builder.store(builder.load(vector_at(origin, start, column, k), align=8), total)
 
             def add(row: Any, way: int) -> None:
                 place = builder.add(first, builder.mul(row, step))
-                scalar = builder.fmul(by, builder.load(builder.gep(left, [place])))
-                single = builder.insert_element(_VECTOR(ir.Undefined), scalar, _SHORT(0))
+                share = builder.load(builder.gep(by, [builder.add(scale, row)]))
+                share = builder.fmul(share, builder.load(builder.gep(left, [place])))
+                single = builder.insert_element(_VECTOR(ir.Undefined), share, _SHORT(0))
                 factor = builder.shuffle_vector(single, single, ir.VectorType(_SHORT, LANES)([0] * LANES))
-                start = builder.add(begin, builder.mul(row, stride))
+                place = builder.add(begin, builder.mul(row, stride))
                 for k, total in enumerate(totals[way]):
-                    value = builder.load(vector_at(source, start, column, k), align=8)
+                    value = builder.load(vector_at(source, place, column, k), align=8)
                     product = builder.fmul(factor, value, flags=("contract",))
                     builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
 
-            together = builder.sub(count, builder.srem(count, number(ways)))
-            with cgutils.for_range_slice(builder, number(0), together, number(ways), inc=True) as (row, _):
+            together = builder.sub(high, builder.srem(builder.sub(high, low), number(ways)))
+            with cgutils.for_range_slice(builder, low, together, number(ways), inc=True) as (row, _):
                 for way in range(ways):
                     add(builder.add(row, number(way)), way)
             if ways > 1:
-                with cgutils.for_range_slice(builder, together, count, number(1), inc=True) as (row, _):
+                with cgutils.for_range_slice(builder, together, high, number(1), inc=True) as (row, _):
                     add(row, 0)
             for k in range(vectors):
                 total = functools.reduce(builder.fadd, [builder.load(parts[k]) for parts in totals])
@@ -91,8 +103,9 @@ def _add_rows(
     return signature, generate
 
 
-#: ``target[at + c] += by sum over k of left[of[0] + of[1] k] source[begin + stride k + c]`` for `count` rows and the
-#: columns below `width`, a number of whole vectors; all places are those in the flat arrays.
+#: Write ``origin[start + c] + sum over k of by[scale + k] left[first + step k] source[begin + stride k + c]`` into
+#: ``target[at + c]`` for rows from `low` to below `high` and the columns below `width`, a number of whole vectors. All
+#: places are those in the flat arrays.
 add_rows: Final[Any] = _add_rows_plain if numba.config.DISABLE_JIT else _add_rows  # type: ignore[attr-defined]
 
 
@@ -103,74 +116,68 @@ def whole_lanes(size: int) -> int:
 
 
 @borrowing
-def factorise(matrix: Floats, m: int, size: int, factor: Floats) -> None:
-    """Write the upper Cholesky factor U of a symmetric matrix, U' U = `matrix[m]`.
+def factorise(matrix: Floats, m: int, size: int, factor: Floats, pivots: Floats) -> None:
+    """Write the factor R of a symmetric matrix, R' D^-1 R = `matrix[m]`, an upper triangle with the diagonal D.
 
-    Of `matrix[m]` the upper half is read; what `factor` has below is not defined.
+    Of `matrix[m]` the upper half is read; what `factor` has below is not defined. `pivots` gets D^-1 and -D^-1.
     """
     width, end = factor.shape[1], whole_lanes(size)
     for i in range(size):
         first = i // LANES * LANES
-        for j in range(first, end):
-            factor[i, j] = matrix[m, i, j]
-        add_rows(factor, i * width + first, -1.0, factor, (i, width), factor, (first, width, i), end - first)
-        scale = 1.0 / math.sqrt(max(factor[i, i], 1e-300))
-        for j in range(first, end):
-            factor[i, j] *= scale
+        at = (m * matrix.shape[1] + i) * matrix.shape[2]
+        places = i * width + first, at + first, pivots.shape[1], i, first
+        add_rows(factor, matrix, pivots, factor, factor, places, (width, width, 0, i), end - first)
+        pivots[0, i] = 1.0 / max(factor[i, i], 1e-300)
+        pivots[1, i] = -pivots[0, i]
 
 
 @borrowing
-def log_determinant(factor: Floats, size: int) -> float:
-    """Return log det of U' U."""
+def log_determinant(pivots: Floats, size: int) -> float:
+    """Return log det of a factorised matrix."""
     total = 0.0
     for i in range(size):
-        total += math.log(factor[i, i])
-    return 2.0 * total
+        total -= math.log(pivots[0, i])
+    return total
 
 
 @borrowing
-def solve_forward(factor: Floats, size: int, right: Floats) -> None:
-    """Multiply `right` by U'^-1."""
+def solve_forward(factor: Floats, size: int, pivots: Floats, right: Floats) -> None:
+    """Multiply `right` by the inverse of R' D^-1."""
     width = right.shape[1]
     for i in range(size):
-        add_rows(right, i * width, -1.0, factor, (i, factor.shape[1]), right, (0, width, i), width)
-        scale = 1.0 / factor[i, i]
-        for j in range(width):
-            right[i, j] *= scale
+        places = i * width, i * width, pivots.shape[1], i, 0
+        add_rows(right, right, pivots, factor, right, places, (factor.shape[1], width, 0, i), width)
 
 
 @borrowing
-def invert_factor(factor: Floats, size: int, lower: Floats) -> None:
-    """Write L, the inverse of U', into `lower`, whose upper half is 0: the inverse of U' U is L' L."""
-    width = lower.shape[1]
-    for k in range(size):
-        end, scale = whole_lanes(k + 1), 1.0 / factor[k, k]
-        for i in range(end):
-            lower[k, i] = 0.0
-        add_rows(lower, k * width, -scale, factor, (k, factor.shape[1]), lower, (0, width, k), end)
-        lower[k, k] = scale
+def invert_factor(factor: Floats, size: int, pivots: Floats, lower: Floats) -> None:
+    """Write L, the inverse of R' D^-1: the inverse of the matrix is L' D^-1 L.
 
-
-@borrowing
-def square(lower: Floats, size: int, result: Floats, to: int) -> None:
-    """Write L' L into `result[to]`."""
-    width, end = lower.shape[1], whole_lanes(size)
-    for i in range(size):
-        for j in range(end):
-            result[to, i, j] = 0.0
-        at = (to * result.shape[1] + i) * result.shape[2]
-        add_rows(result, at, 1.0, lower, (i * width + i, width), lower, (i * width, width, size - i), end)
-
-
-@borrowing
-def invert(matrix: Floats, m: int, size: int, factor: Floats, lower: Floats, result: Floats, to: int) -> None:
-    """Write the inverse of a symmetric matrix into `result[to]`.
-
-    Of `matrix[m]` the upper half is read; `factor` and `lower` are work space, the upper half of `lower` is 0.
+    `lower` is a lower triangle with ones on the diagonal, zeros above it, and these again behind its last row.
     """
-    factorise(matrix, m, size, factor)
-    invert_factor(factor, size, lower)
-    square(lower, size, result, to)
+    width, ones = lower.shape[1], lower.shape[1] ** 2
+    for k in range(size):
+        places = k * width, ones + k * width, pivots.shape[1], k, 0
+        add_rows(lower, lower, pivots, factor, lower, places, (factor.shape[1], width, 0, k), whole_lanes(k + 1))
+
+
+@borrowing
+def square(lower: Floats, size: int, pivots: Floats, result: Floats, to: int) -> None:
+    """Write the inverse L' D^-1 L into `result[to]`."""
+    width, end, none = lower.shape[1], whole_lanes(size), (lower.shape[0] - 1) * lower.shape[1]
+    for i in range(size):
+        places = (to * result.shape[1] + i) * result.shape[2], none, 0, i, 0
+        add_rows(result, lower, pivots, lower, lower, places, (width, width, i, size), end)
+
+
+@borrowing
+def invert(
+    matrix: Floats, m: int, size: int, factor: Floats, pivots: Floats, lower: Floats, result: Floats, to: int
+) -> None:
+    """Write the inverse of a symmetric matrix into `result[to]`; the other arrays are work space (`invert_factor`)."""
+    factorise(matrix, m, size, factor, pivots)
+    invert_factor(factor, size, pivots, lower)
+    square(lower, size, pivots, result, to)
 
 
 @borrowing

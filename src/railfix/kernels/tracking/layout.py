@@ -251,6 +251,7 @@ class Work(NamedTuple):
     system: Floats
     factor: Floats
     lower: Floats
+    pivots: Floats
     right: Floats
     diagonal: Floats
     with_clock: Floats
@@ -263,7 +264,6 @@ class Work(NamedTuple):
     motion: Floats
     joint: Floats
     found: Floats
-    less: Floats
     stepped: Floats
     faded: Floats
     unknown: Indices

@@ -163,16 +163,16 @@ def code_shift(rows: Rows, work: Work, h: int) -> float:
                 + clock * clock
             )
         system[0, i, i] += work.variance[i] / min(work.weight[h, i], 1.0)
-    factorise(system, 0, nc, factor)
-    # both solved forward: the products of U'^-1 by the design with itself and with the values are what is wanted
+    factorise(system, 0, nc, factor, work.pivots)
+    # both solved forward: the products of L^-1 by the design with itself and with the values are what is wanted
     score, information = 0.0, 0.0
     for i in range(nc):
         right[i] = design[h, i, 0]
         work.ordered[i] = value[h, i]
     for i in range(nc):
-        solved, other = right[i] / factor[i, i], work.ordered[i] / factor[i, i]
-        score += solved * other
-        information += solved * solved
+        solved, other = work.pivots[0, i] * right[i], work.pivots[0, i] * work.ordered[i]
+        score += right[i] * other
+        information += right[i] * solved
         for j in range(i + 1, nc):
             right[j] -= factor[i, j] * solved
             work.ordered[j] -= factor[i, j] * other

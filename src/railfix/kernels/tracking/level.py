@@ -161,7 +161,7 @@ def _update(inputs: Inputs, t: int, rows: Rows, best: int, work: Work, h: int) -
     move_sensor_equations(active, rows, best, work, h)
     combine(epochs, t, active, rows, work, h)
     size = rows.counts[0] + COMBINED + rows.counts[3]
-    invert(work.own, h, size, work.factor, work.lower, work.information, h)
+    invert(work.own, h, size, work.factor, work.pivots, work.lower, work.information, h)
     first_weights(rows, work.masked, parameters.degrees, 0.0, 0.0, work, h, h)
     for _ in range(parameters.level_passes - 1):
         fit(rows, work.masked, work, h, h, h)

@@ -214,8 +214,8 @@ def _update(inputs: Inputs, t: int, state: KernelState, rows: Rows, work: Work) 
                 for i in range(gnss + rows.counts[3]):
                     work.innovation[h, i] = work.value[h, i]
             combine(epochs, t, active, rows, work, h)
-            invert(work.own, h, size, work.factor, work.lower, work.information, h)
-            work.log_before[h] = log_determinant(work.factor, size)
+            invert(work.own, h, size, work.factor, work.pivots, work.lower, work.information, h)
+            work.log_before[h] = log_determinant(work.pivots, size)
             if turn == 0:
                 first_weights(rows, work.variance, parameters.degrees, 0.0, 0.0, work, h, h)
                 if h == going:

@@ -99,7 +99,7 @@ def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> N
     """Fit the combinations at the weights in row `to`: change, residuals and variances of what is fitted."""
     design, value, root, information, system = work.design, work.value, work.root, work.information, work.system
     change, weight, right, diagonal, with_clock = work.change, work.weight, work.right, work.diagonal, work.with_clock
-    residual, spread, factor, lower = work.residual, work.fitted, work.factor, work.lower
+    residual, spread, factor, lower, pivots = work.residual, work.fitted, work.factor, work.lower, work.pivots
     nc, nph, ns = rows.counts[0], rows.counts[1], rows.counts[3]
     gnss, size = nc + nph + rows.counts[2], nc + COMBINED + ns
     clock = root[h, nc]
@@ -132,18 +132,20 @@ def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> N
         a = root[h, k] * weight[to, i] / variance[i]
         system[0, k, k] += a * root[h, k]
         right[k] += a * value[h, i]
-    factorise(system, 0, size, factor)
-    invert_factor(factor, size, lower)
-    for i in range(end):
-        change[to, i] = diagonal[i] = with_clock[i] = 0.0
+    factorise(system, 0, size, factor, pivots)
+    invert_factor(factor, size, pivots, lower)
+    for i in range(size):
+        diagonal[i] = 0.0
     for k in range(size):
-        right[k] *= lower[k, k]
+        inverse = pivots[0, k]
+        solved = right[k] * inverse
         for i in range(k + 1, size):
-            right[i] -= factor[k, i] * right[k]
+            right[i] -= factor[k, i] * solved
         for i in range(k + 1):
-            diagonal[i] += lower[k, i] * lower[k, i]
-    add_rows(change, to * change.shape[1], 1.0, right, (0, 1), lower, (0, width, size), end)
-    add_rows(with_clock, 0, 1.0, lower, (nc * width + nc, width), lower, (nc * width, width, size - nc), end)
+            diagonal[i] += inverse * lower[k, i] * lower[k, i]
+    none = (lower.shape[0] - 1) * width
+    add_rows(change, lower, pivots, right, lower, (to * change.shape[1], none, 0, 0, 0), (1, width, 0, size), end)
+    add_rows(with_clock, lower, pivots, lower, lower, (0, none, 0, nc, 0), (width, width, nc, size), end)
     for i in range(nc):
         residual[to, i] = value[h, i] - root[h, i] * change[to, i] - clock * change[to, nc]
         spread[to, i] = (
@@ -161,7 +163,7 @@ def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> N
             along = 0.0
             for c in range(4):
                 along += lower[k, base + c] * part[c]
-            variance_of_fit += along * along
+            variance_of_fit += along * along * pivots[0, k]
         residual[to, i] = value[h, i] - fitted
         spread[to, i] = variance_of_fit
     for j in range(ns):
@@ -189,8 +191,8 @@ def reweight(
     for _ in range(passes - 1):
         weigh_residuals(rows, variance, degrees, work, to)
         fit(rows, variance, work, h, by, to)
-    square(work.lower, size, work.after, to)
-    return -log_determinant(work.factor, size)
+    square(work.lower, size, work.pivots, work.after, to)
+    return -log_determinant(work.pivots, size)
 
 
 @borrowing
@@ -265,7 +267,7 @@ def second_start(parameters: Parameters, rows: Rows, work: Work, h: int, other: 
         for i in range(size):
             for j in range(i, size):
                 own[other, i, j] += freedom * share[i] * share[j]
-    invert(own, other, size, work.factor, work.lower, work.information, other)
+    invert(own, other, size, work.factor, work.pivots, work.lower, work.information, other)
     first_weights(rows, work.variance, parameters.degrees, FREEDOM_PLACE_M2, FREEDOM_SPEED_M2PS2, work, h, other)
     log_after = 0.0
     for by in (other, h):
@@ -327,16 +329,18 @@ def _whiten_motion(rows: Rows, variance: Floats, work: Work, h: int) -> None:
 def apply_update(rows: Rows, variance: Floats, work: Work, h: int) -> None:
     """Write mean and covariance of the compact unknowns after the epoch, and behind them the mean of the old place.
 
-    With Y the covariance of the weighted measurements with the unknowns, S = U' U that of their innovations without the
-    clock of the codes, X = U'^-1 Y, e = U'^-1 of what the clock adds to them, over its variance q after them::
+    With Y the covariance of the weighted measurements with the unknowns, S = L D L' that of their innovations without
+    the clock of the codes, X = L^-1 Y, e and v what L^-1 makes of the clock's coefficients and the innovations, and q
+    the information of the clock after them::
 
-        P - X' X + X' e e' X / q        x + X' (U'^-1 v - e e' U'^-1 v / q)
+        P - X' D^-1 X + z z' / q        x + X' D^-1 v - z (e' D^-1 v) / q        z = X' D^-1 e
     """
     own, root, cross, system, motion, joint = work.own, work.root, work.cross, work.system, work.motion, work.joint
     nc, ns, n, found = rows.counts[0], rows.counts[3], work.new_covariance.shape[1], work.found
     gnss, size, scaled = nc + rows.counts[1] + rows.counts[2], nc + MOTION + ns, work.scaled
     first, sensors, width = nc + C_WAY, nc + COMBINED, found.shape[1]
-    end = whole_lanes(sensors + ns)
+    lower, pivots, end = work.lower, work.pivots, own.shape[2]
+    ones, none, nothing = 2 * end, (lower.shape[0] - 1) * end, (found.shape[0] - 1) * width
     _whiten_motion(rows, variance, work, h)
     for i in range(nc):
         found[i, n + 1] = math.sqrt(work.weight[h, i] / variance[i])
@@ -351,13 +355,14 @@ def apply_update(rows: Rows, variance: Floats, work: Work, h: int) -> None:
         system[0, i, i] += 1.0
     for r in range(MOTION):
         i = nc + r
-        for c in range(end):
-            joint[r, c] = 0.0
-        for c in range(width):
-            found[i, c] = 0.0
-        of, at = (r * motion.shape[1], 1), h * own.shape[1] + first
-        add_rows(joint, r * joint.shape[1], 1.0, motion, of, own, (at * own.shape[2], own.shape[2], MOTION), end)
-        add_rows(found, i * width, 1.0, motion, of, cross, (at * cross.shape[2], cross.shape[2], MOTION), width)
+        of, at, row = (
+            r * motion.shape[1],
+            (h * own.shape[1] + first) * end,
+            (h * cross.shape[1] + first) * cross.shape[2],
+        )
+        add_rows(joint, lower, pivots, motion, own, (r * end, none, ones, of, at), (1, end, 0, MOTION), end)
+        places = i * width, nothing, ones, of, row
+        add_rows(found, found, pivots, motion, cross, places, (1, cross.shape[2], 0, MOTION), width)
         for j in range(nc):
             system[0, j, i] = scaled[j] * joint[r, j]
         for q in range(r + 1):
@@ -383,36 +388,34 @@ def apply_update(rows: Rows, variance: Floats, work: Work, h: int) -> None:
         for c in range(sensors, k + 1):
             system[0, c - 1, i] = scaled[c] * a * own[h, k, c]
         system[0, i, i] += 1.0
-    factorise(system, 0, size, work.factor)
-    solve_forward(work.factor, size, found)
+    factorise(system, 0, size, work.factor, pivots)
+    solve_forward(work.factor, size, pivots, found)
     _take_off(work, h, size, n)
 
 
 @borrowing
 def _take_off(work: Work, h: int, size: int, n: int) -> None:
-    """Take off what `apply_update` has found: X, the clock of the codes and the values, behind S in `factor`."""
+    """Take off what `apply_update` has found: X, the clock of the codes and the values, not yet over D."""
     mean, spread, new_mean, new_covariance = work.mean, work.spread, work.new_mean, work.new_covariance
-    less, found = work.less, work.found
-    known, sum_of_values = CODE_CLOCK_SIGMA_M**-2.0, 0.0
+    found, pivots = work.found, work.pivots
+    width, row, of, none = (
+        found.shape[1],
+        new_covariance.shape[2],
+        spread.shape[1],
+        (found.shape[0] - 1) * found.shape[1],
+    )
+    add_rows(found, found, pivots, found, found, (size * width, none, 0, n + 1, 0), (width, width, 0, size), width)
+    known = 1.0 / CODE_CLOCK_SIGMA_M**2 + found[size, n + 1]
+    clock = found[size, n + 2] / known
     for c in range(n + 1):
-        new_mean[h, c], less[c] = mean[h, c], 0.0
+        new_mean[h, c] = mean[h, c] - clock * found[size, c]
     for i in range(size):
-        e, v = found[i, n + 1], found[i, n + 2]
-        known += e * e
-        sum_of_values += e * v
+        value = pivots[0, i] * found[i, n + 2]
         for c in range(n + 1):
-            new_mean[h, c] += v * found[i, c]
-            less[c] += e * found[i, c]
-    for c in range(n + 1):
-        new_mean[h, c] -= sum_of_values / known * less[c]
-    known, width, row = 1.0 / math.sqrt(known), found.shape[1], new_covariance.shape[2]
+            new_mean[h, c] += value * found[i, c]
+    pivots[1, size] = 1.0 / known
     for c in range(n):
-        less[c] *= known
-    for c in range(n):
-        end, at = whole_lanes(c + 1), (h * n + c) * row
-        for e in range(end):
-            new_covariance[h, c, e] = spread[h, c, e]
-        add_rows(new_covariance, at, 1.0, less, (c, 1), less, (0, 0, 1), end)
-        add_rows(new_covariance, at, -1.0, found, (c, width), found, (0, width, size), end)
+        places = (h * n + c) * row, (h * of + c) * of, pivots.shape[1], c, 0
+        add_rows(new_covariance, spread, pivots, found, found, places, (width, width, 0, size + 1), whole_lanes(c + 1))
         for e in range(c):
             new_covariance[h, e, c] = new_covariance[h, c, e]
