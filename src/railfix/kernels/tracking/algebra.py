@@ -44,7 +44,7 @@ def _add_rows(
 ) -> Any:
     """Sums of rows in vectors of the processor: of loops numba asks at each row whether arrays overlap."""
     del places, rows, width  # of these types
-    five, four = (types.UniTuple(types.intp, size) for size in (5, 4))
+    five, four = (types.UniTuple(types.intp, size) for size in (5, 4))  # type: ignore[no-untyped-call]
     signature = types.void(target, origin, by, left, source, five, four, types.intp)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -52,8 +52,8 @@ def _add_rows(
             context.make_array(kind)(context, builder, value).data
             for kind, value in zip(signature.args[:5], arguments[:5], strict=True)
         )
-        at, start, scale, first, begin = cgutils.unpack_tuple(builder, arguments[5])
-        step, stride, low, high = cgutils.unpack_tuple(builder, arguments[6])
+        at, start, scale, first, begin = cgutils.unpack_tuple(builder, arguments[5])  # type: ignore[no-untyped-call]
+        step, stride, low, high = cgutils.unpack_tuple(builder, arguments[6])  # type: ignore[no-untyped-call]
         width = arguments[7]
         number = width.type
 
@@ -64,7 +64,10 @@ def _add_rows(
         def add_columns(column: Any, vectors: int) -> None:
             # narrow rows are summed up in several parts, as each sum waits for the one before
             ways, none = 4 // vectors, _VECTOR([0.0] * LANES)
-            totals = [[cgutils.alloca_once_value(builder, none) for _ in range(vectors)] for _ in range(ways)]
+            totals = [
+                [cgutils.alloca_once_value(builder, none) for _ in range(vectors)]  # type: ignore[no-untyped-call]
+                for _ in range(ways)
+            ]
             for k, total in enumerate(totals[0]):
                 builder.store(builder.load(vector_at(origin, start, column, k), align=8), total)
 

@@ -95,6 +95,33 @@ def first_weights(
 
 
 @borrowing
+def _write_normal(rows: Rows, variance: Floats, work: Work, h: int, to: int) -> None:
+    """Write the normal matrix of phases and Dopplers at the weights in row `to`, and behind it that of the values."""
+    design, normal = work.design, work.normal
+    begin = rows.counts[0]
+    for k in range(MOTION):
+        for c in range(MOTION + 1):
+            normal[k, c] = 0.0
+    for kind in range(1, 3):
+        base = 0 if kind == 1 else C_RIGHT - C_WAY
+        aa = ab = ac = ad = bb = bc = bd = cc = cd = dd = av = bv = cv = dv = 0.0
+        for i in range(begin, begin + rows.counts[kind]):
+            w, v = work.weight[to, i] / variance[i], work.value[h, i]
+            a, b, c, d = design[h, i, 0], design[h, i, 1], design[h, i, 2], design[h, i, 3]
+            wa, wb, wc, wd = w * a, w * b, w * c, w * d
+            aa, ab, ac, ad, av = aa + wa * a, ab + wa * b, ac + wa * c, ad + wa * d, av + wa * v
+            bb, bc, bd, bv = bb + wb * b, bc + wb * c, bd + wb * d, bv + wb * v
+            cc, cd, cv, dd, dv = cc + wc * c, cd + wc * d, cv + wc * v, dd + wd * d, dv + wd * v
+        begin += rows.counts[kind]
+        sums = (aa, ab, ac, ad), (ab, bb, bc, bd), (ac, bc, cc, cd), (ad, bd, cd, dd)
+        values = av, bv, cv, dv
+        for k in range(4):
+            normal[base + k, MOTION] += values[k]
+            for q in range(4):
+                normal[base + k, base + q] += sums[k][q]
+
+
+@borrowing
 def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> None:
     """Fit the combinations at the weights in row `to`: change, residuals and variances of what is fitted."""
     design, value, root, information, system = work.design, work.value, work.root, work.information, work.system
@@ -102,8 +129,7 @@ def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> N
     residual, spread, factor, lower, pivots = work.residual, work.fitted, work.factor, work.lower, work.pivots
     nc, nph, ns = rows.counts[0], rows.counts[1], rows.counts[3]
     gnss, size = nc + nph + rows.counts[2], nc + COMBINED + ns
-    clock = root[h, nc]
-    part = work.part
+    clock, first, normal = root[h, nc], nc + C_WAY, work.normal
     width, end = lower.shape[1], whole_lanes(size)
     for i in range(size):
         right[i] = 0.0
@@ -117,16 +143,12 @@ def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> N
         system[0, nc, nc] += w * clock * clock
         right[i] += a * value[h, i]
         right[nc] += w * clock * value[h, i]
-    for i in range(nc, gnss):
-        base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
-        w = weight[to, i] / variance[i]
-        for c in range(4):
-            part[c] = design[h, i, c] * root[h, base + c]
-        for c in range(4):
-            a = w * part[c]
-            right[base + c] += a * value[h, i]
-            for e in range(c, 4):
-                system[0, base + c, base + e] += a * part[e]
+    _write_normal(rows, variance, work, h, to)
+    for k in range(MOTION):
+        a = root[h, first + k]
+        right[first + k] += a * normal[k, MOTION]
+        for c in range(k, MOTION):
+            system[0, first + k, first + c] += a * root[h, first + c] * normal[k, c]
     for j in range(ns):
         i, k = gnss + j, nc + COMBINED + j
         a = root[h, k] * weight[to, i] / variance[i]
@@ -153,19 +175,26 @@ def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> N
             + 2.0 * root[h, i] * clock * with_clock[i]
             + clock * clock * with_clock[nc]
         )
+    for k in range(MOTION):
+        a = root[h, first + k]
+        normal[k, MOTION] = a * change[to, first + k]
+        for c in range(k + 1):
+            total = 0.0
+            for j in range(first + k, size):
+                total += pivots[0, j] * lower[j, first + k] * lower[j, first + c]
+            normal[c, k] = a * root[h, first + c] * total
     for i in range(nc, gnss):
-        base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
-        fitted, variance_of_fit = 0.0, 0.0
-        for c in range(4):
-            part[c] = design[h, i, c] * root[h, base + c]
-            fitted += part[c] * change[to, base + c]
-        for k in range(base, size):
-            along = 0.0
-            for c in range(4):
-                along += lower[k, base + c] * part[c]
-            variance_of_fit += along * along * pivots[0, k]
-        residual[to, i] = value[h, i] - fitted
-        spread[to, i] = variance_of_fit
+        k = 0 if i < nc + nph else C_RIGHT - C_WAY
+        a, b, c, d = design[h, i, 0], design[h, i, 1], design[h, i, 2], design[h, i, 3]
+        residual[to, i] = value[h, i] - (
+            a * normal[k, MOTION] + b * normal[k + 1, MOTION] + c * normal[k + 2, MOTION] + d * normal[k + 3, MOTION]
+        )
+        spread[to, i] = (
+            a * (a * normal[k, k] + 2.0 * (b * normal[k, k + 1] + c * normal[k, k + 2] + d * normal[k, k + 3]))
+            + b * (b * normal[k + 1, k + 1] + 2.0 * (c * normal[k + 1, k + 2] + d * normal[k + 1, k + 3]))
+            + c * (c * normal[k + 2, k + 2] + 2.0 * d * normal[k + 2, k + 3])
+            + d * d * normal[k + 3, k + 3]
+        )
     for j in range(ns):
         i, k = gnss + j, nc + COMBINED + j
         residual[to, i] = value[h, i] - root[h, k] * change[to, k]
@@ -292,22 +321,13 @@ def _whiten_motion(rows: Rows, variance: Floats, work: Work, h: int) -> None:
     the values. Clocks come first: where one begins anew, its variance is in one row alone. A row of what is not
     measured is 0.
     """
-    design, root, motion, normal = work.design, work.root, work.motion, work.normal
-    nc, nph = rows.counts[0], rows.counts[1]
-    for k in range(MOTION):
-        for c in range(MOTION + 1):
-            normal[k, c] = motion[k, c] = 0.0
-    for i in range(nc, nc + nph + rows.counts[2]):
-        base = 0 if i < nc + nph else C_RIGHT - C_WAY
-        w = work.weight[h, i] / variance[i]
-        for c in range(4):
-            a = w * design[h, i, c]
-            normal[base + c, MOTION] += a * work.value[h, i]
-            for e in range(4):
-                normal[base + c, base + e] += a * design[h, i, e]
+    root, motion, normal, nc = work.root, work.motion, work.normal, rows.counts[0]
+    _write_normal(rows, variance, work, h, h)
     for r in range(MOTION):
         k = CLOCKS_FIRST[r]
         work.part[r] = normal[k, k]
+        for c in range(MOTION + 1):
+            motion[r, c] = 0.0
     for r in range(MOTION):
         k = CLOCKS_FIRST[r]
         if normal[k, k] <= LEAST_PIVOT * work.part[r]:
