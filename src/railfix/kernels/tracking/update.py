@@ -18,7 +18,6 @@ from railfix.kernels.tracking.algebra import (
     whole_lanes,
 )
 from railfix.kernels.tracking.constants import (
-    CODE_CLOCK_SIGMA_M,
     FREEDOM_PLACE_M2,
     FREEDOM_SPEED_M2PS2,
     LEAST_PIVOT,
@@ -410,12 +409,15 @@ def apply_update(rows: Rows, variance: Floats, work: Work, h: int) -> None:
         system[0, i, i] += 1.0
     factorise(system, 0, size, work.factor, pivots)
     solve_forward(work.factor, size, pivots, found)
-    _take_off(work, h, size, n)
+    _take_off(work, h, size, n, 1.0 / root[h, nc] ** 2)
 
 
 @borrowing
-def _take_off(work: Work, h: int, size: int, n: int) -> None:
-    """Take off what `apply_update` has found: X, the clock of the codes and the values, not yet over D."""
+def _take_off(work: Work, h: int, size: int, n: int, known: float) -> None:
+    """Take off what `apply_update` has found: X, the clock of the codes and the values, not yet over D.
+
+    `known` is the information of that clock before.
+    """
     mean, spread, new_mean, new_covariance = work.mean, work.spread, work.new_mean, work.new_covariance
     found, pivots = work.found, work.pivots
     width, row, of, none = (
@@ -425,7 +427,7 @@ def _take_off(work: Work, h: int, size: int, n: int) -> None:
         (found.shape[0] - 1) * found.shape[1],
     )
     add_rows(found, found, pivots, found, found, (size * width, none, 0, n + 1, 0), (width, width, 0, size), width)
-    known = 1.0 / CODE_CLOCK_SIGMA_M**2 + found[size, n + 1]
+    known = known + found[size, n + 1]
     clock = found[size, n + 2] / known
     for c in range(n + 1):
         new_mean[h, c] = mean[h, c] - clock * found[size, c]
