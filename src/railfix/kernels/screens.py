@@ -163,7 +163,7 @@ def clock_steps(
                 code[m] = math.nan
             if not (math.isfinite(code_m[t, m]) and math.isfinite(rate_mps[t, m])):
                 continue
-            passed = time_ns[t] - since[m]
+            passed = time_ns[t] - since[m] if since[m] != NEVER else 0
             dt = passed // _NS + (passed % _NS) / _NS
             change = code_m[t, m] - code[m] - (rate_mps[t, m] + rate[m]) / 2.0 * dt
             if since[m] != NEVER and dt <= longest_s and not math.isnan(change):
@@ -197,7 +197,7 @@ def holds(
             counts[t, c] = signs[t, c] and run[c] >= hold_ns[c]
             if counts[t, c]:
                 last[c] = time_ns[t]
-            passed = time_ns[t] - last[c]
+            passed = time_ns[t] - last[c] if last[c] != NEVER else 0
             stays[t, c] = last[c] != NEVER and passed // _NS + (passed % _NS) / _NS <= release_s[c]
         previous = time_ns[t]
     return counts, stays, (run, last)
