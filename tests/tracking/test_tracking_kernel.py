@@ -105,10 +105,9 @@ def test_as_plain_python_the_recursion_gives_the_same(name: str, first: int, mon
             np.testing.assert_array_equal(one, other, err_msg=field.name)
 
 
-def _dense_update(handed: Handover, recursion: Recursion, t: int, h: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Design over the unknowns in use and those of an epoch, innovations and variances of codes, phases, Dopplers."""
-    rows, work = handed.rows, handed.work
-    nc, nph, nd, _ = rows.counts.tolist()
+def _design(rows: Any, work: Any, h: int) -> np.ndarray:
+    """Design of codes, phases and Dopplers over the unknowns in use and those of an epoch."""
+    nc, nph, nd, _ = (int(count) for count in rows.counts)
     width, size = work.mean.shape[1], nc + layout.COMBINED
     combine = np.zeros((size, width))
     share = work.share[h, :size] * work.root[h, :size, None]
@@ -118,9 +117,45 @@ def _dense_update(handed: Handover, recursion: Recursion, t: int, h: int) -> tup
     for kind, first, count in ((layout.C_WAY, nc, nph), (layout.C_RIGHT, nc + nph, nd)):
         at = slice(first, first + count)
         design[at, nc + kind : nc + kind + 4] = work.design[h, at]
+    return np.asarray(design @ combine)
+
+
+def _dense_update(handed: Handover, recursion: Recursion, t: int, h: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of a hypothesis, innovations and variances."""
+    rows, work = handed.rows, handed.work
+    nc, nph, nd, _ = rows.counts.tolist()
     kinds = [(0, rows.codes[:nc]), (1, rows.phases[:nph]), (2, rows.dopplers[:nd])]
     variance = np.concatenate([recursion.epochs.variance[kind, t, channels] for kind, channels in kinds])
-    return design @ combine, work.innovation[h, : nc + nph + nd], variance
+    return _design(rows, work, h), work.innovation[h, : nc + nph + nd], variance
+
+
+@pytest.mark.requirement("E5", "C2")
+@pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="this machine has no numbers of 80 bits")
+def test_the_update_of_each_sub_filter_keeps_its_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against 80 bits, from the start: without Dopplers the phase of one satellite alone tells of the drift."""
+    case = ride(40, noise=1.0, seed=5)
+    phase = np.where(np.arange(case.epochs.phase_m.shape[1]) == 0, case.epochs.phase_m, np.nan)
+    advance = plain("tracking.recursion").advance
+    names: dict[str, Any] = advance.__globals__["advance_subfilters"].__globals__
+    update, errors = names["_update"], list[float]()
+
+    def updated(inputs: Any, t: int, rows: Any, best: int, work: Any, h: int) -> None:
+        update(inputs, t, rows, best, work, h)
+        design, prior = (a.astype(np.longdouble) for a in (_design(rows, work, h), work.spread[h]))
+        variance = (work.masked[: len(design)] / work.weight[h, : len(design)]).astype(np.longdouble)
+        prior, n = prior[: design.shape[1], : design.shape[1]], work.new_mean.shape[1] - 1
+        for row, own in zip(design[np.isfinite(variance)], variance[np.isfinite(variance)], strict=True):
+            gain = prior @ row  # one after the other: nothing is inverted
+            prior = prior - np.outer(gain, gain) / (row @ gain + own)
+        sigma = np.sqrt(np.diag(prior)[:n])
+        difference = work.new_covariance[h][:n, :n] - prior[:n, :n]
+        errors.append(float(np.abs(difference / np.outer(sigma, sigma)).max()))
+
+    monkeypatch.setitem(names, "_update", updated)
+    monkeypatch.setattr("railfix.tracking.filter._kernel", lambda: advance)
+    track(part(replace(case.epochs, phase_m=phase), slice(0, 4)), case.line, levels=True)
+    assert len(errors) > 20
+    assert max(errors) < 1e-8
 
 
 @pytest.mark.requirement("E5", "C6")
