@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -129,7 +130,10 @@ def test_rows_are_in_the_parquet_file_before_it_ends(tmp_path: Path) -> None:
             folder.append_parquet("positions.parquet", table)
         # No pieces to join at the end, and of 60 tables few wait in memory.
         assert [path.name for path in folder.staging.iterdir()] == ["positions.parquet"]
-        written = (folder.staging / "positions.parquet").stat().st_size
+        staged, written, before = folder.staging / "positions.parquet", 0, -1
+        while written != before:  # the thread that writes may be behind
+            time.sleep(0.3)
+            before, written = written, staged.stat().st_size
         folder.end_parquet({"provenance": "x"})
         assert folder.scan("positions.parquet").select(pl.len()).collect().item() == 600_000
         file = folder.commit()["positions.parquet"]
