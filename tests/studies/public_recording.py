@@ -18,6 +18,7 @@ from pathlib import Path
 
 import polars as pl
 
+import paths  # noqa: F401  where case_files is
 from case_files import write_case
 
 WHEEL = "gnss-benchmark==2.3.0"
