@@ -21,7 +21,6 @@ from railfix.report import read_runs, write_page
 from railfix.run import RunOptions, run_files
 from railfix.run.output import Overwrite, check_folder
 from railfix.simulate.demonstration import demo_inputs, demo_truth
-from railfix.simulate.run import write_run
 from railfix.simulate.scenario import Scenario
 from railfix.simulate.scenario_file import Recipe, list_scenarios, load_recipe
 
@@ -110,6 +109,8 @@ def _simulate(
     folders: dict[int, Path],
     options: SimulateOptions,
 ) -> None:
+    from railfix.simulate.run import write_run  # scipy.signal takes 0.4 s to load
+
     done = 0
     files: dict[str, Path] = {}
     with progress_bar("simulation") as show:

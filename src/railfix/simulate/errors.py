@@ -14,7 +14,6 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
 
 from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
@@ -77,6 +76,8 @@ class GaussMarkov(Interpolated):
     """Independent Gauss-Markov processes with keys as seeds; a longer run begins with the same values."""
 
     def __init__(self, keys: Sequence[Sequence[int]], *, sigma: float, time_s: float, duration_s: float) -> None:
+        from scipy.signal import lfilter  # 0.4 s to load, at each start that only reads a scenario
+
         spacing = time_s / _NODES_A_TIME
         rho = float(np.exp(-1.0 / _NODES_A_TIME))
         count = node_count(duration_s, spacing)

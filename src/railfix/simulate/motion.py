@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
-from scipy.signal import cont2discrete, lfilter
 
 from railfix.core.arrays import Floats
 from railfix.core.constants import GRAVITY_MPS2
@@ -317,6 +316,8 @@ class BodyMotion:
     @cached_property
     def _response(self) -> CubicSpline[np.float64]:
         """Pitch under the train's acceleration: a damped oscillator of the suspension's period."""
+        from scipy.signal import cont2discrete, lfilter
+
         last = max(self._duration_s, float(self._motion.time_s[-1])) + _MARGIN_S
         time = np.arange(-_MARGIN_S, last + _STEP_S, _STEP_S)
         omega = 2.0 * np.pi / self._vehicle.pitch_period_s
