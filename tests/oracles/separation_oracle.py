@@ -25,7 +25,6 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.protection.level import Asked, Errors
 from railfix.integrity.raim.model import LinearModel, ModelArrays, compact
-from railfix.positioning.normal_equations import inverse_3x3
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 NO_EFFECT: Final = 1e-6
@@ -245,6 +244,23 @@ def without_group(full: AllInView, members: Masks | None) -> Remaining:
     blind: Masks = np.any(~checked & (np.abs(rows[..., n]) > limit), axis=1)
     gone = np.einsum("tm,tmc->tc", rows[..., n], scaled[..., n:])
     return Remaining(full, columns - rows[..., :n].swapaxes(1, 2) @ scaled, gone, blind)
+
+
+def inverse_3x3(matrix: Floats) -> Floats:
+    """Invert symmetric 3 x 3 matrices by cofactors; NaN where the scaled determinant is below 1e-12."""
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    cofactors = np.empty(matrix.shape)
+    cofactors[..., 0, 0] = d * f - e * e
+    cofactors[..., 1, 1] = a * f - c * c
+    cofactors[..., 2, 2] = a * d - b * b
+    cofactors[..., 0, 1] = cofactors[..., 1, 0] = c * e - b * f
+    cofactors[..., 0, 2] = cofactors[..., 2, 0] = b * e - c * d
+    cofactors[..., 1, 2] = cofactors[..., 2, 1] = b * c - a * e
+    determinant = a * cofactors[..., 0, 0] + b * cofactors[..., 0, 1] + c * cofactors[..., 0, 2]
+    regular = determinant > 1e-12 * ((a + d + f) / 3.0) ** 3
+    determinant = np.where(regular, determinant, np.nan)
+    return cofactors / determinant[..., None, None]
 
 
 def regular_inverse(matrix: Floats) -> Floats:

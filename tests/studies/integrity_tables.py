@@ -37,7 +37,7 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_scale import map_information
-from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
+from railfix.positioning.normal_equations import Ranges, normal_equations
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
@@ -294,7 +294,7 @@ def _scale(ranges: Ranges, place: Floats, prior: Floats, weight: Callable[[Float
     distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
     for _ in range(1 if weight is None else 5):
         equations = normal_equations(replace(ranges, weight=ranges.weight * factor), place)
-        step = np.einsum("tij,tj->ti", inverse_3x3(equations.matrix + prior), equations.vector)
+        step = np.einsum("tij,tj->ti", np.linalg.inv(equations.matrix + prior), equations.vector)
         clock = equations.clock_m[:, 0] - np.einsum("ti,ti->t", step, equations.clock_slope[:, :, 0])
         residual = ranges.code_m - distance + np.einsum("tmi,ti->tm", los, step) - clock[:, None]
         size = np.where(used, np.abs(residual) * np.sqrt(ranges.weight), np.nan)
@@ -328,7 +328,7 @@ ESTIMATORS: Final[dict[str, Callable[[Ranges, Floats, Floats], Floats]]] = {
 
 def _root_mean_square(ranges: Ranges, place: Floats, prior: Floats) -> Floats:
     equations = normal_equations(ranges, place)
-    step = np.einsum("tij,tj->ti", inverse_3x3(equations.matrix + prior), equations.vector)
+    step = np.einsum("tij,tj->ti", np.linalg.inv(equations.matrix + prior), equations.vector)
     least = equations.wsse - np.einsum("ti,ti->t", step, equations.vector)
     return np.asarray(np.sqrt(np.maximum(least, 0.0) / np.maximum(ranges.n_used - 2, 1)))
 

@@ -93,7 +93,8 @@ class _InnerCompiler(CompilerBase):
         return [manager]
 
 
-#: Versions of numba whose inner workings `_InnerCompiler` is known to suit; others compile in the usual way.
+#: Versions of numba whose inner workings `_InnerCompiler` and `_CodeOnDisk` are known to suit; others compile and load
+#: in the usual way.
 _SUITED: Final = ((0, 61), (0, 68))
 _IS_SUITED: Final = _SUITED[0] <= tuple(int(part) for part in numba.__version__.split(".")[:2]) <= _SUITED[1]
 
@@ -220,7 +221,7 @@ class _CodeOnDisk(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the code for types of arguments, None where there is none.
 
-        numba would load all that it compiles with before it: 0.15 s. A compilation loads that itself.
+        numba first loads what it needs to compile, 0.15 s; a compilation loads that itself.
         """
         if not _IS_SUITED:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]

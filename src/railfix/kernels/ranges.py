@@ -208,7 +208,7 @@ def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: 
 
 @inner
 def invert(matrix: Floats, inverse: Floats) -> None:
-    """Invert a symmetric matrix by its cofactors (`inverse_3x3`)."""
+    """Invert a symmetric 3 x 3 matrix by its cofactors; NaN where the scaled determinant is below 1e-12."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
     c00, c11, c22 = d * f - e * e, a * f - c * c, a * d - b * b

@@ -8,6 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.tracking.algebra import insert, middle
 
 #: A suspicion that there is none of: NaT as a number.
 NEVER = np.iinfo(np.int64).min
@@ -77,17 +78,6 @@ def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int
 
 
 @inner
-def _put_in(ordered: Floats, count: int, value: float) -> int:
-    """Put a value in order among those so far; return their new number."""
-    at = count
-    while at > 0 and ordered[at - 1] > value:
-        ordered[at] = ordered[at - 1]
-        at -= 1
-    ordered[at] = value
-    return count + 1
-
-
-@inner
 def _deviation(values: Floats, count: int) -> float:
     """Return the standard deviation of some values."""
     total = square = 0.0
@@ -129,9 +119,10 @@ def falls_of_cn0(
                 first[m] = now
             last[m] = now
             if now - first[m] >= known_after_s:
-                compared = _put_in(falls, compared, peak[m] - decay * now - value)
+                insert(falls, compared, peak[m] - decay * now - value)
+                compared += 1
         if compared >= least:
-            fall[t] = (falls[(compared - 1) // 2] + falls[compared // 2]) / 2.0
+            fall[t] = middle(falls, compared)
             spread[t] = _deviation(falls, compared)
         if count >= least:
             difference[t] = _deviation(seen, count)
@@ -167,11 +158,12 @@ def clock_steps(
             dt = passed // _NS + (passed % _NS) / _NS
             change = code_m[t, m] - code[m] - (rate_mps[t, m] + rate[m]) / 2.0 * dt
             if since[m] != NEVER and dt <= longest_s and not math.isnan(change):
-                count = _put_in(changes, count, change)
+                insert(changes, count, change)
+                count += 1
                 finite += math.isfinite(change)
             code[m], rate[m], since[m] = code_m[t, m], rate_mps[t, m], time_ns[t]
         if count > 0 and finite >= least:
-            step[t] = (changes[(count - 1) // 2] + changes[count // 2]) / 2.0
+            step[t] = middle(changes, count)
     return step, (code, rate, since)
 
 
