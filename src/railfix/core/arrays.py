@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Instance = TypeVar("Instance")
+Rows = TypeVar("Rows", bound="DataclassInstance")
 Floats = NDArray[np.float64]  #: Real numbers in the unit that the name of the array ends with; NaN where absent.
 Complexes = NDArray[np.complex128]  #: Complex numbers.
 Integers = NDArray[np.int64]  #: Counts and identifiers.
@@ -66,6 +68,32 @@ def changed(instance: Instance, **values: Any) -> Instance:
     copy = object.__new__(type(instance))
     copy.__dict__.update(instance.__dict__, **values)
     return copy
+
+
+def _row_arrays(instance: DataclassInstance) -> dict[str, NDArray[Any]]:
+    values = {item.name: getattr(instance, item.name) for item in fields(instance)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
+    """Return a dataclass with some rows of each of its arrays, and its other fields."""
+    return replace(instance, **{name: value[rows] for name, value in _row_arrays(instance).items()})
+
+
+def join_rows(parts: Sequence[Rows]) -> Rows:
+    """Return a dataclass with the rows of several one after the other, and the other fields of the first."""
+    tables = [_row_arrays(part) for part in parts]
+    return replace(parts[0], **{name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
+
+
+def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
+    """Return the group of each row of groups with so many rows, and its place in its group from 0.
+
+    >>> places_in_groups(np.array([2, 0, 3]))
+    (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
+    """
+    group = np.repeat(np.arange(len(counts)), counts)
+    return group, np.arange(len(group)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def medians(values: Floats) -> Floats:

@@ -111,6 +111,14 @@ def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indic
     return np.where(np.abs(have[row] - want) <= within_ns, row, -1)
 
 
+def nearest_day(second_of_day: ArrayLike, near: ArrayLike) -> Datetimes:
+    """Resolve the day of seconds of day, in any scale: the time nearest to another one of that scale."""
+    other = np.asarray(near, dtype="datetime64[ns]")
+    same_day = other.astype("datetime64[D]").astype("datetime64[ns]") + timedelta(second_of_day)
+    days = np.rint(seconds(other - same_day) / SECONDS_PER_DAY).astype(np.int64)
+    return np.asarray(same_day + days.astype("timedelta64[D]"))
+
+
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
     """Resolve the week of seconds of week: the GPS time nearest to another time, known to within half a week."""
     week, sow = to_week(near)

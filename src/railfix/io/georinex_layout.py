@@ -15,9 +15,15 @@ from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
-from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
+from railfix.io.rinex.navigation_records import (
+    FIELDS,
+    RawRecord,
+    first_fault,
+    glonass_records,
+    kepler_records,
+)
 from railfix.io.rinex.observations_lines import KINDS, signal_of
-from railfix.io.rinex.write_navigation import glonass_numbers, kepler_numbers
+from railfix.io.rinex.write_navigation import check_messages, glonass_numbers, kepler_numbers
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -218,10 +224,14 @@ def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
     """
     import xarray as xr
 
-    records = [*kepler_numbers(navigation.kepler), *glonass_numbers(navigation.glonass)]
+    kepler, glonass = navigation.kepler, navigation.glonass
+    check_messages(kepler, "3.04")
     copies: Counter[tuple[str, np.datetime64]] = Counter()
     rows = []
-    for satellite, time, numbers in records:
+    for satellite, time, numbers in (
+        *zip(kepler.satellite.tolist(), *kepler_numbers(kepler, FIELDS["G"]), strict=True),
+        *zip(glonass.satellite.tolist(), *glonass_numbers(glonass), strict=True),
+    ):
         copy = copies[satellite, time]
         copies[satellite, time] += 1
         rows.append((f"{satellite}_{copy}" if copy else satellite, time, numbers))

@@ -11,10 +11,11 @@ from typing import Literal
 
 import numpy as np
 
+from railfix.core.arrays import join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, Paths, path_names
 from railfix.core.timescale import gps_time
-from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
 from railfix.io.mate import mate_table, read_mate_observations
@@ -237,14 +238,9 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
 def _join(parts: list[Navigation]) -> Navigation:
     """Records of several sources; ionosphere and leap seconds of the first that has them."""
-
-    def rows(kind: str, table: type[KeplerRecords] | type[GlonassRecords]) -> dict[str, np.ndarray]:
-        names = table.__dataclass_fields__
-        return {name: np.concatenate([getattr(getattr(part, kind), name) for part in parts]) for name in names}
-
     return Navigation(
-        kepler=KeplerRecords(**rows("kepler", KeplerRecords)),
-        glonass=GlonassRecords(**rows("glonass", GlonassRecords)),
+        kepler=join_rows([part.kepler for part in parts]),
+        glonass=join_rows([part.glonass for part in parts]),
         klobuchar={letter: value for part in reversed(parts) for letter, value in part.klobuchar.items()},
         leap_seconds=next((part.leap_seconds for part in parts if part.leap_seconds is not None), None),
         skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +14,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.errors import InputFileError
+from railfix.core.files import FilePath
 from railfix.core.tables import reading_table
 from railfix.core.timescale import from_week, seconds
 from railfix.gnss.observations import ObservationHeader, Observations
@@ -73,13 +73,13 @@ WRITTEN: Final[Mapping[str, tuple[str, ...]]] = {
 _TEXTS: Final = ("SAT_ID", "SIGNAL_TYPE", "ANTENNA", "TRACK_EDGE_ID", "UTM_CELL", "TRACK_SEGMENT_TYPE")
 
 
-def mate_table(path: str | PathLike[str]) -> str:
+def mate_table(path: FilePath) -> str:
     """Return which table of EGNSS MATE a file is by its name, blank where it is none: ``s_imu.parquet`` is S_IMU."""
     name, _, kind = Path(path).name.partition(".")
     return name.upper() if name.upper() in READ and kind.lower() in ("parquet", "csv", "csv.gz") else ""
 
 
-def read_mate(path: str | PathLike[str], needed: tuple[str, ...]) -> pl.DataFrame:
+def read_mate(path: FilePath, needed: tuple[str, ...]) -> pl.DataFrame:
     """Read a table, CSV (also .gz) or Parquet, with upper-case names; columns not in the file are empty."""
     name, file = mate_table(path), Path(path)
     with reading_table(path, f"cannot be read as the table {name} of EGNSS MATE ({{}})"):
@@ -102,7 +102,7 @@ def read_mate(path: str | PathLike[str], needed: tuple[str, ...]) -> pl.DataFram
     return table.with_columns(pl.lit(None).alias(column) for column in absent)
 
 
-def only_device(path: str | PathLike[str], table: pl.DataFrame) -> pl.DataFrame:
+def only_device(path: FilePath, table: pl.DataFrame) -> pl.DataFrame:
     """Return the table; InputFileError where it has rows of several devices."""
     devices = table["DEVICE_ID"].drop_nulls().unique().sort().to_list()
     if len(devices) > 1:

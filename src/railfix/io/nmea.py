@@ -5,16 +5,15 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from os import PathLike
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes
 from railfix.core.errors import InputFileError
-from railfix.core.files import BrokenLines, ending, read_text, read_text_lines
+from railfix.core.files import BrokenLines, FilePath, ending, read_text, read_text_lines
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.timescale import from_week, utc_to_gpst
+from railfix.core.timescale import SECONDS_PER_DAY, from_week, timedelta, utc_to_gpst
 from railfix.gnss.observations import first_problems
 from railfix.io.position_log import PositionLog, read_positions
 from railfix.io.receiver.framing import head_of, is_receiver_log
@@ -24,7 +23,7 @@ from railfix.io.receiver.log import read_receiver_positions
 _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PPP": 6, "SINGLE": 5, "PSRSP": 5}
 
 
-def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
+def read_gpx_positions(path: FilePath) -> PositionLog:
     """Read the track points of GPX 1.0 or 1.1 (UTC); heights without ``geoidheight`` are kept, with a note."""
     try:
         root = ElementTree.fromstring(read_text(path))
@@ -51,12 +50,9 @@ def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
     notes = (
         () if np.isfinite(values[:, 3]).all() else (f"{path}: heights of GPX are above the geoid; kept as they are",)
     )
-    known = ~np.isnat(utc)
-    time = np.full(len(utc), np.datetime64("NaT", "ns"))
-    time[known] = utc_to_gpst(utc[known])
     return PositionLog(
         path=str(path),
-        time=time,
+        time=utc_to_gpst(utc),
         ecef_m=ecef_from_geodetic(values[:, 0], values[:, 1], np.nan_to_num(values[:, 2]) + geoid),
         quality=np.full(len(values), -1),
         sigma_m=np.full((len(values), 3), np.nan),
@@ -65,7 +61,7 @@ def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
     )
 
 
-def read_novatel_positions(path: str | PathLike[str]) -> PositionLog:
+def read_novatel_positions(path: FilePath) -> PositionLog:
     """Read the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN)."""
     rows: list[tuple[float, ...]] = []
     lines: list[int] = []
@@ -105,8 +101,6 @@ def read_novatel_positions(path: str | PathLike[str]) -> PositionLog:
 
 #: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.PositionLog`); others are 0, no position.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
-_DAY_S: Final = 86_400.0
-_NS: Final = 1e9
 
 
 @dataclass(frozen=True)
@@ -128,9 +122,7 @@ class _Date:
     day: np.datetime64
 
 
-def read_nmea(
-    path: str | PathLike[str], *, broken_lines: BrokenLines = "stop", date: np.datetime64 | None = None
-) -> PositionLog:
+def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.datetime64 | None = None) -> PositionLog:
     """Read the GGA sentences of an NMEA log.
 
     Parameters
@@ -187,7 +179,7 @@ def read_nmea(
     )
 
 
-def _sentences(path: str | PathLike[str], problems: list[InputFileError]) -> Iterator[tuple[int, list[str]]]:
+def _sentences(path: FilePath, problems: list[InputFileError]) -> Iterator[tuple[int, list[str]]]:
     """Yield line number and fields of every sentence with a correct checksum."""
     for number, line in enumerate(read_text_lines(path), start=1):
         text = line.strip()
@@ -258,21 +250,18 @@ def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes
     line = np.array([fix.line for fix in fixes])
     if chained:
         step = np.diff(of_day, prepend=of_day[:1])
-        days = np.cumsum(np.nan_to_num(step) < -_DAY_S / 2)
+        days = np.cumsum(np.nan_to_num(step) < -SECONDS_PER_DAY / 2)
         base = np.full(len(fixes), dates[0].day, dtype="datetime64[D]")
     else:
         row = np.maximum(np.searchsorted([date.line for date in dates], line, side="right") - 1, 0)
         base = np.array([date.day for date in dates], dtype="datetime64[D]")[row]
-        days = -np.rint((of_day - np.array([date.of_day_s for date in dates])[row]) / _DAY_S)
+        days = -np.rint((of_day - np.array([date.of_day_s for date in dates])[row]) / SECONDS_PER_DAY)
         days = np.nan_to_num(days).astype(np.int64)
-    known = np.isfinite(of_day)
-    since = np.rint(np.where(known, of_day, 0.0) * _NS).astype(np.int64).astype("timedelta64[ns]")
-    utc = base.astype("datetime64[ns]") + days.astype("timedelta64[D]") + since
-    return np.where(known, utc_to_gpst(utc), np.datetime64("NaT", "ns"))
+    return utc_to_gpst(base.astype("datetime64[ns]") + days.astype("timedelta64[D]") + timedelta(of_day))
 
 
 def read_any_positions(
-    path: str | PathLike[str],
+    path: FilePath,
     *,
     broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,

@@ -5,17 +5,16 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import ending, read_text
+from railfix.core.files import FilePath, ending, read_text
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import misspelt
-from railfix.core.timescale import from_week, timedelta, utc_to_gpst
+from railfix.core.timescale import SECONDS_PER_WEEK, from_week, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, fails, read_named_columns
 
 _SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
@@ -24,7 +23,6 @@ CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
     "z_m", "quality", "ratio", *_SIGMAS,
 )  # fmt: skip
-_WEEK_S: Final = 604_800
 #: Largest Unix time that is taken for seconds, in 2100.
 _LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
@@ -55,7 +53,7 @@ class PositionLog:
         return bool((self.quality >= 0).any())
 
 
-def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PositionLog:
+def read_positions(path: FilePath, *, columns: Mapping[str, str] | None = None) -> PositionLog:
     """Read a log of positions: CSV by its ending, else RTKLIB's solution format.
 
     Parameters
@@ -153,7 +151,7 @@ def positions_times(table: NamedColumns) -> Datetimes:
     if "time_gpst" in table:
         return _column_of_times(table, "time_gpst")
     if "time_utc" in table:
-        return _from_utc(_column_of_times(table, "time_utc"))
+        return utc_to_gpst(_column_of_times(table, "time_utc"))
     if "unix_s" in table:
         unix = table.numbers("unix_s", blank=np.nan)
         wrong = np.isfinite(unix) & ((unix < 0.0) | (unix > _LAST_UNIX_S))
@@ -162,16 +160,16 @@ def positions_times(table: NamedColumns) -> Datetimes:
             raise table.error(row, f"unix_s {unix[row]:g} is no count of seconds since 1970; is it in milliseconds?")
         whole = np.floor(np.nan_to_num(unix))
         since = whole.astype("timedelta64[s]") + timedelta(np.nan_to_num(unix) - whole)
-        return _from_utc(np.where(np.isnan(unix), np.datetime64("NaT"), np.datetime64("1970-01-01", "ns") + since))
+        return utc_to_gpst(np.where(np.isnan(unix), np.datetime64("NaT"), np.datetime64("1970-01-01", "ns") + since))
     time = np.full(len(table), np.datetime64("NaT", "ns"))
     if "week" in table and "tow_s" in table:
         week, seconds = table.numbers("week", blank=np.nan), table.numbers("tow_s", blank=np.nan)
         known = np.isfinite(week) & np.isfinite(seconds)
-        wrong = known & ((week != np.floor(week)) | (week < 0) | (seconds < 0) | (seconds > _WEEK_S))
+        wrong = known & ((week != np.floor(week)) | (week < 0) | (seconds < 0) | (seconds > SECONDS_PER_WEEK))
         if wrong.any():
             row = int(np.argmax(wrong))
             what = f"week {week[row]:g} and tow_s {seconds[row]:g}"
-            raise table.error(row, f"{what} are no GPS week and seconds of it (0 to {_WEEK_S})")
+            raise table.error(row, f"{what} are no GPS week and seconds of it (0 to {SECONDS_PER_WEEK})")
         time[known] = from_week(week[known].astype(np.int64), seconds[known])
     return time
 
@@ -193,14 +191,6 @@ def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
         raise table.error(row, f"{name} '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
 
 
-def _from_utc(time: Datetimes) -> Datetimes:
-    """Convert UTC to GPS time, NaT kept."""
-    known = ~np.isnat(time)
-    converted = time.astype("datetime64[ns]")
-    converted[known] = utc_to_gpst(converted[known])
-    return converted
-
-
 def _times(texts: list[str]) -> Datetimes:
     """Parse ISO 8601 times; raise `ValueError` where one is not, or has a time zone."""
     with warnings.catch_warnings():
@@ -214,7 +204,7 @@ def _times(texts: list[str]) -> Datetimes:
 # --- RTKLIB ------------------------------------------------------------------
 
 
-def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
+def read_rtklib_positions(path: FilePath) -> PositionLog:
     """Read RTKLIB's solution format (manual 2.4.2, B.1); baselines and heights above the geoid are rejected."""
     lines = read_text(path).splitlines()
     header = [line for line in lines if line.startswith("%")]
@@ -248,7 +238,7 @@ def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
     )
 
 
-def _rtklib_header(path: str | PathLike[str], header: list[str]) -> tuple[str, list[str]]:
+def _rtklib_header(path: FilePath, header: list[str]) -> tuple[str, list[str]]:
     """Read the time scale and the names of the columns after the time."""
     for line in header:
         if "lat/lon/height=" in line and "geodetic" in line.split("lat/lon/height=")[1].split(",")[0]:
@@ -270,7 +260,7 @@ def _rtklib_header(path: str | PathLike[str], header: list[str]) -> tuple[str, l
     )
 
 
-def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple[str, str]], scale: str) -> Datetimes:
+def _rtklib_times(path: FilePath, number: Integers, cells: list[tuple[str, str]], scale: str) -> Datetimes:
     calendar = "/" in cells[0][0]
     try:
         if calendar:
@@ -290,7 +280,7 @@ def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple
     return time if scale == "GPST" else utc_to_gpst(time)
 
 
-def _rtklib_numbers(path: str | PathLike[str], number: Integers, fields: list[list[str]]) -> Floats:
+def _rtklib_numbers(path: FilePath, number: Integers, fields: list[list[str]]) -> Floats:
     try:
         return np.array(fields, dtype=np.float64)
     except ValueError:
@@ -300,7 +290,7 @@ def _rtklib_numbers(path: str | PathLike[str], number: Integers, fields: list[li
         raise
 
 
-def _rtklib_ecef(path: str | PathLike[str], number: Integers, values: Floats, names: list[str]) -> Floats:
+def _rtklib_ecef(path: FilePath, number: Integers, values: Floats, names: list[str]) -> Floats:
     if names[0].startswith("x-ecef"):
         return values
     if values.shape[1] == 7:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending
+from railfix.core.files import FilePath, ending
 from railfix.core.tables import reading_table
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
@@ -71,7 +70,7 @@ class AntennaReference:
 
 
 def read_reference(
-    path: str | PathLike[str],
+    path: FilePath,
     antennas: Sequence[str],
     *,
     quality: Collection[int] = (_FIX,),
@@ -151,7 +150,7 @@ def _columns(log: PositionLog, table: NamedColumns | None) -> dict[str, NDArray[
 
 
 def _of_antenna(
-    path: str | PathLike[str],
+    path: FilePath,
     name: str,
     owner: Strings,
     usable: Masks,
@@ -242,7 +241,7 @@ class Acceleration:
         return np.where(before == after, np.diff(total) / np.diff(at), np.nan)
 
 
-def read_pulses(path: str | PathLike[str]) -> Pulses:
+def read_pulses(path: FilePath) -> Pulses:
     """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
 
     ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the distance
@@ -267,7 +266,7 @@ def read_pulses(path: str | PathLike[str]) -> Pulses:
     return Pulses(path=str(path), time=time, count=count, kind=kind, signed=falling or "direction" in table)
 
 
-def read_acceleration(path: str | PathLike[str]) -> Acceleration:
+def read_acceleration(path: FilePath) -> Acceleration:
     """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
 
     ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
@@ -289,7 +288,7 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
     )
 
 
-def _sensor_table(path: str | PathLike[str]) -> NamedColumns:
+def _sensor_table(path: FilePath) -> NamedColumns:
     if Path(path).suffix == ".parquet":
         with reading_table(path, "cannot be read as a Parquet table ({})"):
             return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO).splitlines(), path)

@@ -117,7 +117,7 @@ def encode(message: TrainMessage) -> bytes:
     """CBOR of a message, always the same bytes for the same message; absent fields are left out."""
     import cbor2
 
-    values = {KEYS[name]: value for name, value in _plain(message).items() if value is not None}
+    values = {KEYS[name]: value for name, value in message.model_dump(mode="json").items() if value is not None}
     return cbor2.dumps({_VERSION_KEY: VERSION, **values}, canonical=True)
 
 
@@ -161,17 +161,9 @@ def _validate(values: dict[str, Any]) -> TrainMessage:
         raise MessageError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
 
 
-def _plain(message: TrainMessage) -> dict[str, Any]:
-    values = message.model_dump()
-    values["status"], values["sources"] = int(message.status), int(message.sources)
-    if message.interference is not None:
-        values["interference"] = int(message.interference)
-    return values
-
-
 def to_json(message: TrainMessage) -> str:
     """One line of JSON with the names of the fields; statuses and sources in words."""
-    values = _plain(message)
+    values = message.model_dump()
     values["status"] = message.status.name.lower()
     values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]
     if message.interference is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import os
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.errors import OutputError
+from railfix.core.files import FilePath
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
@@ -193,7 +193,7 @@ def section_table(simulation: Simulation) -> pl.DataFrame:
 
 def write_run(
     scenario: Scenario,
-    folder: str | os.PathLike[str],
+    folder: FilePath,
     *,
     packing: Literal["packed", "plain"] = "packed",
     command: str = "",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
-from railfix.core.files import write_whole
+from railfix.core.files import FilePath, write_whole
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, SLOT_OF
@@ -191,7 +190,7 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
     )
 
 
-def write_sbas(messages: SbasMessages, path: str | PathLike[str]) -> None:
+def write_sbas(messages: SbasMessages, path: FilePath) -> None:
     """Write messages as RTKLIB's .sbs, which `railfix run --sbas` reads; OutputError when it cannot be written."""
     lines, digits = [], 58 if messages.band == "L1" else 63  # RTKLIB cuts the parity
     for time, prn, kind, bits in zip(messages.time, messages.prn, messages.type, messages.bits, strict=True):

@@ -27,11 +27,11 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.files import FilePath
 from railfix.core.settings import read_toml, validated
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
@@ -87,7 +87,7 @@ def list_scenarios() -> dict[str, Path]:
     return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
 
 
-def find_scenario(name: str | PathLike[str]) -> Path:
+def find_scenario(name: FilePath) -> Path:
     """A scenario file by its path, or by the name of a shipped one; InputFileError when it is neither."""
     shipped, path = list_scenarios(), Path(name)
     if path.is_file() or (path.suffix and str(name) not in shipped):
@@ -97,7 +97,7 @@ def find_scenario(name: str | PathLike[str]) -> Path:
     return shipped[str(name)]
 
 
-def load_recipe(name: str | PathLike[str]) -> Recipe:
+def load_recipe(name: FilePath) -> Recipe:
     """Contents of a scenario file (a path, or the name of a shipped scenario), one run or several.
 
     InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a recipe is not one (names
@@ -144,7 +144,7 @@ def _run_table(
     return _over(base, _absolute({key: run[key] for key in run if key not in ("name", "parts")}, path))
 
 
-def load_scenario(name: str | PathLike[str]) -> Scenario:
+def load_scenario(name: FilePath) -> Scenario:
     """The scenario of a file that holds one run: a path, or the name of a shipped scenario.
 
     InputFileError: the file is missing, unreadable, or no TOML. SettingsError: a setting is misspelt, of the wrong

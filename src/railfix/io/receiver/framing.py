@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, join_rows, take_rows
 from railfix.core.files import FilePath, open_stream
 
 #: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
@@ -318,20 +318,14 @@ class Subframes:
 
     def take(self, rows: Integers | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Subframes:
         """Some of the rows."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in _SUBFRAME_ARRAYS})
-
-
-_SUBFRAME_ARRAYS: Final = ("satellite", "signal", "glonass_channel", "words", "order")
+        return take_rows(self, rows)
 
 
 def join_subframes(first: Subframes, second: Subframes) -> Subframes:
     """Subframes of two formats of one stream, in its order."""
     if not len(second) and not second.skipped:
         return first
-    both = Subframes(
-        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in _SUBFRAME_ARRAYS},
-        skipped={**first.skipped, **second.skipped},
-    )
+    both = replace(join_rows([first, second]), skipped={**first.skipped, **second.skipped})
     return both.take(np.argsort(both.order, kind="stable"))
 
 
@@ -368,4 +362,4 @@ def unpack_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, dro
     """Bits of words of which the lowest `drop` are left out and the next `keep` kept, shape (N, words * keep)."""
     shift = np.arange(keep - 1, -1, -1, dtype=np.uint32) + np.uint32(drop)
     bits = words[:, :, None] >> shift & np.uint32(1)
-    return bits.reshape(len(words), -1).astype(np.uint8)
+    return bits.reshape(len(words), words.shape[1] * keep).astype(np.uint8)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
-from railfix.core.timescale import from_week, gpst_minus_utc, nearest_week, seconds, timedelta, to_week
+from railfix.core.timescale import from_week, gpst_to_utc, nearest_day, nearest_week, to_week
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
@@ -167,8 +167,6 @@ def no_measurements(receiver: str) -> Measurements:
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     """Measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
-    if len(parts) == 1:
-        return parts[0]
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
     return Measurements(
@@ -274,8 +272,8 @@ def beidou_record(satellite: str, message: str, values: Values, time: np.datetim
 
 def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Record:
     """Record of GLONASS from the fields of its strings 1 to 4, or of RTCM 1020; `time` resolves the day."""
-    epoch = _near_day(values["tb_s"] - _MOSCOW_S, _utc(time))
-    _, message_time = to_week(_near_day(_frame_s(values), _utc(time)))
+    epoch = nearest_day(values["tb_s"] - _MOSCOW_S, gpst_to_utc(time))
+    _, message_time = to_week(nearest_day(_frame_s(values), gpst_to_utc(time)))
     numbers = {
         **values,
         "health": float(bool(values["health"]) or bool(values["ln"])),  # either stops the use (ICD, 4.4, B_n and l_n)
@@ -289,16 +287,12 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 def frame_time(values: Values, time: np.datetime64) -> Datetimes:
     """When the GLONASS frame of a string 1 began, GPS time."""
-    utc = _utc(time)
-    return np.asarray(time + (_near_day(_frame_s(values), utc) - utc))
+    utc = gpst_to_utc(time)
+    return np.asarray(time + (nearest_day(_frame_s(values), utc) - utc))
 
 
 def _frame_s(values: Values) -> float:
     return values["hour"] + values["minute"] + values["half_minute"] - _MOSCOW_S
-
-
-def _utc(time: np.datetime64) -> Datetimes:
-    return np.asarray(time - gpst_minus_utc(time).astype("timedelta64[s]"), dtype="datetime64[ns]")
 
 
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
@@ -329,9 +323,3 @@ def _near_week(broadcast: float, time: np.datetime64) -> int:
     """Full week nearest to a time from a week number of ten bits."""
     week = int(to_week(time)[0])
     return week + (int(broadcast) - week + 512) % 1024 - 512
-
-
-def _near_day(second_of_day: float, near: Datetimes) -> np.datetime64:
-    """The instant with a second of day that is nearest to another instant."""
-    day = near.astype("datetime64[D]").astype("datetime64[ns]") + timedelta(second_of_day)
-    return np.datetime64(day + np.rint(seconds(near - day) / 86_400.0).astype(np.int64).astype("timedelta64[D]"), "ns")

@@ -276,8 +276,7 @@ URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 
 
 def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
     """Return words of I/NAV page pairs (N, 8), even first, as bits (N, 128), and which have a valid CRC, no alert."""
-    octets = words[:, :8].astype(">u4").view(np.uint8).reshape(len(words), 32)
-    bits = np.unpackbits(octets, axis=1)
+    bits = unpack_words(words[:, :8], drop=0, keep=32)
     even, odd = bits[:, :120], bits[:, 128:248]
     checked = has_crc(np.concatenate([even[:, :114], odd[:, :106]], axis=1), 196)
     valid = (even[:, 0] == 0) & (odd[:, 0] == 1) & (even[:, 1] == 0) & (odd[:, 1] == 0) & checked

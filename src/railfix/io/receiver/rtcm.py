@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
+from railfix.core.timescale import bdt_to_gpst, gpst_to_utc, nearest_week, utc_to_gpst
 from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
@@ -85,11 +85,7 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
     """Channels of 1020 messages after those known before; MSM4 and MSM6 carry none themselves."""
     chosen = frames.of("rtcm3", 1020)
     bits = bits_of(frames, chosen, 23)
-    known = (
-        np.full(len(before), -1),
-        np.array([*before], dtype=np.int64),
-        np.array([*before.values()], dtype=np.int64),
-    )
+    known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
     new = (frames.frame_start[chosen], unsigned(bits, 12, 6), unsigned(bits, 18, 5) - 7)
     return ChannelNews(*(np.concatenate(parts) for parts in zip(known, new, strict=True)))
 
@@ -293,9 +289,7 @@ def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
     if system == "R":
         day, of_day = unsigned(bits, 24, 3), unsigned(bits, 27, 27) * 1e-3
         utc_s = day * 86_400.0 + of_day - _MOSCOW_S
-        near_utc = near - gpst_minus_utc(near).astype("timedelta64[s]")
-        utc = nearest_week(utc_s, np.full(len(bits), near_utc))
-        return np.asarray(utc + gpst_minus_utc(near).astype("timedelta64[s]"), dtype="datetime64[ns]")
+        return utc_to_gpst(nearest_week(utc_s, np.full(len(bits), gpst_to_utc(near))))
     of_week = unsigned(bits, 24, 30) * 1e-3
     time = nearest_week(of_week, np.full(len(bits), near))
     return bdt_to_gpst(time) if system == "C" else time

@@ -17,7 +17,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.gnss.observations import frequency_by_name_hz
-from railfix.io.receiver.framing import BCNAV1_PAGE, SBAS_L5, Frames, Subframes, join_subframes
+from railfix.io.receiver.framing import BCNAV1_PAGE, SBAS_L5, Frames, Subframes, join_subframes, unpack_words, unsigned
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.nav_messages import BCNAV1_PARTS, has_crc
 from railfix.io.receiver.ubx import gather_structures
@@ -271,7 +271,7 @@ def navigation_subframes(frames: Frames) -> Subframes:
             signal[this], known = ours, known | this
     galileo, beidou = kind == GAL_RAW_INAV, kind == BDS_RAW
     words[galileo] = _inav_words(words[galileo])
-    words[beidou] = _words_of_30(words[beidou])
+    words[beidou] = _words_of(unpack_words(words[beidou], drop=0, keep=32)[:, :_BDS_BITS], 30)
     passed = rows["passed"] != 0
     counts = {
         "SBF navigation pages without valid CRC": int(np.count_nonzero(known & ~passed)),
@@ -307,7 +307,7 @@ def _bcnav1_pages(frames: Frames) -> Subframes:
         satellite=_NAMES[rows["sv"]][row],
         signal=np.full(len(row), BCNAV1_PAGE),
         glonass_channel=np.zeros(len(row), dtype=np.int64),
-        words=np.packbits(pages[valid], axis=2).reshape(-1).view(">u4").reshape(-1, 10).astype(np.uint32),
+        words=_words_of(pages[valid], 32),
         order=frames.frame_start[chosen][row],
         skipped={"C B-CNAV1 without valid CRC": int(np.count_nonzero(~valid))} if not valid.all() else {},
     )
@@ -323,23 +323,18 @@ def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
     return frames.frame_start[chosen[dated]], times
 
 
-def _bits(words: Words) -> Bytes:
-    return np.unpackbits(words.astype(">u4").view(np.uint8).reshape(len(words), 40), axis=1)
+def _words_of(bits: Bytes, length: int) -> Words:
+    """Ten words of a number of bits, right-aligned, from bits put after each other, shape (..., 10 * length)."""
+    return unsigned(bits.reshape(-1, length), 0, length).reshape(-1, 10).astype(np.uint32)
 
 
 def _inav_words(words: Words) -> Words:
     """Even and odd page in four words each, from both joined without the even page's tail."""
-    bits = _bits(words)
+    bits = unpack_words(words, drop=0, keep=32)
     pages = np.zeros((len(words), 320), dtype=np.uint8)
     pages[:, :_EVEN_BITS] = bits[:, :_EVEN_BITS]
     pages[:, 128:248] = bits[:, _EVEN_BITS : _EVEN_BITS + 120]
-    return np.packbits(pages, axis=1).reshape(-1).view(">u4").reshape(len(words), 10).astype(np.uint32)
-
-
-def _words_of_30(words: Words) -> Words:
-    """Ten words of 30 bits, right-aligned, from 300 bits put after each other."""
-    bits = _bits(words)[:, :_BDS_BITS].reshape(-1, 10, 30).astype(np.uint32)
-    return np.asarray((bits << np.arange(29, -1, -1, dtype=np.uint32)).sum(axis=2, dtype=np.uint32))
+    return _words_of(pages, 32)
 
 
 def positions(frames: Frames) -> dict[str, np.ndarray]:

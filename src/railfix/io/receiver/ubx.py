@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, Strings
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, Strings, places_in_groups
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week, nearest_week
 from railfix.io.receiver.framing import Frames, Subframes
@@ -49,6 +49,7 @@ _MEASUREMENT: Final = np.dtype(
         ("doppler_std", "u1"), ("tracking", "u1"), ("reserved", "u1"),
     ]
 )  # fmt: skip
+_WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Most words of RXM-SFRBX that are used.
 _RAWX_HEADER: Final = np.dtype(
     [("tow", "<f8"), ("week", "<u2"), ("leap", "i1"), ("count", "u1"), ("status", "u1"), ("version", "u1"), ("_", "V2")]
 )
@@ -98,8 +99,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
     skipped = {"broken RXM-RAWX": int((~whole).sum()), "RXM-RAWX without time": int(undated.sum())}
     chosen, header = chosen[plausible], header[plausible]
     count = header["count"].astype(np.int64)
-    epoch = np.repeat(np.arange(len(chosen)), count)
-    within = np.arange(len(epoch)) - np.repeat(np.cumsum(count) - count, count)
+    epoch, within = places_in_groups(count)
     rows = gather_structures(frames.data, frames.start[chosen][epoch] + 16 + 32 * within, _MEASUREMENT)
     system, tracking = rows["gnss"].astype(np.int64), rows["tracking"].astype(np.int64)
     names = np.array([[SIGNALS.get(g, {}).get(s, "") for s in range(16)] for g in range(8)], dtype="<U2")
@@ -147,12 +147,9 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
     count = frames.data[first + 4].astype(np.int64)
     whole = length == 8 + 4 * count
     chosen, first, count = chosen[whole], first[whole], count[whole]
-    words = np.zeros((len(chosen), 10), dtype=np.uint32)
-    for k in range(10):
-        has = count > k
-        place = first[has] + 8 + 4 * k
-        block = frames.data[place[:, None] + np.arange(4)] if len(place) else np.zeros((0, 4), np.uint8)
-        words[has, k] = np.ascontiguousarray(block).view("<u4")[:, 0]
+    data = np.concatenate([frames.data, np.zeros(_WORDS.itemsize, np.uint8)])
+    words = np.where(np.arange(10) < count[:, None], gather_structures(data, first + 8, _WORDS)["words"], 0)
+    words = words.astype(np.uint32)
     system, signal = frames.data[first].astype(np.int64), frames.data[first + 2].astype(np.int64)
     wrong = np.isin(system, (0, 5)) & (signal == 0) & ~has_lnav_parity(words)
     counts = {f"{SYSTEMS[k]} subframes with wrong parity": int(np.sum(wrong & (system == k))) for k in (0, 5)}

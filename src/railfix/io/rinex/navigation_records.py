@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Integers, Strings
-from railfix.core.timescale import bdt_to_gpst, nearest_week, seconds, timedelta, to_week, utc_to_gpst
+from railfix.core.timescale import bdt_to_gpst, nearest_day, nearest_week, seconds, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
 #: Numbers of a Keplerian record in the order of the file, the three of the clock first.
@@ -232,11 +232,9 @@ def glonass_records(raw: Sequence[RawRecord]) -> GlonassRecords:
     frame = table[:, 2]
     known = np.isfinite(frame) & (np.abs(frame) < 1e6)
     # RINEX 2 writes seconds of the day, RINEX 3 and 4 seconds of the week, both in UTC.
-    day = utc.astype("datetime64[D]").astype("datetime64[ns]")
-    of_day = day + timedelta(np.where(known, frame % 86_400.0, 0.0))
-    nearest_day = of_day + np.rint(seconds(utc - of_day) / 86_400.0).astype(np.int64).astype("timedelta64[D]")
     old = np.array([r.version < 3.0 for r in raw], dtype=bool)
-    sent = np.where(old, nearest_day, nearest_week(np.where(known, frame, 0.0), utc))
+    frame = np.where(known, frame, 0.0)
+    sent = np.where(old, nearest_day(frame % 86_400.0, utc), nearest_week(frame, utc))
     known &= np.abs(seconds(sent - utc)) < 86_400.0
     arrays: dict[str, Any] = {
         "position_ecef_m": state[:, :, 0] * 1e3,

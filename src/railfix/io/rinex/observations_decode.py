@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix import kernels
-from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, places_in_groups, take_rows
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
@@ -125,7 +125,7 @@ class DecodedRows:
     line: Integers
 
     def __getitem__(self, which: Masks | Integers) -> DecodedRows:
-        return DecodedRows(self.epoch[which], self.letter[which], self.number[which], self.line[which])
+        return take_rows(self, which)
 
 
 def lines_per_satellite(header: RinexHeader) -> int:
@@ -151,8 +151,7 @@ def decode(
 
 def _rows(lines: Lines, epochs: EpochHeads, header: RinexHeader) -> DecodedRows:
     count = epochs.count
-    epoch = np.repeat(np.arange(len(epochs)), count)
-    order = np.arange(len(epoch)) - np.repeat(np.cumsum(count) - count, count)
+    epoch, order = places_in_groups(count)
     if header.version >= 3.0:
         line = epochs.line[epoch] + 1 + order
         name = lines.columns(line, 3)
@@ -275,9 +274,7 @@ def _values(
 
     log.faults(SATELLITES, lines.number[rows.line[which]], message)
     fine = ~(broken | too_long)
-    if fine.all():
-        return rows, fields
-    return rows[fine], Fields(fields.value[fine], fields.lock[fine], fields.bad[fine])
+    return (rows, fields) if fine.all() else (rows[fine], take_rows(fields, fine))
 
 
 def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Masks:

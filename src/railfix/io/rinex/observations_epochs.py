@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from railfix.core.arrays import Integers, Masks
+from railfix.core.arrays import Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines
 from railfix.gnss.observations import MAX_PROBLEMS, first_problems
@@ -246,8 +246,7 @@ class _Walk:
         if not self._events:
             return epochs
         extra = np.array([(*event, 0, 0) for event in self._events], dtype=np.int64).T
-        columns = (epochs.line, epochs.flag, epochs.count, epochs.time_ns, epochs.flaw)
-        joined = EpochHeads(*(np.concatenate(pair) for pair in zip(columns, extra, strict=True)))
+        joined = join_rows([epochs, EpochHeads(*extra)])
         return joined[np.argsort(joined.line, kind="stable")]
 
 

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Bytes, Integers, Masks
+from railfix.core.arrays import Bytes, Integers, Masks, take_rows
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
@@ -87,7 +87,7 @@ class EpochHeads:
         return len(self.line)
 
     def __getitem__(self, which: slice | Masks | Integers) -> EpochHeads:
-        return EpochHeads(self.line[which], self.flag[which], self.count[which], self.time_ns[which], self.flaw[which])
+        return take_rows(self, which)
 
 
 FLAWS: Final = (

@@ -13,12 +13,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import chain
-from os import PathLike
 from pathlib import Path
 from typing import IO, Final, Literal, cast, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import OutputError
@@ -122,7 +120,7 @@ _FOUR: Final = (np.arange(10_000)[:, None] // (1000, 100, 10, 1) % 10 + ord("0")
 
 def write_observations(
     observations: Observations | Iterable[Observations],
-    path: str | PathLike[str],
+    path: FilePath,
     *,
     packing: Packing | None = None,
     version: RinexVersion = "3.04",
@@ -199,8 +197,8 @@ def _observation_header(
     systems = list(columns)
     letter = systems[0] if len(systems) == 1 else "M"
     place = np.nan_to_num(header.approximate_ecef_m)
-    year, month, day, hour, minute, ticks = (int(part[0]) for part in _split_time(first.time[:1]))
-    date = f"{year:6d}{month:6d}{day:6d}{hour:6d}{minute:6d}{ticks // 10_000_000:5d}.{ticks % 10_000_000:07d}"
+    *parts, second = _calendar_text(first.time[:1]).tobytes().decode().split()
+    date = "".join(f"{int(part):6d}" for part in parts) + f"{second:>13}"
     lines = [
         header_line(f"{version:>9}{'':11}{'OBSERVATION DATA':<20}{letter:<20}", "RINEX VERSION / TYPE"),
         stamp,
@@ -324,39 +322,22 @@ def _format_f14_3(value: Floats) -> Bytes:
     return text
 
 
-def _split_time(time: ArrayLike) -> tuple[Integers, ...]:
-    """Split times into year, month, day, hour, minute and the rest in 100 ns."""
-    tags = np.asarray(time, dtype="datetime64[ns]")
-    month = tags.astype("datetime64[M]")
-    day = tags.astype("datetime64[D]")
-    ticks, finer = np.divmod((tags - day).astype(np.int64), 100)
-    if finer.any() or np.isnat(tags).any():
+def _calendar_text(time: Datetimes) -> Bytes:
+    """Format times as ``yyyy mm dd hh mm ss.sssssss``, shape (T, 27)."""
+    if np.isnat(time).any() or (time.astype("datetime64[ns]").astype(np.int64) % 100).any():
         raise ValueError("a time tag is NaT or finer than 100 ns, which the F11.7 of RINEX cannot hold")
-    minutes, ticks = np.divmod(ticks, 60 * 10_000_000)
-    months = month.astype(np.int64)
-    return (
-        months // 12 + 1970,
-        months % 12 + 1,
-        (day - month.astype("datetime64[D]")).astype(np.int64) + 1,
-        minutes // 60,
-        minutes % 60,
-        ticks,
-    )
+    iso = np.datetime_as_string(time, unit="ns").astype("S29")
+    text = iso.view(np.uint8).reshape(len(time), 29)[:, :27].copy()
+    text[:, [4, 7, 10, 13, 16]] = _BLANK
+    text[text[:, 17] == ord("0"), 17] = _BLANK
+    return text
 
 
 def _epoch_lines(time: Datetimes, flag: Masks, count: Integers) -> Bytes:
     """Format ``> yyyy mm dd hh mm ss.sssssss  f nnn`` with line ends, shape (T, 36)."""
-    year, month, day, hour, minute, ticks = _split_time(time)
     text = np.full((len(time), _EPOCH_WIDTH), _BLANK, dtype=np.uint8)
     text[:, 0], text[:, -1] = ord(">"), ord("\n")
-    text[:, 2:6] = _FOUR[year]
-    for at, value in ((7, month), (10, day), (13, hour), (16, minute)):
-        text[:, at : at + 2] = _FOUR[value][:, 2:]
-    second, ticks = np.divmod(ticks, 10_000_000)
-    text[:, 19:21] = _FOUR[second][:, 2:]
-    text[second < 10, 19] = _BLANK
-    text[:, 21] = ord(".")
-    text[:, 22:25], text[:, 25:29] = _FOUR[ticks // 10_000][:, 1:], _FOUR[ticks % 10_000]
+    text[:, 2:29] = _calendar_text(time)
     text[:, 31] = np.where(flag, ord("1"), ord("0"))
     text[:, 32:35] = _FOUR[count][:, 1:]
     text[count < 100, 32] = _BLANK

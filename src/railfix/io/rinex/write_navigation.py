@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
-from os import PathLike
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, take_rows
 from railfix.core.constants import BDT_MINUS_GPST_S
+from railfix.core.files import FilePath
 from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_to_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.navigation_records import FIELDS
@@ -32,7 +32,7 @@ _GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}
 
 def write_navigation(
     navigation: Navigation,
-    path: str | PathLike[str],
+    path: FilePath,
     *,
     packing: Packing | None = None,
     version: RinexVersion = "3.04",
@@ -83,15 +83,15 @@ def write_navigation(
         head.append(header_line(f"{navigation.leap_seconds:6d}", "LEAP SECONDS"))
     head.append(header_line("", "END OF HEADER"))
     texts = [np.empty(0, dtype="<U1")]
-    _check_messages(kepler, version)
-    kepler = _rows(kepler, np.argsort(kepler.message == "CNV1", kind="stable"))
+    check_messages(kepler, version)
+    kepler = take_rows(kepler, np.argsort(kepler.message == "CNV1", kind="stable"))
     late = kepler.message == "CNV1"
-    for rows, numbers in ((~late, _kepler_fields), (late, _cnv1_fields)):
+    for rows, names in ((~late, FIELDS["G"]), (late, FIELDS["C CNV1"])):
         if rows.any():
-            own = _rows(kepler, rows)
-            texts.append(_records(own.satellite, *numbers(own)))
+            own = take_rows(kepler, rows)
+            texts.append(_records(own.satellite, *kepler_numbers(own, names)))
     if len(glonass):
-        texts.append(_records(glonass.satellite, *_glonass_fields(glonass)))
+        texts.append(_records(glonass.satellite, *glonass_numbers(glonass)))
     body = np.concatenate(texts)
     if version != "3.04":
         titles = [f"> EPH {s} {m}\n" for s, m in zip(kepler.satellite.tolist(), kepler.message.tolist(), strict=True)]
@@ -114,14 +114,10 @@ def with_written_messages(navigation: Navigation, version: RinexVersion = "3.04"
     kept = np.isin(kepler.message, _WRITTEN[version])
     kinds = zip(kepler.satellite[~kept].tolist(), kepler.message[~kept].tolist(), strict=True)
     left_out = Counter(f"{satellite[0]} {message} ephemerides, which are not written" for satellite, message in kinds)
-    return replace(navigation, kepler=_rows(kepler, kept)), dict(left_out)
+    return replace(navigation, kepler=take_rows(kepler, kept)), dict(left_out)
 
 
-def _rows(records: KeplerRecords, rows: Masks | Indices) -> KeplerRecords:
-    return KeplerRecords(**{item.name: getattr(records, item.name)[rows] for item in fields(records)})
-
-
-def _check_messages(records: KeplerRecords, version: RinexVersion) -> None:
+def check_messages(records: KeplerRecords, version: RinexVersion) -> None:
     """Raise ValueError on a record of a message that the version lacks."""
     if (other := ~np.isin(records.message, _WRITTEN[version])).any():
         raise ValueError(f"records of {records.message[other][0]} cannot be written; leave them out")
@@ -146,10 +142,10 @@ def _field(values: Floats) -> Strings:
     return np.where(np.isfinite(values), np.char.mod("%19.12E", np.nan_to_num(values)), _BLANK)
 
 
-def _records(satellite: Strings, time: Datetimes, fields: Sequence[Floats]) -> Strings:
+def _records(satellite: Strings, time: Datetimes, numbers: Floats) -> Strings:
     """Format records: satellite, time, three clock fields, then four a line, blank ones at its end omitted."""
     text = np.char.add(satellite, _calendar_text(time))
-    for i, values in enumerate(fields):
+    for i, values in enumerate(numbers.T):
         if i >= 3 and i % 4 == 3:
             text = np.char.add(np.char.rstrip(text), "\n    ")
         text = np.char.add(text, _field(values))
@@ -164,23 +160,8 @@ def _calendar_text(time: Datetimes) -> Strings:
     return np.char.add(" ", text)
 
 
-def kepler_numbers(records: KeplerRecords) -> Iterator[tuple[str, np.datetime64, list[float]]]:
-    """Satellite, clock time in the constellation's own time, and numbers in file order of each record."""
-    _check_messages(records, "3.04")
-    toc, fields = _kepler_fields(records)
-    for satellite, time, numbers in zip(records.satellite.tolist(), toc, np.stack(fields, axis=1), strict=True):
-        yield satellite, time, numbers.tolist()
-
-
-def glonass_numbers(records: GlonassRecords) -> Iterator[tuple[str, np.datetime64, list[float]]]:
-    """Satellite, time in UTC, and numbers in file order (kilometres) of each record."""
-    toe, fields = _glonass_fields(records)
-    for satellite, time, numbers in zip(records.satellite.tolist(), toe, np.stack(fields, axis=1), strict=True):
-        yield satellite, time, numbers.tolist()
-
-
-def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
-    """Clock time in the constellation's own time, and one array for each number of the file."""
+def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Datetimes, Floats]:
+    """Clock time in the constellation's own time, and the numbers of these names (`FIELDS`), shape (n, numbers)."""
     letter = records.satellite.astype("<U1")
     unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
     if unknown.size:
@@ -190,37 +171,23 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
     toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
     week, sent = _week_and_transmission(records, shift, beidou)
-    # The spare field of BeiDou between two others is 0: some readers cannot read a blank there.
-    zero, blank = np.zeros(len(records)), np.full(len(records), np.nan)
     # QZSS writes the flag: 0 for two hours, 1 for longer.
     fit = np.where(
         letter == "J",
         np.where(np.isnan(records.fit_interval_h), np.nan, records.fit_interval_h > 2.0),
         records.fit_interval_h,
     )
-    first, second = records.group_delay_1_s, records.group_delay_2_s
-    fields = (
-        records.af0_s, records.af1, records.af2,
-        records.iode, records.crs, records.delta_n, records.m0,
-        records.cuc, records.eccentricity, records.cus, records.sqrt_a,
-        records.toe_sow_s, records.cic, records.omega0, records.cis,
-        records.i0, records.crc, records.omega, records.omega_dot,
-        records.i_dot, records.data_source, week, np.where(navstar, zero, blank),
-        records.accuracy_m, records.health, first, np.where(navstar, records.iodc, second),
-        sent, np.where(navstar, fit, np.where(beidou, records.iodc, blank)),
-    )  # fmt: skip
-    return toc, [np.asarray(f, dtype=np.float64) for f in fields]
-
-
-def _cnv1_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
-    """Clock time in BDT, and one array for each number of CNV1 (RINEX 4.02, table A18)."""
-    shift = timedelta(np.full(len(records), BDT_MINUS_GPST_S))
-    known = {name: getattr(records, name) for name in KeplerRecords.__dataclass_fields__}
-    known["inter_signal_0"] = records.inter_signal_s[:, 0]
-    known["transmitted"] = _week_and_transmission(records, shift, np.ones(len(records), dtype=bool))[1]
-    known["spare"], unknown = np.full((2, len(records)), [[np.nan], [UNKNOWN_S]])
-    toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
-    return toc, [np.asarray(known.get(name, unknown), dtype=np.float64) for name in FIELDS["C CNV1"]]
+    blank, unknown = np.full((2, len(records)), [[np.nan], [UNKNOWN_S]])
+    known = vars(records) | {
+        "week": week,
+        "flag": np.where(navstar, 0.0, np.nan),
+        "group_delay_2_s": np.where(navstar, records.iodc, records.group_delay_2_s),
+        "inter_signal_0": records.inter_signal_s[:, 0],
+        "transmitted": sent,
+        "fit": np.where(navstar, fit, np.where(beidou, records.iodc, blank)),
+        "spare": blank,
+    }
+    return toc, np.stack([np.asarray(known.get(name, unknown), dtype=np.float64) for name in names], axis=1)
 
 
 def _week_and_transmission(
@@ -236,8 +203,8 @@ def _week_and_transmission(
     return own.astype(np.float64), np.where(np.isnan(sent), UNKNOWN_S, sent)
 
 
-def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
-    """Time in UTC, and one array for each number of the file."""
+def glonass_numbers(records: GlonassRecords) -> tuple[Datetimes, Floats]:
+    """Time in UTC, and the numbers in file order (kilometres), shape (n, numbers)."""
     toe, sent = gpst_to_utc(records.toe), gpst_to_utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
     position, velocity, acceleration = (
@@ -251,4 +218,4 @@ def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
     last = (records.health, records.frequency_channel, records.age_days)
     for axis, extra in enumerate(last):
         fields += [position[:, axis], velocity[:, axis], acceleration[:, axis], extra.astype(np.float64)]
-    return toe, fields
+    return toe, np.stack(fields, axis=1)
