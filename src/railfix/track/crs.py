@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
-from os import PathLike
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.files import FilePath
 
 #: Three-dimensional codes of the realisations of the ITRF.
 _ITRF: Final = {
@@ -189,7 +189,7 @@ def _system(crs: str) -> CRS:
     return CRS.from_user_input(crs)
 
 
-def find_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
+def find_crs(crs: str, *, path: FilePath = "") -> CRS:
     """The system of a name, asked for in a file; SettingsError when PROJ does not know it."""
     try:
         return _system(crs)
@@ -200,7 +200,7 @@ def find_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
         ) from None
 
 
-def choose_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
+def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
     """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
     if given is None or named is None:
         used = given or named

@@ -162,20 +162,17 @@ def alignment_at(
     place_m: Floats, plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
 ) -> AlignmentPoints:
     """Return points of an alignment at lengths in plan (n,), each by the first point of its own element."""
-    starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
+    starts = plan_starts(plan)
     xy, curvature = np.zeros((len(place_m), 2)), np.zeros(len(place_m))
-    index = np.clip(np.searchsorted(starts, place_m, side="right") - 1, 0, len(plan) - 1)
-    for k, element in enumerate(plan):
-        rows = index == k
-        if rows.any():
-            way = place_m[rows] - starts[k]
-            xy[rows], curvature[rows] = element.place_at(way), element.curvature_at(way)
+    for rows, k in _by_start(place_m, starts):
+        way = place_m[rows] - starts[k]
+        xy[rows], curvature[rows] = plan[k].place_at(way), plan[k].curvature_at(way)
     height, gradient = np.full(len(place_m), np.nan), np.full(len(place_m), np.nan)
-    for rows, k in _by_start(place_m, profile):
+    for rows, k in _by_start(place_m, [element.start_m for element in profile]):
         height[rows] = profile[k].height_at(place_m[rows])
         gradient[rows] = profile[k].gradient_at(place_m[rows])
     difference = np.full(len(place_m), np.nan)
-    for rows, k in _by_start(place_m, cant):
+    for rows, k in _by_start(place_m, [element.start_m for element in cant]):
         left, right = cant[k].rails_at(place_m[rows])
         height[rows] += (left + right) / 2.0
         difference[rows] = right - left
@@ -184,21 +181,27 @@ def alignment_at(
     )
 
 
-def _by_start(place_m: Floats, elements: Sequence[ProfileElement] | Sequence[CantElement]) -> list[tuple[Masks, int]]:
-    if not elements:
+def plan_starts(plan: Sequence[PlanElement]) -> Floats:
+    """Length in plan at the start of each element, shape (elements,) [m]."""
+    return np.cumsum([0.0, *(element.length_m for element in plan[:-1])])
+
+
+def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
+    """Rows and number of each element that places lie in: the last that begins before, else the first."""
+    if not len(starts):
         return []
-    index = np.searchsorted([element.start_m for element in elements], place_m, side="right") - 1
-    return [(np.clip(index, 0, None) == k, k) for k in np.unique(np.clip(index, 0, None))]
+    index = np.maximum(np.searchsorted(starts, place_m, side="right") - 1, 0)
+    return [(index == k, k) for k in np.unique(index).tolist()]
 
 
 def alignment_points(
     plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
     """Points of an alignment such that chords stay within 1 cm of its arcs, and notes on joints that do not meet."""
-    length = sum(element.length_m for element in plan)
-    starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
-    places = [np.array([0.0, length]), starts]
-    for element, start in zip(plan, starts, strict=False):
+    starts = plan_starts(plan)
+    length = starts[-1] + plan[-1].length_m
+    places = [np.array([0.0, length])]
+    for element, start in zip(plan, starts, strict=True):
         bend = max(abs(element.first), abs(element.last))
         step = min(_LONGEST_M, np.sqrt(8.0 * _CHORD_M / bend)) if bend else _LONGEST_M
         places.append(start + np.linspace(0.0, element.length_m, int(np.ceil(element.length_m / step)) + 1))

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
@@ -25,7 +24,7 @@ from pyproj.exceptions import CRSError, ProjError
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import read_text
+from railfix.core.files import FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.crs import (
     HELD,
@@ -87,7 +86,7 @@ class MapMotion(TypedDict, total=False):
     plate: str | None  #: Plate that moves coordinates of an ITRF from `epoch` to the time of the log: one of `PLATES`.
     #: Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
     #: deformation included; `epoch` is that of the file then, from which on the plate moves them.
-    parameters: str | PathLike[str] | None
+    parameters: FilePath | None
 
 
 def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> tuple[Track, FrameShift]:
@@ -207,7 +206,7 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 
 
 def _by_parameters(
-    ecef_m: Floats, path: str | PathLike[str], year: float, epoch: float | None, plate: str
+    ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
     """Move JGD2011 by a semi-dynamic correction, once in each thousandth of a degree, and with the plate."""
     try:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from os import PathLike
 from typing import Any, Final
 
 import numpy as np
 from pyproj import CRS, Transformer
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, places_in_groups
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import ending
+from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.nmea import read_any_positions
@@ -27,7 +26,7 @@ from railfix.track.trajectory import NearestOnPolyline
 RASTERS: Final = (
     ".tif", ".tiff", ".asc", ".vrt", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".bil", ".flt", ".jp2", ".grd", ".xyz",
 )  # fmt: skip
-HeightSource = str | PathLike[str] | PositionLog  #: A file, or positions in memory.
+HeightSource = FilePath | PositionLog  #: A file, or positions in memory.
 _SPACING_M: Final = 50.0  #: Largest distance of the points that heights are put on [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Cells of a raster read at a time.
 _NEAR_M: Final = 15.0  #: Positions further than this from the line in plan are of another line [m].
@@ -41,9 +40,7 @@ _LARGEST_KERNEL_M: Final = 150.0
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
-def check_raster(
-    path: str | PathLike[str], *, geoid: str | None, height_datum: str | None, sigma_m: float | None
-) -> None:
+def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
     """Raise SettingsError with all options that a raster needs besides; InputFileError where it is none."""
     with _open_raster(path) as (_, crs):
         own = crs.is_compound
@@ -88,8 +85,8 @@ def _dense(track: Track) -> Track:
     if not (pieces > 1).any():
         return track
     pieces = np.maximum(pieces, 1)
-    start = np.repeat(np.arange(len(pieces)), pieces)
-    share = (np.arange(len(start)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / np.repeat(pieces, pieces)
+    start, piece = places_in_groups(pieces)
+    share = piece / pieces[start]
 
     def between(values: Floats) -> Floats:
         return np.append(values[start] + share * (values[start + 1] - values[start]), values[-1])
@@ -105,7 +102,7 @@ def _dense(track: Track) -> Track:
 
 
 @contextmanager
-def _open_raster(path: str | PathLike[str]) -> Iterator[tuple[Any, CRS]]:
+def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
     """A raster and its CRS; InputFileError where there is none."""
     try:
         import rasterio
@@ -122,7 +119,7 @@ def _open_raster(path: str | PathLike[str]) -> Iterator[tuple[Any, CRS]]:
 
 
 def _from_raster(
-    track: Track, path: str | PathLike[str], *, geoid: str | None, height_datum: str | None, sigma_m: float | None
+    track: Track, path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None
 ) -> Track:
     """Heights of a raster at the points of the track, linear between the middles of its cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Any, Final
 
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_text
+from railfix.core.files import FilePath, read_text
 from railfix.track.crs import LARGEST_SCALE, choose_crs
-from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
+from railfix.track.elements import CantElement, PlanElement, ProfileElement, plan_starts, segment_of_design
 from railfix.track.route import MapReading, Segment
 
 _LAWS: Final = {
@@ -61,7 +60,7 @@ class _Placement:
 class _Step:
     """Entities of a STEP physical file (ISO 10303-21) by number."""
 
-    def __init__(self, path: str | PathLike[str]) -> None:
+    def __init__(self, path: FilePath) -> None:
         self.path = str(path)
         text = read_text(path)
         if "ISO-10303-21" not in text[:200] or "DATA;" not in text:
@@ -98,7 +97,7 @@ def _values(text: str) -> list[Any]:
     return list(stack[0][0])
 
 
-def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read alignments of an IFC file; heights are of the middle between the rail tops (IfcSegmentedReferenceCurve)."""
     step = _Step(path)
     nested = {entity.values[4]: entity.values[5] for _, entity in step.of_kind("IFCRELNESTS")}
@@ -268,9 +267,8 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
 
 def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement]) -> list[PlanElement]:
     """Return the elements in plan, Viennese bends with the lean of their cant; `leans` are metres a metre of it."""
-    starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
     result = []
-    for element, lean, start in zip(plan, leans, starts, strict=False):
+    for element, lean, start in zip(plan, leans, plan_starts(plan), strict=True):
         if element.law == "viennese":
             same = cant[int(np.argmin([abs(ramp.start_m - start) for ramp in cant]))]
             rise = np.diff(same.right_m) - np.diff(same.left_m) if abs(same.start_m - start) < 0.1 else np.zeros(1)

@@ -12,7 +12,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
-from os import PathLike
 from pathlib import Path
 from typing import Final
 
@@ -20,11 +19,11 @@ import numpy as np
 import polars as pl
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import text_lines
+from railfix.core.files import FilePath, text_lines
 from railfix.io.mate import mate_table, read_mate
 from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import choose_crs, frame_degrees
-from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
+from railfix.track.elements import CantElement, PlanElement, ProfileElement, plan_starts, segment_of_design
 from railfix.track.route import MapReading, Segment, make_segment
 
 #: CRS of coordinates in degrees with their ellipsoidal height (ETRS89).
@@ -74,13 +73,13 @@ _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
 
-def is_mate(path: str | PathLike[str]) -> bool:
+def is_mate(path: FilePath) -> bool:
     """Whether a CSV is a table of positions of track segments, by its header."""
     head = next(iter(text_lines(path)), "").upper()
     return "TRACK_EDGE_ID" in head and "TRACK_SEGMENT_TYPE" in head
 
 
-def read_mate_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def read_mate_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the edges of the tables as segments, in the order of the file; InputFileError where they do not meet."""
     gradients, cants = (_rows(path, name) for name in (_GRADIENT, _CANT))
     found = []
@@ -96,7 +95,7 @@ def read_mate_segments(path: str | PathLike[str], reading: MapReading) -> list[S
     return found
 
 
-def _rows(path: str | PathLike[str], table: str | None) -> dict[str, list[Row]]:
+def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
     """Rows of each edge by their distance from its start; of another table beside the file where it is there."""
     file = Path(path)
     if table is not None:
@@ -241,10 +240,9 @@ def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
     start, length, first, last = (_number(path, row, name) for name in (*_SPAN, "INITIAL_CANT", "END_CANT"))
     if _number(path, row, "TRACK_SEGMENT_DIRECTION") < 0.0:
         first, last = last, first
-    starts = np.cumsum([0.0, *(element.length_m for element in plan)])
     bends = [
         bend
-        for element, low in zip(plan, starts, strict=False)
+        for element, low in zip(plan, plan_starts(plan), strict=True)
         if low < start + length and low + element.length_m > start
         for bend in (element.first, element.last)
     ]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, read_only
+from railfix.core.arrays import Floats, Indices, Integers, Masks, places_in_groups, read_only, take_rows
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files
@@ -57,7 +57,7 @@ class Candidates:
 
     def take(self, rows: Indices | Masks) -> Candidates:
         """Return those of some of the positions."""
-        return Candidates(track=self.track[rows], chainage_m=self.chainage_m[rows], offset_m=self.offset_m[rows])
+        return take_rows(self, rows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,8 +195,8 @@ class Network:
         inner[self.first_point[1:-1] - 1] = False
         segment = np.flatnonzero(inner & (steps > 0.0))
         pieces = np.maximum(np.ceil(steps[segment] / _SAMPLE_M).astype(np.intp), 1)
-        of = np.repeat(segment, pieces)
-        share = (np.arange(len(of)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / np.repeat(pieces, pieces)
+        row, piece = places_in_groups(pieces)
+        of, share = segment[row], (piece + 0.5) / pieces[row]
         samples = self.points_m[of] + share[:, None] * (self.points_m[of + 1] - self.points_m[of])
         track = np.searchsorted(self.first_point, of, side="right") - 1
         reach = float((steps[segment] / pieces).max(initial=0.0)) / 2.0

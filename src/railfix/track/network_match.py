@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from os import PathLike
 from typing import Any, Final, Unpack
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, take_rows
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import ending
+from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions
@@ -39,6 +38,8 @@ _WRONG_S: Final = 60.0
 #: Tracks that are looked at from such positions, and what stands where there is none.
 _MOST_FAR: Final = 8
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
+#: What stands where a position was not matched.
+_NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
 _MOST_TRACKS: Final = 16  #: Tracks near a position that are looked at.
 _APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each other for which heights count [m].
@@ -58,8 +59,7 @@ class PlanLog:
 
     def take(self, rows: Indices) -> PlanLog:
         """Return some of the positions."""
-        columns: dict[str, Any] = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return replace(self, **columns)
+        return take_rows(self, rows)
 
     def in_frame_of(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """Return the positions, in the frame of the satellites, in that of the network; else MismatchError."""
@@ -113,11 +113,10 @@ class Matched:
 
     def take(self, rows: Indices) -> Matched:
         """Return some of the positions."""
-        own = {name: values[rows] for name, values in vars(self).items() if name != "candidates"}
-        return Matched(**own, candidates=self.candidates.take(rows))
+        return replace(take_rows(self, rows), candidates=self.candidates.take(rows))
 
 
-def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PlanLog:
+def read_plan_positions(path: FilePath, *, columns: Mapping[str, str] | None = None) -> PlanLog:
     """Read positions in plan: any log of positions, or a CSV (`columns` renamed) without heights."""
     if ending(path) == ".csv":
         table = rename_columns(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
@@ -291,12 +290,6 @@ def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
         full[rows] = values
         return full
 
-    near = matched.candidates
-    return Matched(
-        track=over(matched.track, -1),
-        chainage_m=over(matched.chainage_m, np.nan),
-        offset_m=over(matched.offset_m, np.nan),
-        probability=over(matched.probability, np.nan),
-        candidates=Candidates(**{name: over(values, _NO_TRACK[name]) for name, values in vars(near).items()}),
-        probabilities=over(matched.probabilities, np.nan),
-    )
+    own = {name: over(values, _NO_MATCH[name]) for name, values in vars(matched).items() if name in _NO_MATCH}
+    near = {name: over(values, _NO_TRACK[name]) for name, values in vars(matched.candidates).items()}
+    return Matched(**own, candidates=Candidates(**near))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from os import PathLike
 from typing import Final
 
 import networkx as nx
@@ -14,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending, read_text
+from railfix.core.files import FilePath, ending, read_text
 from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
 from railfix.track.read import read_segments
@@ -29,7 +28,7 @@ _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
 
 def read_network(
-    paths: Sequence[str | PathLike[str]], reading: MapReading | None = None, *, tolerance_m: float = TOLERANCE_M
+    paths: Sequence[FilePath], reading: MapReading | None = None, *, tolerance_m: float = TOLERANCE_M
 ) -> Network:
     """Read a network from map files, connected as they state, else where ends, or an end and a track, meet."""
     of_file = replace(reading or MapReading(), duplicates="keep")
@@ -37,9 +36,7 @@ def read_network(
     return network_of(tracks, paths, tolerance_m=tolerance_m)
 
 
-def network_of(
-    tracks: list[Segment], paths: Sequence[str | PathLike[str]], *, tolerance_m: float = TOLERANCE_M
-) -> Network:
+def network_of(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
     """Connect tracks to a network: as their files state it, else by their ends; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
@@ -49,7 +46,7 @@ def network_of(
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
 
 
-def _relations(path: str | PathLike[str]) -> list[Relation]:
+def _relations(path: FilePath) -> list[Relation]:
     """Connections that a file states, empty where it states none."""
     if ending(path) in (".xml", ".railml"):
         return read_railml_relations(path)
@@ -84,16 +81,7 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
     known = [r for r in relations if r.first in number and r.second in number]
     if not known:
         raise InputFileError(path, f"none of its {len(relations)} net relations names a track of the file")
-    links = tuple(
-        Link(
-            first=number[r.first],
-            first_end=r.first_end,
-            second=number[r.second],
-            second_end=r.second_end,
-            navigable=r.navigable,
-        )
-        for r in known
-    )
+    links = tuple(Link(**{**vars(r), "first": number[r.first], "second": number[r.second]}) for r in known)
     note = f"connections as {len(known)} net relations of the file state them"
     if len(known) < len(relations):
         note += f"; {len(relations) - len(known)} relations name a track that it does not have"
@@ -218,10 +206,17 @@ def check_network(network: Network) -> NetworkQuality:
     )
 
 
-def _place(network: Network, track: int, end: int) -> dict[str, float]:
-    segment = network.tracks[track]
+def _finding(network: Network, kind: str, tracks: Sequence[int], end: int, sentence: str) -> NetworkFinding:
+    """A fault at an end of the first of some tracks, whose names stand in the sentence for {0} and {1}."""
+    names, segment = tuple(network.names[track] for track in tracks), network.tracks[tracks[0]]
     k = -end  # 0 is the first point, -1 the last
-    return {"latitude_deg": float(segment.latitude_deg[k]), "longitude_deg": float(segment.longitude_deg[k])}
+    return NetworkFinding(
+        kind=kind,
+        tracks=names,
+        latitude_deg=float(segment.latitude_deg[k]),
+        longitude_deg=float(segment.longitude_deg[k]),
+        sentence=sentence.format(*names),
+    )
 
 
 def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFinding]:
@@ -236,44 +231,28 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
     for a, b in sorted(near):
         (t, e), (u, _) = loose[a], loose[b]
         gap = float(np.linalg.norm(points[a] - points[b]))
-        names = (network.names[t], network.names[u])
-        yield NetworkFinding(
-            kind="gap",
-            tracks=names,
-            **_place(network, t, e),
-            sentence=f"{names[0]} and {names[1]} end {gap:.2f} m apart without a navigable connection",
+        yield _finding(
+            network, "gap", (t, u), e, f"{{0}} and {{1}} end {gap:.2f} m apart without a navigable connection"
         )
     paired = {k for pair in near for k in pair}
     for k, (t, e) in enumerate(loose):
         if k not in paired:
-            name = network.names[t]
-            yield NetworkFinding(
-                kind="dead end", tracks=(name,), **_place(network, t, e), sentence=f"{name} ends without a connection"
-            )
+            yield _finding(network, "dead end", (t,), e, "{0} ends without a connection")
 
 
 def _joints(network: Network) -> Iterator[NetworkFinding]:
     """Connections whose ends do not meet, and navigable ones with a kink."""
     ends, outward = end_points(network)
     for link in network.links:
-        first, second = (link.first, link.first_end), (link.second, link.second_end)
-        names = (network.names[link.first], network.names[link.second])
+        first, second, tracks = (link.first, link.first_end), (link.second, link.second_end), (link.first, link.second)
         gap = float(np.linalg.norm(ends[first] - ends[second]))
         if gap > _JOINT_M:
-            yield NetworkFinding(
-                kind="joint",
-                tracks=names,
-                **_place(network, *first),
-                sentence=f"the connected ends of {names[0]} and {names[1]} are {gap:.2f} m apart",
-            )
+            sentence = f"the connected ends of {{0}} and {{1}} are {gap:.2f} m apart"
+            yield _finding(network, "joint", tracks, link.first_end, sentence)
         turn = 180.0 - np.degrees(np.arccos(np.clip(outward[first] @ outward[second], -1.0, 1.0)))
         if link.navigable and turn > _KINK_DEG:
-            yield NetworkFinding(
-                kind="kink",
-                tracks=names,
-                **_place(network, *first),
-                sentence=f"the direction changes by {turn:.0f} deg from {names[0]} to {names[1]}",
-            )
+            sentence = f"the direction changes by {turn:.0f} deg from {{0}} to {{1}}"
+            yield _finding(network, "kink", tracks, link.first_end, sentence)
 
 
 def _too_near(network: Network) -> Iterator[NetworkFinding]:

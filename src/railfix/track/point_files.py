@@ -6,14 +6,13 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from os import PathLike
 from typing import Any, Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import read_text, write_whole
+from railfix.core.files import FilePath, read_text, write_whole
 from railfix.core.settings import misspelt
 from railfix.core.tables import plural
 from railfix.io.named_columns import NamedColumns, read_named_columns
@@ -175,7 +174,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]
     return frame_degrees(crs, values[:, 0], values[:, 1], path=path)
 
 
-def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of a GeoJSON file as segments; `reading` gives what the file leaves out."""
     text = read_text(path)
     try:
@@ -282,7 +281,7 @@ def attributes(read: Callable[[str, float], Floats | None]) -> dict[str, Floats]
     return found
 
 
-def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
+def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
     """Read a CSV track map as one segment of a route; its CRS is geographic."""
     check_height_datum(reading.height_datum)
     table = read_named_columns(path)
@@ -393,7 +392,7 @@ def _check_degrees(crs: str | None, latitude: Floats, longitude: Floats, *, path
     return frame_degrees(crs, longitude, latitude, path=path)
 
 
-def write_track_csv(track: Track, path: str | PathLike[str], *, sigma_m: Floats | None = None) -> None:
+def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = None) -> None:
     """Write a track as CSV with ellipsoidal heights; a failed write leaves no file.
 
     Attributes without any value are omitted. The file reads back equal to the track within

@@ -11,7 +11,7 @@ from typing import Unpack
 import numpy as np
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import ending
+from railfix.core.files import FilePath, ending
 from railfix.io.mate import mate_table
 from railfix.track.frames import GEOIDS, check_height_datum
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
@@ -26,12 +26,12 @@ from railfix.track.xml_files import read_rinf_segments
 
 
 def read_track(
-    paths: str | PathLike[str] | Sequence[str | PathLike[str]],
+    paths: FilePath | Sequence[FilePath],
     *,
     name: str | None = None,
     max_gap_m: float = MAX_GAP_M,
     sigma_height_m: float | None = None,
-    heights: str | PathLike[str] | None = None,
+    heights: FilePath | None = None,
     **options: Unpack[MapOptions],
 ) -> Track:
     """Read the centreline of a route from map files.
@@ -140,7 +140,7 @@ def check_heights(
         check_raster(heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
 
 
-def read_segments(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of one map file in their order; a file without heights gives segments without."""
     segments = _segments_of(file, reading)
     if (given := reading.sigma_plan_m) is not None:
@@ -161,7 +161,7 @@ def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
     return replace(segment, metadata=metadata, notes=(*segment.notes, *notes))
 
 
-def _segments_of(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def _segments_of(file: FilePath, reading: MapReading) -> list[Segment]:
     if mate_table(file) and (mate_table(file) == "S_DM_TRACKPOINT" or ending(file) == ".parquet"):
         from railfix.track.mate_file import read_edges
 

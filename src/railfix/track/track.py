@@ -259,9 +259,14 @@ def geometry_of(track: Track) -> Geometry:
         mid_chord_m=_scatter(length**2 * curvature / 8.0, segments, len(spacing)),
         gradient_permille=_scatter(1e3 * climb / length, segments, len(spacing)),
         height_spike_m=_scatter(spike, points, len(track)),
-        map_curvature=_mean_of_map(track, curvature_of_map),
+        map_curvature=_mean_over(track.chainage_m, curvature_of_map, *_windows(track.chainage_m, _BEND_WINDOW_M)),
         point_curvature=_bend(track, kept, turn),
     )
+
+
+def _windows(along: Floats, window_m: float) -> tuple[Floats, Floats]:
+    """Compute the ends of a window about each point, within the line."""
+    return np.maximum(along - window_m / 2.0, along[0]), np.minimum(along + window_m / 2.0, along[-1])
 
 
 def _scatter(values: Floats, places: Integers, size: int) -> Floats:
@@ -299,17 +304,15 @@ def _circle_curvature(plan: Floats) -> Floats:
     return np.concatenate([[np.nan], inner, [np.nan]])
 
 
-def _mean_of_map(track: Track, curvature: Floats) -> Floats:
-    """Compute the mean of the map's curvature over the same window, shape (V,) [1/m]; NaN where it is not known."""
-    along = track.chainage_m
-    low, high = np.maximum(along - _BEND_WINDOW_M / 2.0, along[0]), np.minimum(along + _BEND_WINDOW_M / 2.0, along[-1])
-    unknown = np.isnan(curvature)
+def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floats:
+    """Compute the means of values at points of the line from one chainage to another; NaN with an unknown one."""
+    unknown = np.isnan(values)
 
-    def between(values: Floats) -> Floats:
-        total = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2.0 * np.diff(along))])
+    def between(part: Floats) -> Floats:
+        total = np.concatenate([[0.0], np.cumsum((part[1:] + part[:-1]) / 2.0 * np.diff(along))])
         return np.asarray(np.interp(high, along, total) - np.interp(low, along, total))
 
-    whole, without = between(np.where(unknown, 0.0, curvature)), between(unknown.astype(np.float64))
+    whole, without = between(np.where(unknown, 0.0, values)), between(unknown.astype(np.float64))
     return np.where((without > 0.0) | (high <= low), np.nan, whole / np.where(high > low, high - low, 1.0))
 
 
@@ -327,18 +330,10 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
 
 def mean_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
     """Mean gradients [permille] of attribute and heights over a window, shapes (V,); NaN where unknown."""
-    along, gradient = track.chainage_m, track.gradient_permille
-    mean = (gradient[1:] + gradient[:-1]) / 2.0
-    unknown = np.concatenate([[0], np.cumsum(np.isnan(mean))])
-    climb = np.concatenate([[0.0], np.cumsum(np.where(np.isnan(mean), 0.0, mean) * np.diff(along))])
-    low = np.maximum(along - window_m / 2.0, along[0])
-    high = np.minimum(along + window_m / 2.0, along[-1])
-    last = np.minimum(np.searchsorted(along, high, side="left"), len(along) - 1)
-    first = np.maximum(np.searchsorted(along, low, side="right") - 1, 0)
-    enough = (high - low >= window_m / 2.0) & (unknown[last] == unknown[first])
-    width = np.where(enough, high - low, np.nan)
-    order = np.concatenate([[True], np.diff(along) > 0.0])
-    attribute = (np.interp(high, along[order], climb[order]) - np.interp(low, along[order], climb[order])) / width
-    height = track.height_m[order]
-    from_heights = 1e3 * (np.interp(high, along[order], height) - np.interp(low, along[order], height)) / width
-    return attribute, from_heights
+    different = np.concatenate([[True], np.diff(track.chainage_m) > 0.0])
+    along, height = track.chainage_m[different], track.height_m[different]
+    low, high = _windows(track.chainage_m, window_m)
+    width = np.where(high - low >= window_m / 2.0, high - low, np.nan)
+    attribute = _mean_over(track.chainage_m, track.gradient_permille, low, high)
+    from_heights = 1e3 * (np.interp(high, along, height) - np.interp(low, along, height)) / width
+    return np.where(np.isnan(width), np.nan, attribute), from_heights

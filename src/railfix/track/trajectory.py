@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, read_only
+from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, places_in_groups, read_only
 from railfix.core.geodesy import axes_at
 from railfix.core.tables import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
@@ -43,9 +43,8 @@ class NearestOnPolyline:
         self._length = np.linalg.norm(self._step, axis=1)
         spacing = max(float(np.median(self._length)), float(self._length.sum()) / (4 * len(points_m)), 1e-3)
         pieces = np.maximum(np.ceil(self._length / spacing).astype(np.int64), 1)
-        first = np.cumsum(pieces) - pieces
-        self._segment = np.repeat(np.arange(len(pieces)), pieces)
-        share = (np.arange(pieces.sum()) - first[self._segment] + 0.5) / pieces[self._segment]
+        self._segment, piece = places_in_groups(pieces)
+        share = (piece + 0.5) / pieces[self._segment]
         #: Half the spacing of the samples, which lie in the middle of their pieces [m].
         self.reach_m = float((self._length / pieces).max()) / 2.0 * (1.0 + 1e-9)
         self._tree = cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])

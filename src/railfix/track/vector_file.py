@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
-from os import PathLike
 from typing import Any, Final
 from xml.etree.ElementTree import ParseError, iterparse
 
@@ -22,7 +21,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending, open_stream
+from railfix.core.files import FilePath, ending, open_stream
 from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights
 from railfix.track.frames import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
@@ -103,7 +102,7 @@ def metadata_of(row: Mapping[str, Any]) -> dict[str, str]:
     return {"name": " ".join(words[:2]), **ORIGIN}
 
 
-def with_left_out(path: str | PathLike[str], segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
+def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
     """Segments of a file, the first with a note on its lines that are no tracks; InputFileError where none is left."""
     left_out = ", ".join(f"{n} {why}" for why, n in reasons.items())
     note = f"{path}: lines left out that are no tracks: {left_out}"
@@ -113,7 +112,7 @@ def with_left_out(path: str | PathLike[str], segments: list[Segment], reasons: C
     return [replace(segments[0], notes=(*segments[0].notes, note)), *segments[1:]] if reasons else segments
 
 
-def read_osm_xml(path: str | PathLike[str]) -> list[Way]:
+def read_osm_xml(path: FilePath) -> list[Way]:
     """Read the railway ways of an OSM XML file, in any order of its elements; InputFileError."""
     nodes: dict[str, tuple[float, float]] = {}
     ways: list[tuple[dict[str, Any], list[Any]]] = []
@@ -152,7 +151,7 @@ def read_overpass(path: str, elements: Any) -> list[Way]:
     return _ways(path, ways, nodes)
 
 
-def _place(path: str | PathLike[str], lon: Any, lat: Any) -> tuple[float, float]:
+def _place(path: FilePath, lon: Any, lat: Any) -> tuple[float, float]:
     for text in (lon, lat):
         if "," in str(text):
             raise InputFileError(path, f"{text}: has a comma in a number; a point was expected")
@@ -163,7 +162,7 @@ def _place(path: str | PathLike[str], lon: Any, lat: Any) -> tuple[float, float]
 
 
 def _ways(
-    path: str | PathLike[str],
+    path: FilePath,
     ways: Iterable[tuple[dict[str, Any], list[Any]]],
     nodes: Mapping[str, tuple[float, float]],
 ) -> list[Way]:
@@ -191,7 +190,7 @@ _LOOKED_AT: Final = 1 << 20  #: Bytes of a text file that are looked at before G
 _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns that name a line, in this order.
 
 
-def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
+def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
     """Read CRS, properties and geometries of all features of a kind ("LineString", "none": any), an entry a layer."""
     try:
         import pyogrio
@@ -223,7 +222,7 @@ def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str |
     return layers
 
 
-def _check_text(path: str | PathLike[str]) -> None:
+def _check_text(path: FilePath) -> None:
     """Reject coordinates that GDAL reads as others: decimal commas, heights above the ground."""
     kind = ending(path)
     if kind not in (".gpx", ".kml"):
@@ -238,7 +237,7 @@ def _check_text(path: str | PathLike[str]) -> None:
         )
 
 
-def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of a map file as segments; CRS, height datum and geoid are for files that name none."""
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
@@ -257,7 +256,7 @@ def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list
     return with_left_out(path, segments, left_out)
 
 
-def _features(path: str | PathLike[str]) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]]]]:
+def _features(path: FilePath) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]]]]:
     """CRS, columns and lines of the features of each layer; of OSM XML without GDAL, which needs sorted nodes."""
     if ending(path) == ".osm":
         ways = read_osm_xml(path)

@@ -7,7 +7,6 @@ Axes: origin midway between the bogie centres at the height of the rail tops; ``
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike
 from typing import Final, Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from pydantic import ConfigDict, Field
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
+from railfix.core.files import FilePath
 from railfix.core.geodesy import axes_at, enu_axes
 from railfix.core.settings import Settings, load_settings
 from railfix.track.from_positions import ANTENNA_PATH
@@ -58,7 +58,7 @@ class Vehicle(Settings):
         return self.gauge_m + RAIL_HEAD_M
 
 
-def read_vehicle(path: str | PathLike[str]) -> Vehicle:
+def read_vehicle(path: FilePath) -> Vehicle:
     """Read a vehicle file (TOML).
 
     InputFileError: no such file, or not TOML. SettingsError: a key is unknown, missing or out of range.

@@ -11,13 +11,12 @@ import warnings
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
-from os import PathLike
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending, file_sha256, open_stream, read_bytes
+from railfix.core.files import FilePath, ending, file_sha256, open_stream, read_bytes
 from railfix.track.crs import choose_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
@@ -58,7 +57,7 @@ class Relation:
     navigable: bool  #: Whether trains pass from one to the other.
 
 
-def _root(path: str | PathLike[str]) -> Any:
+def _root(path: FilePath) -> Any:
     try:
         from lxml import etree
     except ImportError:
@@ -70,7 +69,7 @@ def _root(path: str | PathLike[str]) -> Any:
         raise InputFileError(path, f"this is not XML ({error.msg})", line=error.lineno) from None
 
 
-def read_xml_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def read_xml_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of a LandXML or railML 3 file as segments; InputFileError when it is neither, or has no line."""
     root = _root(path)
     kind = str(root.tag).rsplit("}", 1)[-1]
@@ -310,7 +309,7 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     return segments
 
 
-def read_railml_relations(path: str | PathLike[str]) -> list[Relation]:
+def read_railml_relations(path: FilePath) -> list[Relation]:
     """Read the net relations of a railML 3 file; empty for other XML files."""
     root = _root(path)
     relations = []
@@ -341,7 +340,7 @@ _WKT: Final = re.compile(r"\s*(?:<(?P<crs>[^>]+)>)?\s*LINESTRING\s*Z?\s*\((?P<po
 _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
-def read_rinf_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
+def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the linear elements that have a geometry as segments; InputFileError where there is none."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
@@ -366,7 +365,7 @@ def read_rinf_segments(path: str | PathLike[str], reading: MapReading) -> list[S
     return segments
 
 
-def read_rinf_relations(path: str | PathLike[str]) -> list[Relation]:
+def read_rinf_relations(path: FilePath) -> list[Relation]:
     """Read the net relations of the register; navigability None joins two ends that no train passes between."""
     graph, relations = _graph(path), []
     for item in _all(graph, "NetRelation"):
@@ -388,7 +387,7 @@ def read_rinf_relations(path: str | PathLike[str]) -> list[Relation]:
     return relations
 
 
-def _graph(path: str | PathLike[str]) -> Graph:
+def _graph(path: FilePath) -> Graph:
     return _parse(str(path), file_sha256(path))
 
 
