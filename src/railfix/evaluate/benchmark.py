@@ -22,7 +22,7 @@ from railfix.core.errors import MismatchError, RailfixError
 from railfix.core.files import fingerprint, read_bytes, write_whole
 from railfix.core.geodesy import sigma_along
 from railfix.core.reasons import Status
-from railfix.core.timescale import seconds
+from railfix.core.timescale import nearest_rows, seconds
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
 from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, has_position
@@ -50,15 +50,10 @@ _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 
 def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
     """Find the row of a log nearest to each epoch, within 0.4 of the median interval; -1 without one, shape (T,)."""
-    rows = np.full(len(time), -1, dtype=np.intp)
-    known = np.flatnonzero(~np.isnat(found))
-    index = np.clip(np.searchsorted(time, found[known]), 1, len(time) - 1)
-    index -= (found[known] - time[index - 1]) < (time[index] - found[known])
-    away = np.abs(seconds(found[known] - time[index]))
-    near = np.flatnonzero(away < _NEAR * float(np.median(seconds(np.diff(time)))))
-    nearest = near[np.argsort(-away[near], kind="stable")]  # the nearest is written last
-    rows[index[nearest]] = known[nearest]
-    return rows
+    order = np.argsort(found, kind="stable")[: np.count_nonzero(~np.isnat(found))]
+    near_ns = int(_NEAR * np.median(np.diff(time).astype(np.int64)))
+    rows = nearest_rows(found[order], time, within_ns=near_ns)
+    return np.append(order, -1)[rows]
 
 
 def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Trajectory) -> pl.DataFrame:

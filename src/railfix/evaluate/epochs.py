@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, places_in_groups
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import EvaluationOptions, RunFolder, Sections, floats
@@ -72,11 +72,6 @@ class AntennaEpochs:
     step_s: float  #: Step of the log.
     from_sections: int  #: Epochs with a reference whose environment is that of the sections.
 
-    @property
-    def method(self) -> str:
-        """Method of the errors."""
-        return self.errors.method
-
 
 def level_columns(table: pl.DataFrame) -> list[str]:
     """Names of the columns of protection levels."""
@@ -111,10 +106,8 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
     gap = seconds(np.diff(time))
     step = float(np.median(gap))
     more = np.where(gap > 1.5 * step, np.round(gap / step).astype(np.int64) - 1, 0)
-    parts = np.repeat(more + 1, more)
-    first = np.repeat(np.cumsum(more) - more, more)
-    share = (np.arange(len(parts)) - first + 1) / parts
-    left = np.repeat(np.arange(len(gap)), more)
+    left, number = places_in_groups(more)
+    share = (number + 1) / (more[left] + 1)
     put_in = time[left] + (share * (time[left + 1] - time[left]).astype(np.float64)).astype("timedelta64[ns]")
     whole = np.concatenate([time, put_in])
     order = np.argsort(whole, kind="stable")

@@ -34,7 +34,7 @@ from railfix.io.reference_log import AntennaReference, read_reference
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
 #: Columns of the positions that are evaluated beside those of every table.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
-_FACTS: Final = ("method", "speed_from", "outside", "step_s")
+_FACTS: Final = ("speed_from", "outside", "step_s")
 #: Blocks of one run are numbered apart from those of the next.
 _BLOCKS_APART: Final = 10**9
 
@@ -240,6 +240,7 @@ def _evaluate(
         path=folder.path,
         table=folder.table,
         reference=source,
+        method={name: antenna.errors.method for name, antenna in antennas.items()},
         **facts,
         protection=folder.protection,
         settings=folder.settings,

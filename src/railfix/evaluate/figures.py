@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import nan
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import polars as pl
@@ -220,16 +220,15 @@ USED: Final = (
 def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
     """Epochs inside the reference, with a class and its rank (``section``, ``section_rank``) for every grouping."""
     section = (pl.col("chainage_m") / options.section_m).floor().cast(pl.Int64)
-    speed = pl.col("speed_mps") * 3.6
-    edges = np.array(options.speed_edges_kmh)
-    speed_rank = pl.when(pl.col("speed_mps") < options.standing_mps).then(0).otherwise(_rank(speed, edges) + 1)
-    sats = np.array(_SATELLITE_EDGES, dtype=np.float64)
+    speed, used = pl.col("speed_mps") * 3.6, pl.col("n_used")
+    edges = options.speed_edges_kmh
+    speed_rank = pl.when(pl.col("speed_mps") < options.standing_mps).then(0).otherwise(edges_reached(speed, edges) + 1)
     ranks = {
         "all": pl.lit(0),
         "section": section,
         "environment": pl.lit(0),
         "speed": pl.when(pl.col("speed_mps").is_null()).then(len(edges) + 2).otherwise(speed_rank),
-        "satellites": pl.when(pl.col("n_used").is_null()).then(-1).otherwise(_rank(pl.col("n_used"), sats)),
+        "satellites": pl.when(used.is_null()).then(-1).otherwise(edges_reached(used, _SATELLITE_EDGES)),
         "signals": pl.when(AIDED).then(0).otherwise(1),
         "status": pl.col("status").replace_strict({s.text: int(s) for s in Status}, default=len(Status)),
         "configuration": pl.lit(0),
@@ -255,7 +254,7 @@ def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.Data
     )
 
 
-def _rank(value: pl.Expr, edges: np.ndarray[Any, np.dtype[np.float64]]) -> pl.Expr:
+def edges_reached(value: pl.Expr, edges: Sequence[float]) -> pl.Expr:
     """How many of the edges a value has reached."""
     return pl.sum_horizontal((value >= float(edge)).cast(pl.Int64) for edge in edges)
 
@@ -379,26 +378,20 @@ def _with_limits(
     table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
 ) -> pl.DataFrame:
     """The table with confidence limits, null where there are none."""
-    groups = {}
-    if part is not None:
-        kept = part.select(*by, "error", "sigma", "observed", "has", "block")
-        groups = kept.partition_by(by, as_dict=True, maintain_order=True, include_key=False)
-    rows: list[dict[str, Any]] = []
-    for key in table.select(by).iter_rows():
-        if key not in groups:
-            rows.append({"blocks": None, **dict.fromkeys(LIMIT_COLUMNS)})
-            continue
-        group = groups[key]
-        limits = block_limits(
-            floats(group, "error"),
-            floats(group, "sigma"),
-            group["observed"].to_numpy(),
-            group["has"].to_numpy(),
-            group["block"].to_numpy(),
+    schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
+    if part is None:
+        return table.with_columns(pl.lit(None, kind).alias(name) for name, kind in schema.items())
+    kept = part.select(*by, "error", "sigma", "observed", "has", "block")
+    groups = kept.partition_by(by, as_dict=True, maintain_order=True, include_key=False)
+    rows = [
+        block_limits(
+            floats(groups[key], "error"),
+            floats(groups[key], "sigma"),
+            *(groups[key][name].to_numpy() for name in ("observed", "has", "block")),
             replicates=options.replicates,
             seed=options.seed,
             confidence=options.confidence,
         )
-        rows.append(limits)
-    schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
+        for key in table.select(by).iter_rows()
+    ]
     return table.hstack(pl.DataFrame(rows, schema=schema).with_columns(pl.col(LIMIT_COLUMNS).fill_nan(None)))

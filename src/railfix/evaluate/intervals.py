@@ -12,7 +12,7 @@ import polars as pl
 
 from railfix.core.errors import MismatchError
 from railfix.evaluate.epochs import OF_FILTER, level_columns
-from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, has_position
+from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, edges_reached, has_position
 from railfix.evaluate.inputs import RunFolder, read_run, tables_of
 
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
@@ -133,7 +133,7 @@ def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     words = pl.col("sources").str.split("+").list.explode(keep_nulls=False, empty_as_null=False)
     table = marked.group_by([*keys, "stretch"], maintain_order=True).agg(
         begin_gpst=pl.col("time_gpst").first(),
-        duration_s=(pl.col("time_gpst").last() - first).dt.total_nanoseconds() / 1e9,
+        duration_s=_seconds(pl.col("time_gpst").last() - first),
         travelled_m=pl.col("moved_m").last() - start,
         environment=pl.col("environment").get(pl.len() // 2),
         carried_by=words.filter(words != "").unique(maintain_order=True).str.join("+"),
@@ -173,7 +173,7 @@ def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
         return None
     judged = filtered.filter("in_reference", "reference_good", "positioned")
     names = [f"{low:g} to {high:g}" for low, high in pairwise(_EDGES)]
-    rank = pl.sum_horizontal((pl.col("branch_probability") >= edge).cast(pl.Int64) for edge in _EDGES[1:-1])
+    rank = edges_reached(pl.col("branch_probability"), _EDGES[1:-1])
     wrong = pl.col("distance_m") > WRONG_PLACE_M
     figures = [
         pl.len().cast(pl.Int64).alias("judged"),
@@ -183,14 +183,9 @@ def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
         pl.col("block").n_unique().cast(pl.Int64).alias("blocks"),
         pl.col("block").filter(wrong).n_unique().cast(pl.Int64).alias("wrong_blocks"),
     ]
-    ranked = judged.with_columns(rank=rank)
-    tables = [
-        ranked.group_by([*KEYS, "rank"], maintain_order=True).agg(figures),
-        ranked.with_columns(rank=pl.lit(len(names), pl.Int64))
-        .group_by([*KEYS, "rank"], maintain_order=True)
-        .agg(figures),
-    ]
-    table = pl.concat(tables).with_columns(probability=pl.col("rank").replace_strict(dict(enumerate([*names, ALL]))))
+    ranked = pl.concat([judged.with_columns(rank=rank), judged.with_columns(rank=pl.lit(len(names), pl.Int64))])
+    table = ranked.group_by([*KEYS, "rank"], maintain_order=True).agg(figures)
+    table = table.with_columns(probability=pl.col("rank").replace_strict(dict(enumerate([*names, ALL]))))
     return table.sort(*KEYS, "rank", maintain_order=True).select(*KEYS, *BRANCH_COLUMNS)
 
 

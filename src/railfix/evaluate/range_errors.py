@@ -6,7 +6,7 @@ Common errors are those that a nearby reference station has measured; of the err
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix import __version__
-from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.arrays import Datetimes, Floats, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import file_sha256
 from railfix.core.geodesy import range_with_rotation
@@ -282,9 +282,7 @@ def error_model_from_runs(
     parts = [samples for run in runs for samples in run.samples]
     if not any(len(part.error_m) for part in parts):
         raise MismatchError("no pseudorange error could be computed; do run, reference and station belong together?")
-    samples = ErrorSamples(
-        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(ErrorSamples)}
-    )
+    samples = join_rows(parts)
     conditions = runs[0].conditions
     for source, run in zip(inputs[1:], runs[1:], strict=True):
         if differences := condition_differences(

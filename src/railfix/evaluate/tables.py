@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -337,7 +337,6 @@ P1_COMMERCIAL: Final = (
     {"position": "conventional", "rate": 0.867, "max_m": 65.8},
     {"position": "constrained, all screens", "rate": 0.846, "max_m": 10.2},
 )
-_FILTER_COLUMNS: Final = {"outages": OUTAGE_COLUMNS, "branches": BRANCH_COLUMNS}
 #: Epochs beyond their level in ``evaluation.json``, the worst; the CSV file has all.
 MOST_BEYOND: Final = 200
 
@@ -358,37 +357,30 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
     ==================== ================================================================
     """
     folder.append_parquet("errors.parquet", evaluation.epochs)
-    folder.append_csv("tables.csv", evaluation.figures)
-    folder.append_csv("intervals.csv", evaluation.intervals)
-    if evaluation.levels is not None:
-        folder.append_csv("levels.csv", evaluation.levels)
-    for name, table in _of_filter(evaluation).items():
-        folder.append_csv(f"{name}.csv", table)
-    for kind, found in evaluation.integrity.items():
-        folder.append_csv(f"stanford_{kind}.csv", found.stanford)
-        folder.append_csv(f"beyond_{kind}.csv", found.beyond)
+    for name, (table, _) in _tables(evaluation).items():
+        folder.append_csv("tables.csv" if name == "figures" else f"{name}.csv", table)
     folder.write_json("evaluation.json", as_record(evaluation))
     return folder.commit({"railfix": __version__, "runs": "; ".join(str(run.path) for run in evaluation.runs)})
 
 
-def _of_filter(evaluation: Evaluation) -> dict[str, pl.DataFrame]:
-    """Tables of the filter along the track by name; empty without one."""
-    tables = {"outages": evaluation.outages, "branches": evaluation.branches}
-    return {name: table for name, table in tables.items() if table is not None}
+def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str, str]]]:
+    """All tables but that of epochs, by name, with the meaning of their columns."""
+    tables: dict[str, tuple[pl.DataFrame | None, Mapping[str, str]]] = {
+        "figures": (evaluation.figures, FIGURE_COLUMNS),
+        "intervals": (evaluation.intervals, INTERVAL_COLUMNS),
+        "outages": (evaluation.outages, OUTAGE_COLUMNS),
+        "branches": (evaluation.branches, BRANCH_COLUMNS),
+        "levels": (evaluation.levels, LEVEL_COLUMNS),
+    }
+    for kind, found in evaluation.integrity.items():
+        beyond = {name.replace("KIND", kind): meaning for name, meaning in BEYOND_COLUMNS.items()}
+        tables |= {f"stanford_{kind}": (found.stanford, STANFORD_COLUMNS), f"beyond_{kind}": (found.beyond, beyond)}
+    return {name: (table, columns) for name, (table, columns) in tables.items() if table is not None}
 
 
 def as_record(evaluation: Evaluation) -> dict[str, Any]:
     """Everything that ``evaluation.json`` says, as plain values; NaN as None."""
-    tables = {"figures": evaluation.figures, "intervals": evaluation.intervals, **_of_filter(evaluation)}
-    columns = {"figures": FIGURE_COLUMNS, "intervals": INTERVAL_COLUMNS, "epochs": EPOCH_COLUMNS}
-    columns |= {name: _FILTER_COLUMNS[name] for name in _of_filter(evaluation)}
-    if evaluation.levels is not None:
-        tables["levels"] = evaluation.levels
-        columns["levels"] = LEVEL_COLUMNS
-    for kind, found in evaluation.integrity.items():
-        tables |= {f"stanford_{kind}": found.stanford, f"beyond_{kind}": found.beyond.head(MOST_BEYOND)}
-        columns[f"stanford_{kind}"] = STANFORD_COLUMNS
-        columns[f"beyond_{kind}"] = {name.replace("KIND", kind): meaning for name, meaning in BEYOND_COLUMNS.items()}
+    tables = _tables(evaluation)
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), "polars": pl.__version__},
         "command": list(sys.argv),
@@ -399,9 +391,14 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
             for run in evaluation.runs
         ],
         "units": "metres, seconds, metres a second as the names end (_m, _s, _mps); shares are parts of 1",
-        "columns": columns,
+        "columns": {name: tables[name][1] for name in ("figures", "intervals")}
+        | {"epochs": EPOCH_COLUMNS}
+        | {name: columns for name, (_, columns) in tables.items()},
         "beyond_counts": {kind: len(found.beyond) for kind, found in evaluation.integrity.items()},
-        **{name: _rows(table) for name, table in tables.items()},
+        **{
+            name: _rows(table.head(MOST_BEYOND) if name.startswith("beyond_") else table)
+            for name, (table, _) in tables.items()
+        },
     }
 
 

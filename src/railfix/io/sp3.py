@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Final
 
@@ -19,15 +18,6 @@ _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
 #: Time systems other than GPS time, by the names that files use.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
 _NO_CLOCK: Final = 999_999.0  #: Written where a clock is unknown [us].
-
-
-@dataclass
-class _States:
-    """States read so far: epoch [ns of GPS time], satellite, position [km] and clock [us]."""
-
-    epoch: list[int] = field(default_factory=list)
-    satellite: list[str] = field(default_factory=list)
-    numbers: list[list[float]] = field(default_factory=list)
 
 
 def read_sp3(paths: Paths) -> PreciseEphemeris:
@@ -50,17 +40,15 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
         together have fewer epochs than the interpolation needs.
     """
     files = path_names(paths)
-    states = _States()
-    for path in files:
-        _read_file(path, states)
+    epoch, satellite, numbers = zip(*(state for path in files for state in _states(path)), strict=True)
     source = ", ".join(files)
-    times, row = np.unique(np.array(states.epoch, dtype=np.int64), return_inverse=True)
-    satellites, column = np.unique(np.array(states.satellite, dtype="<U3"), return_inverse=True)
+    times, row = np.unique(np.array(epoch, dtype=np.int64), return_inverse=True)
+    satellites, column = np.unique(np.array(satellite, dtype="<U3"), return_inverse=True)
     if len(times) < POINTS:
         raise InputFileError(source, f"has {len(times)} epochs, the interpolation of orbits needs at least {POINTS}")
     grid = np.full((len(times), len(satellites), 4), np.nan)
     # Assigned in reverse order, so that the first of several values is kept.
-    grid[row[::-1], column[::-1]] = np.array(states.numbers)[::-1]
+    grid[row[::-1], column[::-1]] = np.array(numbers)[::-1]
     position, clock = grid[..., :3], grid[..., 3]
     position[(position == 0.0).all(axis=-1)] = np.nan
     clock[np.abs(clock) >= _NO_CLOCK] = np.nan
@@ -73,13 +61,14 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     )
 
 
-def _read_file(path: FilePath, states: _States) -> None:
+def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
+    """Read epochs [ns of GPS time], satellites, positions [km] and clocks [us] of a file."""
     lines = read_text_lines(path)
     if not lines or lines[0][:2] not in ("#a", "#b", "#c", "#d"):
         raise InputFileError(path, "is not an SP3 file: its first line must begin with #a, #b, #c or #d", line=1)
     system = _time_system(path, lines)
     epoch: int | None = None
-    before = len(states.epoch)
+    states: list[tuple[int, str, list[float]]] = []
     for number, line in enumerate(lines, start=1):
         try:
             if line.startswith("*"):
@@ -87,14 +76,13 @@ def _read_file(path: FilePath, states: _States) -> None:
             elif line.startswith("P"):
                 if epoch is None:
                     raise InputFileError(path, "a position comes before the first epoch", line=number)
-                states.satellite.append(_satellite(line[1:4]))
-                states.numbers.append(_numbers(line))
-                states.epoch.append(epoch)
+                states.append((epoch, _satellite(line[1:4]), _numbers(line)))
         except ValueError:
             what = f"{line.strip()!r} has an invalid satellite, time or number"
             raise InputFileError(path, what, line=number) from None
-    if len(states.epoch) == before:
+    if not states:
         raise InputFileError(path, "has no satellite position; the file is cut short, give the complete one")
+    return states
 
 
 def _satellite(text: str) -> str:

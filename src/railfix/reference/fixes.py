@@ -172,12 +172,7 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
         ratio=ratio,
         sigma_enu_m=log.sigma_m[rows][:, [1, 0, 2]],
         rejection=rejection,
-        spacing_m=blank,
-        arc_m=blank,
-        lateral_m=blank,
-        height_m=blank,
-        sigma_m=blank,
-        travel_m=blank,
+        **dict.fromkeys(("spacing_m", "arc_m", "lateral_m", "height_m", "sigma_m", "travel_m"), blank),
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.arrays import Datetimes, Floats, Indices, places_in_groups
 from railfix.core.timescale import nearest_rows, seconds, timedelta
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps
@@ -46,8 +46,7 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
     usual = float(np.median(seconds(np.diff(rows))))
     step = seconds(np.diff(merged))
     pieces = np.where(step > 1.5 * usual, np.ceil(step / usual - 1e-6), 1.0).astype(np.int64)
-    first = np.repeat(np.arange(len(step)), pieces)
-    number = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    first, number = places_in_groups(pieces)
     filled = merged[first] + timedelta(step[first] * number / pieces[first])
     return np.append(filled, merged[-1])
 
@@ -134,9 +133,8 @@ def _with_motion(
     chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, moved: Floats, settings: ReferenceSettings
 ) -> Chain:
     """Position, speed and a time-correlated acceleration (Singer's model), with the accelerometer's measurements."""
-    first = np.array([0])
-    for unknown, sigma in ((unknowns.speed, _ANY_SPEED_MPS), (unknowns.acceleration, MOTION_MPS2)):
-        chain = chain.with_observations(first, _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
+    chain = _with_prior(chain, unknowns.speed, _ANY_SPEED_MPS)
+    chain = _with_prior(chain, unknowns.acceleration, MOTION_MPS2)
     turn, noise = singer_steps(dt, MOTION_MPS2, MOTION_S)
     before, after = np.zeros((2, len(dt), 3, unknowns.count))
     before[:, :, :3], after[:, :, :3] = -turn, np.eye(3)
@@ -169,9 +167,7 @@ def _with_doppler(
         return chain
     kept = np.exp(-dt / settings.doppler_bias_s)
     variance = settings.doppler_bias_mps**2
-    chain = chain.with_observations(
-        np.array([0]), _one(unknowns, unknowns.doppler), np.zeros(1), np.full(1, 1.0 / variance)
-    )
+    chain = _with_prior(chain, unknowns.doppler, settings.doppler_bias_mps)
     chain = _with_walk(chain, unknowns.doppler, kept, 1.0 / (variance * (1.0 - kept**2)))
     row = _one(unknowns, unknowns.speed) + _one(unknowns, unknowns.doppler)
     weight = relief * evidence.doppler_sigma_mps[seen] ** -2.0
@@ -192,8 +188,8 @@ def _with_wheel(
     start = evidence.wheel_m[read[0]] - nominal[read[0]]
     weight = np.full(len(read), max(evidence.wheel_sigma_m, _LEAST_READING_M) ** -2)
     chain = chain.with_observations(read, row, evidence.wheel_m[read] - start - nominal[read], weight)
-    for unknown, sigma in ((unknowns.difference, _ANY_DISTANCE_M), (unknowns.scale, settings.wheel_scale)):
-        chain = chain.with_observations(np.array([0]), _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
+    chain = _with_prior(chain, unknowns.difference, _ANY_DISTANCE_M)
+    chain = _with_prior(chain, unknowns.scale, settings.wheel_scale)
     before, after = np.zeros((2, len(way), 1, unknowns.count))
     after[:, 0, unknowns.difference], before[:, 0, unknowns.difference] = 1.0, -1.0
     before[:, 0, unknowns.scale] = -way
@@ -205,10 +201,15 @@ def _with_wheel(
 def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
     """The accelerometer's offset, a random walk."""
     if unknowns.offset >= 0:
-        prior = np.full(1, ACCELERATION_BIAS_MPS2**-2)
-        chain = chain.with_observations(np.array([0]), _one(unknowns, unknowns.offset), np.zeros(1), prior)
+        chain = _with_prior(chain, unknowns.offset, ACCELERATION_BIAS_MPS2)
         chain = _with_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
     return chain
+
+
+def _with_prior(chain: Chain, unknown: int, sigma: float) -> Chain:
+    """An unknown of expectation 0 at the first instant."""
+    row = np.eye(chain.right.shape[1])[unknown]
+    return chain.with_observations(np.array([0]), row, np.zeros(1), np.full(1, sigma**-2))
 
 
 def _with_walk(chain: Chain, unknown: int, kept: Floats, weight: Floats) -> Chain:

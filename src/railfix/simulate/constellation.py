@@ -9,19 +9,20 @@ signals follow the newest record transmitted, as receivers use it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, take_rows
 from railfix.core.constants import BDT_MINUS_GPST_S, EARTH_ROTATION_RATE, GM_GPS, SPEED_OF_LIGHT
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta, to_week
-from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GM, ROTATION, Orbits, kepler_state
 from railfix.io.rinex import read_navigation
+from railfix.io.rinex.navigation_records import glonass_records
 from railfix.simulate.scenario import Scenario
 
 #: Health as broadcast: all data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou).
@@ -52,27 +53,12 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
             f"the scenario's; reference times in the file: {span}"
         )
     return Navigation(
-        kepler=_rows(records, np.concatenate(kept)),
-        glonass=no_glonass(),
+        kepler=take_rows(records, np.concatenate(kept)),
+        glonass=glonass_records([]),
         klobuchar={"G": navigation.klobuchar["G"]} if "G" in navigation.klobuchar else {"G": np.zeros(8)},
         leap_seconds=int(gpst_minus_utc(first)) if navigation.leap_seconds is None else navigation.leap_seconds,
         sources=navigation.sources,
     )
-
-
-def no_glonass() -> GlonassRecords:
-    """Empty GLONASS records; GLONASS is not simulated."""
-    none, times = np.empty(0), np.empty(0, dtype="datetime64[ns]")
-    vectors, integers = np.empty((0, 3)), np.empty(0, dtype=np.int64)
-    return GlonassRecords(
-        satellite=np.empty(0, dtype="<U3"), toe=times, transmitted=times, clock_bias_s=none, relative_frequency=none,
-        position_ecef_m=vectors, velocity_ecef_mps=vectors, acceleration_ecef_mps2=vectors, health=integers,
-        frequency_channel=integers, age_days=none,
-    )  # fmt: skip
-
-
-def _rows(records: KeplerRecords, rows: Indices | Masks) -> KeplerRecords:
-    return replace(records, **{item.name: getattr(records, item.name)[rows] for item in fields(records)})
 
 
 def _messages(scenario: Scenario) -> dict[str, tuple[str, ...]]:
@@ -86,7 +72,7 @@ def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, 
     delay = np.where(letter == "E", records.group_delay_2_s, records.group_delay_1_s)
     for system in systems:
         usable |= (letter == system) & np.isin(records.message, messages[system]) & np.isfinite(delay)
-    records, letter = _rows(records, usable), letter[usable]
+    records, letter = take_rows(records, usable), letter[usable]
     serves, before = (timedelta([table[str(s)] for s in letter]) for table in (_SERVES_S, _SENT_BEFORE_S))
     early = records.toe - records.transmitted
     plausible = ~np.isnat(records.transmitted) & (np.abs(early) <= serves)
@@ -152,7 +138,7 @@ def simulate_navigation(scenario: Scenario) -> Navigation:
     table["satellite"] = table["satellite"].astype("<U3")
     return Navigation(
         kepler=KeplerRecords(**table),
-        glonass=no_glonass(),
+        glonass=glonass_records([]),
         klobuchar={"G": np.array(KLOBUCHAR)},
         leap_seconds=int(gpst_minus_utc(scenario.start)),
         sources=("simulated",),
@@ -314,17 +300,24 @@ def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats
     row = newest_record(records, satellite, tag)
     since_toe = seconds(tag - records.toe[row]) - late_s
     since_toc = seconds(tag - records.toc[row]) - late_s
-    flight = np.full(late_s.shape, 0.08)
+
+    def state(flight_s: Floats) -> Floats:
+        return np.column_stack(record_state(records, row, since_toe - flight_s, since_toc - flight_s))
+
+    return _solve_light_time(state, np.full(late_s.shape, _FLIGHT_S), receiver_ecef_m)
+
+
+def _solve_light_time(state: Callable[[Floats], Floats], flight_s: Floats, receiver_ecef_m: Floats) -> Links:
+    """Iterate from a first flight time; `state` gives place and clock, shape (..., 4), by flight times (...)."""
+    x, y, z = (receiver_ecef_m[..., axis] for axis in range(3))
     for _ in range(3):
-        place, clock = record_state(records, row, since_toe - flight, since_toc - flight)
-        angle = EARTH_ROTATION_RATE * flight
+        place = state(flight_s)
+        angle = EARTH_ROTATION_RATE * flight_s
         cos, sin = np.cos(angle), np.sin(angle)
-        turned = np.stack(
-            [cos * place[:, 0] + sin * place[:, 1], cos * place[:, 1] - sin * place[:, 0], place[:, 2]], axis=-1
-        )
-        distance = np.linalg.norm(turned - receiver_ecef_m, axis=-1)
-        flight = distance / SPEED_OF_LIGHT
-    return Links(range_m=distance, satellite_ecef_m=turned, clock_s=clock)
+        sky = (cos * place[..., 0] + sin * place[..., 1], cos * place[..., 1] - sin * place[..., 0], place[..., 2])
+        distance = np.sqrt((sky[0] - x) ** 2 + (sky[1] - y) ** 2 + (sky[2] - z) ** 2)
+        flight_s = distance / SPEED_OF_LIGHT
+    return Links(range_m=distance, satellite_ecef_m=np.stack(sky, axis=-1), clock_s=place[..., 3])
 
 
 class SatelliteTable:
@@ -376,14 +369,9 @@ class SatelliteTable:
             value = value * u + self._powers[k][piece]
         slope /= self._half
         bend /= self._half**2
-        flight = np.full(value.shape[:2], _FLIGHT_S)
-        x, y, z = receiver_ecef_m[:, 0, None], receiver_ecef_m[:, 1, None], receiver_ecef_m[:, 2, None]
-        for _ in range(3):
-            dt = (_FLIGHT_S - flight)[..., None]
-            place = value + dt * (slope + dt * bend)
-            angle = EARTH_ROTATION_RATE * flight
-            cos, sin = np.cos(angle), np.sin(angle)
-            sky = (cos * place[..., 0] + sin * place[..., 1], cos * place[..., 1] - sin * place[..., 0], place[..., 2])
-            distance = np.sqrt((sky[0] - x) ** 2 + (sky[1] - y) ** 2 + (sky[2] - z) ** 2)
-            flight = distance / SPEED_OF_LIGHT
-        return Links(range_m=distance, satellite_ecef_m=np.stack(sky, axis=-1), clock_s=place[..., 3])
+
+        def state(flight_s: Floats) -> Floats:
+            dt = (_FLIGHT_S - flight_s)[..., None]
+            return np.asarray(value + dt * (slope + dt * bend))
+
+        return _solve_light_time(state, np.full(value.shape[:2], _FLIGHT_S), receiver_ecef_m[:, None])

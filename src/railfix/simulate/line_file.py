@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Final, Literal
 
@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, places_in_groups, take_rows
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import axes_at
@@ -341,7 +341,7 @@ def line_of_file(settings: LineFile) -> FileLine:
             f"has {used.sum()} points from {settings.from_m:g} to {settings.to_m:g} m of its "
             f"{track.chainage_m[-1]:.0f} m, expected at least 4",
         )
-    track = _part(track, used)
+    track = track if used.all() else take_rows(track, used)
     chord = CubicSpline(track.chainage_m, track.ecef_m, axis=0)
     at, arc = _arc_length(chord, track.chainage_m)
     place, slope, bend = (chord(at, order) for order in range(3))
@@ -363,25 +363,11 @@ def line_of_file(settings: LineFile) -> FileLine:
     )
 
 
-def _part(track: Track, used: Masks) -> Track:
-    """Some of the points of a track."""
-    if used.all():
-        return track
-    columns: dict[str, Any] = {
-        item.name: getattr(track, item.name)[used]
-        for item in fields(track)
-        if isinstance(getattr(track, item.name), np.ndarray)
-    }
-    return replace(track, **columns)
-
-
 def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, Floats]:
     """Parameters at about every half metre, the knots among them, and the arc length there (Gauss, 3 points)."""
     pieces = np.maximum(np.ceil(np.diff(knots) / _STEP_M).astype(np.int64), 1)
-    start = np.repeat(knots[:-1], pieces)
-    step = np.repeat(np.diff(knots) / pieces, pieces)
-    number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    at = np.append(start + number * step, knots[-1])
+    knot, number = places_in_groups(pieces)
+    at = np.append(knots[knot] + number * (np.diff(knots) / pieces)[knot], knots[-1])
     node, weight = np.polynomial.legendre.leggauss(3)
     gauss = at[:-1, None] + np.diff(at)[:, None] * (node + 1.0) / 2.0
     speed = np.linalg.norm(chord(gauss, 1), axis=-1)

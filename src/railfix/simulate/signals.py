@@ -14,7 +14,7 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.constellation import SatelliteTable, links, simulate_navigation
 from railfix.simulate.environment import Environment
@@ -148,10 +148,7 @@ class Simulation:
             approximate_ecef_m=np.round(place, -2 if antenna in ANTENNAS else 4),
             interval_s=self.scenario.interval_s,
             leap_seconds=self.navigation.leap_seconds,
-            signals={
-                s: tuple(sorted({g for name, g in self.channels if name[0] == s}))
-                for s in sorted({name[0] for name, _ in self.channels})
-            },
+            signals=signals_by_system(*(np.array(part) for part in zip(*self.channels, strict=True))),
         )
 
     def pieces(self, antenna: str, *, chunk_epochs: int = CHUNK_EPOCHS) -> Iterator[Piece]:

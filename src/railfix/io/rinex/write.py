@@ -21,7 +21,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import OutputError
 from railfix.core.files import FilePath, stage_file
-from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.observations_lines import KINDS
 
 RinexVersion = Literal["3.04", "4.02"]  #: Versions that can be written.
@@ -176,11 +176,8 @@ def _columns(first: Observations, given: Mapping[str, Sequence[str]] | None) -> 
         if wrong:
             raise ValueError(f"{wrong[0]!r} is not an observable; C, L, D or S and a signal were expected, as in 'C1C'")
         return {system: tuple(names) for system, names in given.items()}
-    pairs = sorted(set(zip(first.system.tolist(), first.signal.tolist(), strict=True)))
-    columns: dict[str, tuple[str, ...]] = {}
-    for system, signal in pairs:
-        columns[system] = (*columns.get(system, ()), *(kind + signal for kind in KINDS))
-    return columns
+    signals = signals_by_system(first.satellite, first.signal)
+    return {system: tuple(kind + name for name in names for kind in KINDS) for system, names in signals.items()}
 
 
 # ---------------------------------------------------------------- header

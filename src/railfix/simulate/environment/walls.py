@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, take_rows
 from railfix.simulate.environment.correlator import (
     circular_reflection,
     cross_polar_gain,
@@ -39,9 +39,13 @@ class Rays:
 
     def take(self, rows: Indices) -> Rays:
         """Rays of some rows."""
-        return replace(
-            self, **{name: getattr(self, name)[rows] for name in ("chainage_m", "x", "y", "z", "wavelength_m")}
-        )
+        return take_rows(self, rows)
+
+
+def _slants(across: Floats, z: Floats) -> tuple[Floats, Floats]:
+    """Sines of the angles at which rays pass a level edge and a vertical one, by their component across both."""
+    size = np.abs(across)
+    return size / np.sqrt(across**2 + z**2), size / np.sqrt(np.maximum(1.0 - z**2, 1e-9))
 
 
 def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats, lateral: Floats) -> Indices:
@@ -57,8 +61,7 @@ def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Fl
 def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
     """Fresnel parameter of a ray at a wall with level top and vertical ends, positive inside its outline."""
     scale = per_metre(far_m, rays.wavelength_m)
-    rise = np.abs(across) / np.sqrt(across**2 + rays.z**2)
-    level = np.abs(across) / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
+    rise, level = _slants(across, rays.z)
     top = (row.value["height_m"][wall] - rays.height_m - z) * rise
     ends = np.minimum(x - row.start_m[wall], row.end_m[wall] - x) * level
     return np.minimum(top, ends) * scale
@@ -297,8 +300,7 @@ def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats)
         np.minimum(place, settings.length_m - place),
         -np.minimum(place - settings.length_m, spacing - place),
     )
-    level = lateral / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
-    rise = lateral / np.sqrt(lateral**2 + rays.z**2)
+    rise, level = _slants(lateral, rays.z)
     top = (settings.height_m - rays.height_m - far * rays.z) * rise
     v = np.minimum(top, ends * level) * per_metre(far, rays.wavelength_m)
     return np.where(rays.y * _SIDE[settings.side] > 0.0, v, FREE_V)
@@ -317,8 +319,7 @@ def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Flo
     for part in equipment:
         along = np.maximum(np.abs(rays.x), _LEAST_LATERAL)
         far = abs(part.ahead_m) / along
-        rise = along / np.sqrt(along**2 + rays.z**2)
-        aside = along / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
+        rise, aside = _slants(along, rays.z)
         margin = np.minimum(
             (part.above_antenna_m - far * rays.z) * rise, (part.half_width_m - far * np.abs(rays.y)) * aside
         )
