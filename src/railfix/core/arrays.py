@@ -96,6 +96,22 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
     return group, np.arange(len(group)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
+def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]:
+    """Return one choice of each layer (dynamic programming): the least sum of their costs and those of the steps.
+
+    `costs` of the choices of a layer, shape (n,); `steps` from those of the layer before, shape (n, n before).
+    """
+    total, came = costs[0], list[Indices]()
+    for cost, step in zip(costs[1:], steps, strict=True):
+        reached = total + step
+        came.append(reached.argmin(axis=1))
+        total = reached.min(axis=1) + cost
+    path = [int(total.argmin())]
+    for before in reversed(came):
+        path.append(int(before[path[-1]]))
+    return path[::-1]
+
+
 def medians(values: Floats) -> Floats:
     """Return the medians along the last axis over what is not NaN; NaN where nothing is."""
     *shape, width = values.shape

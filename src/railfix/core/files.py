@@ -21,7 +21,7 @@ import sys
 import tempfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import cache
 from os import PathLike
 from pathlib import Path
@@ -288,6 +288,12 @@ def _unpack_compress(path: FilePath, source: IO[bytes], held: ExitStack) -> IO[b
     return unpacked
 
 
+def hatanaka_program(name: str) -> AbstractContextManager[Path]:
+    """Return the path of a program of the package `hatanaka`, in a context in which it exists."""
+    file = f"{name}.exe" if sys.platform == "win32" else name
+    return importlib.resources.as_file(importlib.resources.files("hatanaka.bin") / file)
+
+
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
     """Start the decoder on an open source and take over the resources in `held`."""
     if isinstance(source, gzip.GzipFile):
@@ -299,8 +305,7 @@ def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> Byte
     # the decoder inherits the descriptor, whose place `seek` need not move within what is buffered
     os.lseek(source.fileno(), 0, os.SEEK_SET)
     log = _temporary(held)
-    name = "crx2rnx.exe" if sys.platform == "win32" else "crx2rnx"
-    program = held.enter_context(importlib.resources.as_file(importlib.resources.files("hatanaka.bin") / name))
+    program = held.enter_context(hatanaka_program("crx2rnx"))
     process = subprocess.Popen([str(program), "-"], stdin=source, stdout=subprocess.PIPE, stderr=log)
     held.callback(_end, process)
     return _HatanakaStream(path, process, log, held.pop_all(), disk=source)

@@ -50,10 +50,15 @@ _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 
 def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
     """Find the row of a log nearest to each epoch, within 0.4 of the median interval; -1 without one, shape (T,)."""
-    order = np.argsort(found, kind="stable")[: np.count_nonzero(~np.isnat(found))]
+    rows = np.full(len(time), -1, dtype=np.intp)
+    known = np.flatnonzero(~np.isnat(found))
     near_ns = int(_NEAR * np.median(np.diff(time).astype(np.int64)))
-    rows = nearest_rows(found[order], time, within_ns=near_ns)
-    return np.append(order, -1)[rows]
+    index = nearest_rows(time, found[known], within_ns=near_ns)
+    near = np.flatnonzero(index >= 0)
+    away = np.abs(found[known[near]] - time[index[near]])
+    nearest = near[np.argsort(-away, kind="stable")]  # the nearest is written last
+    rows[index[nearest]] = known[nearest]
+    return rows
 
 
 def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Trajectory) -> pl.DataFrame:

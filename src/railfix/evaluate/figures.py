@@ -223,28 +223,20 @@ def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.Data
     speed, used = pl.col("speed_mps") * 3.6, pl.col("n_used")
     edges = options.speed_edges_kmh
     speed_rank = pl.when(pl.col("speed_mps") < options.standing_mps).then(0).otherwise(edges_reached(speed, edges) + 1)
-    ranks = {
-        "all": pl.lit(0),
+    ranks = dict.fromkeys(("all", "environment", "configuration", "line"), pl.lit(0)) | {
         "section": section,
-        "environment": pl.lit(0),
         "speed": pl.when(pl.col("speed_mps").is_null()).then(len(edges) + 2).otherwise(speed_rank),
         "satellites": pl.when(used.is_null()).then(-1).otherwise(edges_reached(used, _SATELLITE_EDGES)),
         "signals": pl.when(AIDED).then(0).otherwise(1),
         "status": pl.col("status").replace_strict({s.text: int(s) for s in Status}, default=len(Status)),
-        "configuration": pl.lit(0),
-        "line": pl.lit(0),
     }
     begins = section * options.section_m
-    names = {
+    names = {name: pl.col(name) for name in ("environment", "status", "configuration", "line")} | {
         "all": pl.lit(ALL),
         "section": pl.format("{} to {} m", *(_plain(x) for x in (begins, begins + options.section_m))),
-        "environment": pl.col("environment"),
         "speed": pl.col("speed_rank").replace_strict(dict(enumerate(_speed_names(options)))),
         "satellites": pl.col("satellites_rank").replace_strict(dict(enumerate(_satellite_names(), start=-1))),
         "signals": pl.when(AIDED).then(pl.lit(WITH_SATELLITES)).otherwise(pl.lit(WITHOUT_SATELLITES)),
-        "status": pl.col("status"),
-        "configuration": pl.col("configuration"),
-        "line": pl.col("line"),
     }
     inside = epochs.filter("in_reference")
     ranked = inside.with_columns(rank.cast(pl.Int32).alias(f"{name}_rank") for name, rank in ranks.items())

@@ -54,14 +54,13 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
     if len(reference_time) < 2:
         raise ValueError(f"reference_time has {len(reference_time)} instants, at least two were expected")
     last = len(reference_time) - 1
-    after = np.searchsorted(reference_time, time, side="left")
-    exact = (after <= last) & (reference_time[np.minimum(after, last)] == time)
-    right = np.clip(after, 1, last)
+    right = np.clip(np.searchsorted(reference_time, time), 1, last)
     left = right - 1
     step = seconds(reference_time[right] - reference_time[left])
     share = seconds(time - reference_time[left]) / step
-    inside = (after > 0) & (after <= last) & (step <= largest_gap_s)
-    at = np.minimum(after, last)
+    exact = (share == 0.0) | (share == 1.0)
+    inside = (share > 0.0) & (share < 1.0) & (step <= largest_gap_s)
+    at = np.where(share == 1.0, right, left)
     return Bracket(
         left=np.where(exact, at, left),
         right=np.where(exact, at, right),

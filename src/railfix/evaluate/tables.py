@@ -137,13 +137,10 @@ def evaluation_of(evaluation: Evaluation, name: str) -> Evaluation:
     def own(rows: Any) -> Any:
         return rows if rows is None or "run" not in rows.columns else rows.filter(run=name)
 
+    tables = ("figures", "intervals", "levels", "outages", "branches")
     return replace(
         evaluation,
-        figures=own(evaluation.figures),
-        intervals=own(evaluation.intervals),
-        levels=own(evaluation.levels),
-        outages=own(evaluation.outages),
-        branches=own(evaluation.branches),
+        **{table: own(getattr(evaluation, table)) for table in tables},
         integrity={
             kind: replace(found, stanford=stanford, beyond=own(found.beyond))
             for kind, found in evaluation.integrity.items()

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Integers
+from railfix.core.arrays import Floats, Integers, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
 
@@ -42,6 +42,10 @@ class NamedColumns:
     def header_error(self, message: str) -> InputFileError:
         """Return an error that names the line of the header."""
         return InputFileError(self.path, message, line=self.header_line)
+
+    def texts(self, name: str, *, absent: str) -> Strings:
+        """Return one column as texts, `absent` in each row where the table lacks it."""
+        return np.array(self.cells[name].to_list(), dtype=np.str_) if name in self else np.full(len(self), absent)
 
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
         """Parse one column as finite numbers; `blank` is the value of empty cells, and allows ``nan``."""

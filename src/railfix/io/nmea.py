@@ -5,6 +5,8 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import xor
 from typing import Final
 
 import numpy as np
@@ -190,9 +192,7 @@ def _sentences(path: FilePath, problems: list[InputFileError]) -> Iterator[tuple
             what = "has no checksum" if text[0] == "$" else "does not begin with $"
             problems.append(InputFileError(path, f"this sentence {what}; NMEA 0183 was expected", line=number))
             continue
-        total = 0
-        for byte in body.encode("latin-1"):
-            total ^= byte
+        total = reduce(xor, body.encode("latin-1"), 0)
         if checksum[:2].upper() != f"{total:02X}":
             problems.append(
                 InputFileError(path, f"the checksum is {checksum[:2]}, {total:02X} was expected", line=number)

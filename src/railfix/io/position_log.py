@@ -106,13 +106,14 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
         time=positions_times(table),
         ecef_m=ecef_from_geodetic(*values.T) if geodetic else values,
         quality=np.where(np.isfinite(quality), quality, -1.0).astype(np.int64),
-        sigma_m=np.stack([_numbers_or_nan(table, name) for name in _SIGMAS], axis=-1),
+        sigma_m=np.stack([numbers_or_nan(table, name) for name in _SIGMAS], axis=-1),
         line=table.line,
-        ratio=_numbers_or_nan(table, "ratio") if "ratio" in table else None,
+        ratio=numbers_or_nan(table, "ratio") if "ratio" in table else None,
     )
 
 
-def _numbers_or_nan(table: NamedColumns, name: str) -> Floats:
+def numbers_or_nan(table: NamedColumns, name: str) -> Floats:
+    """Parse a column as numbers, NaN where it is blank or the table lacks it."""
     return table.numbers(name, blank=np.nan) if name in table else np.full(len(table), np.nan)
 
 

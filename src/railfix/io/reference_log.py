@@ -26,6 +26,7 @@ from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import (
     CSV_COLUMNS,
     PositionLog,
+    numbers_or_nan,
     positions_of_table,
     positions_times,
     qualities_in_words,
@@ -106,16 +107,15 @@ def read_reference(
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
     if log.has_quality:
         usable &= np.isin(log.quality, [*quality])
-    owner = np.full(len(log), antennas[0])
-    if table is not None and "antenna" in table:
-        owner = np.array(table.cells["antenna"].to_list(), dtype=np.str_)
-    elif len(antennas) > 1:
+    cells = NamedColumns(path=log.path, metadata={}, header_line=0, line=log.line, cells={}) if table is None else table
+    owner = cells.texts("antenna", absent=antennas[0])
+    if "antenna" not in cells and len(antennas) > 1:
         raise InputFileError(
             path,
             f"a column antenna ({', '.join(antennas)}) is needed for the reference of two antennas; give a CSV file "
             "with one (railfix reference makes it of a log of one antenna)",
         )
-    values = _columns(log, table)
+    values = _columns(log, cells)
     what = ""
     if log.has_quality:
         wanted, there = ", ".join(map(str, quality)), qualities_in_words(log)
@@ -130,23 +130,20 @@ def _table(path: Path, columns: Mapping[str, str]) -> NamedColumns | None:
     return rename_columns(read_named_columns(path), columns, known=dict.fromkeys((*CSV_COLUMNS, *COLUMNS)))
 
 
-def _columns(log: PositionLog, table: NamedColumns | None) -> dict[str, NDArray[np.generic]]:
+def _columns(log: PositionLog, table: NamedColumns) -> dict[str, NDArray[np.generic]]:
     """Collect all columns of all rows, blank where the file has none."""
-    absent = np.full(len(log), np.nan)
-    columns: dict[str, NDArray[np.generic]] = {"time": log.time, "ecef_m": log.ecef_m}
-    for name in ("chainage_m", "speed_mps", "sigma_m"):
-        columns[name] = table.numbers(name, blank=np.nan) if table is not None and name in table else absent
-    source = np.full(len(log), "truth" if table is not None and all(n in table for n in _OF_TRUTH) else "rtk")
-    environment = np.full(len(log), "")
-    if table is not None and "source" in table:
-        source = np.array(table.cells["source"].to_list(), dtype=np.str_)
-        unknown = ~np.isin(source, SOURCES)
-        if unknown.any():
-            row = int(np.argmax(unknown))
-            raise table.error(row, f"source is '{source[row]}'; {', '.join(SOURCES[:-1])} or blank was expected")
-    if table is not None and "environment" in table:
-        environment = np.array(table.cells["environment"].to_list(), dtype=np.str_)
-    return {**columns, "source": source, "environment": environment}
+    source = table.texts("source", absent="truth" if all(name in table for name in _OF_TRUTH) else "rtk")
+    unknown = ~np.isin(source, SOURCES)
+    if unknown.any():
+        row = int(np.argmax(unknown))
+        raise table.error(row, f"source is '{source[row]}'; {', '.join(SOURCES[:-1])} or blank was expected")
+    return {
+        "time": log.time,
+        "ecef_m": log.ecef_m,
+        **{name: numbers_or_nan(table, name) for name in ("chainage_m", "speed_mps", "sigma_m")},
+        "source": source,
+        "environment": table.texts("environment", absent=""),
+    }
 
 
 def _of_antenna(

@@ -66,6 +66,11 @@ class Speeds:
         return ways[0], ways[1]
 
 
+def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Speeds:
+    rows = np.flatnonzero(np.isfinite(speed_mps))
+    return Speeds(time=time[rows], speed_mps=speed_mps[rows], sigma_mps=sigma_mps[rows])
+
+
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
     """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where there is none."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
@@ -179,7 +184,7 @@ class _ReferenceBuilder:
         closing = np.zeros(len(moved))
         duration, both = seconds(np.diff(fix_time)), fixes.sigma_m[good[1:]] ** 2 + fixes.sigma_m[good[:-1]] ** 2
         joined = self._join(speeds)
-        if joined is not None and len(joined.time) > 1:
+        if len(joined.time) > 1:
             way, white = (np.diff(part) for part in joined.way(fix_time))
             tau = settings.doppler_bias_s
             lasting = 2.0 * tau**2 * (duration / tau - 1.0 + np.exp(-duration / tau)) * settings.doppler_bias_mps**2
@@ -200,7 +205,7 @@ class _ReferenceBuilder:
         """Return the settings with sensor errors estimated from the log's own fixes, and where each came from."""
         settings, sources, good = self.settings, {}, fixes.good
         joined = self._join(speeds)
-        if joined is not None and len(joined.time) > 1:
+        if len(joined.time) > 1:
             misclosures = self._closings(fixes, *joined.way(fixes.time[good]))
             settings = settings.replaced(doppler_bias_mps=lasting_error_mps(misclosures, settings))
             sources["doppler"] = {
@@ -251,25 +256,17 @@ class _ReferenceBuilder:
             section, _ = path.segment_at(arc)
             tangent = np.where(np.isfinite(arc)[:, None], path.tangent[section], np.nan)
             solved = doppler_speed(dopplers, path.at_arc(arc), tangent, limits=self.settings.doppler)
-            rows = np.flatnonzero(np.isfinite(solved.speed_mps))
-            speeds = Speeds(
-                time=dopplers.time[rows], speed_mps=solved.speed_mps[rows], sigma_mps=solved.sigma_mps[rows]
-            )
-            speeds_of[name] = (speeds, solved)
+            speeds_of[name] = (_known_speeds(dopplers.time, solved.speed_mps, solved.sigma_mps), solved)
         return speeds_of
 
-    def _join(self, speeds: SolvedSpeeds) -> Speeds | None:
-        """All receivers' speeds as one."""
-        if not speeds:
-            return None
+    def _join(self, speeds: SolvedSpeeds) -> Speeds:
+        """All receivers' speeds as one; empty without any."""
         own = [part for part, _ in speeds.values()]
-        time = own[0].time if len(own) == 1 else np.unique(np.concatenate([part.time for part in own]))
+        time = np.unique(np.concatenate([np.empty(0, dtype="datetime64[ns]"), *(part.time for part in own)]))
         if len(own) > 1:
             apart = np.diff(time, prepend=time[:1] - np.timedelta64(1, "s")) > np.timedelta64(20, "ms")
             time = time[apart]
-        speed, sigma = combine_speeds(time, own)
-        rows = np.flatnonzero(np.isfinite(speed))
-        return Speeds(time=time[rows], speed_mps=speed[rows], sigma_mps=sigma[rows])
+        return _known_speeds(time, *combine_speeds(time, own))
 
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
@@ -280,13 +277,11 @@ class _ReferenceBuilder:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))
             step = np.abs(np.diff(way, prepend=way[:1]))
             return way, np.cumsum(settings.slip_m**2 * np.nan_to_num(step))
-        if joined is None:
-            return np.full(len(time), np.nan), np.full(len(time), np.nan)
         way, white = joined.way(time)
         lasting = 2.0 * settings.doppler_bias_s * settings.doppler_bias_mps**2 * _since(time, time)
         return way, white + lasting
 
-    def _hint(self, time: Datetimes, joined: Speeds | None, fixes: Fixes) -> Floats:
+    def _hint(self, time: Datetimes, joined: Speeds, fixes: Fixes) -> Floats:
         """Return speeds that show the direction of the wheel: Dopplers, else close consecutive fixes."""
         good = fixes.good
         fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
@@ -296,7 +291,7 @@ class _ReferenceBuilder:
         section = np.searchsorted(fix_time, time, side="right") - 1
         inside = (section >= 0) & (section < len(slope))
         hint = np.where(inside, slope[np.clip(section, 0, len(slope) - 1)], np.nan)
-        if joined is not None and len(joined.time):
+        if len(joined.time):
             row = nearest_rows(joined.time, time, within_ns=SAME_INSTANT_NS)
             hint = np.where(row >= 0, joined.speed_mps[np.maximum(row, 0)], hint)
         return np.asarray(hint)

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, cheapest_path
 from railfix.core.geodesy import sigma_along
 from railfix.core.settings import Settings, option
 from railfix.core.timescale import nearest_rows, seconds
@@ -247,27 +247,15 @@ def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[F
 
 
 def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, max_speed_mps: float) -> Indices:
-    """One pass a position: the cheapest chain from the first to the last (dynamic programming)."""
+    """One pass a position: the cheapest chain from the first to the last."""
     found, first = np.unique(position, return_index=True)
     if len(found) == len(position):
         return np.arange(len(found))
-    edges = np.append(first, len(position)).tolist()
-    cost = np.abs(lateral_m[edges[0] : edges[1]])
-    came: list[Indices] = []
-    for k, (begin, end) in enumerate(pairwise(edges[1:])):
-        start = edges[k]
-        way = np.abs(arc_m[begin:end, None] - arc_m[None, start:begin])
-        reach = max_speed_mps * (time_s[found[k + 1]] - time_s[found[k]]) + _JITTER_M
-        # The shortest way counts; a second pass of a crossing costs what it is longer by.
-        total = cost + way + np.where(way > reach, _OUT_OF_REACH_M, 0.0)
-        came.append(total.argmin(axis=1))
-        cost = total.min(axis=1) + np.abs(lateral_m[begin:end])
-    best = int(np.argmin(cost))
-    chosen = [edges[-2] + best]
-    for k in range(len(came) - 1, -1, -1):
-        best = int(came[k][best])
-        chosen.append(edges[k] + best)
-    return np.array(chosen[::-1], dtype=np.intp)
+    reach = max_speed_mps * np.diff(time_s[found]) + _JITTER_M
+    # The shortest way counts; a second pass of a crossing costs what it is longer by.
+    ways = (np.abs(after[:, None] - before) for before, after in pairwise(np.split(arc_m, first[1:])))
+    steps = (way + np.where(way > limit, _OUT_OF_REACH_M, 0.0) for way, limit in zip(ways, reach, strict=True))
+    return np.asarray(first + cheapest_path(np.split(np.abs(lateral_m), first[1:]), steps))
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:

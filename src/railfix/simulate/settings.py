@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from itertools import pairwise
 from typing import Annotated, Any, Literal, get_args
@@ -19,6 +20,7 @@ from pydantic import (
 )
 
 from railfix.core.settings import Settings
+from railfix.core.timescale import gps_time
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -61,15 +63,9 @@ AngleBetween = Annotated[tuple[Finite, Finite], AfterValidator(_rising)]
 
 def _gps_time(value: Any) -> np.datetime64:
     """GPS time of a TOML time, a text or a datetime64."""
-    try:
-        if isinstance(value, datetime) and value.tzinfo is None:
-            value = value.isoformat()
-        if isinstance(value, (str, np.datetime64)):
-            time = np.datetime64(str(value), "ns")
-            if not np.isnat(time):
-                return np.datetime64(time)
-    except ValueError:
-        pass
+    with suppress(ValueError):
+        if isinstance(value, str | datetime | np.datetime64) and not np.isnat(time := gps_time(value)):
+            return time
     raise ValueError("must be a time as 2024-03-05T03:10:00, GPS time without a zone")
 
 

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
+from railfix.core.arrays import cheapest_path
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
 from railfix.io.mate import mate_table, read_mate
@@ -139,17 +140,9 @@ def _crs_of(cell: str) -> str | None:
 def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
     """Elements of an edge, of each row the form that meets its neighbours best."""
     forms = [_forms(path, row) for row in rows]
-    # the cheapest sequence of forms, by the gaps at their joints
-    cost, back = np.zeros(len(forms[0])), []
-    for before, after in pairwise(forms):
-        gaps = np.array([[_gap(a, b) for a in before] for b in after])
-        total = gaps + cost
-        back.append(np.argmin(total, axis=1))
-        cost = total.min(axis=1)
-    chosen = [int(np.argmin(cost))]
-    for column in reversed(back):
-        chosen.append(int(column[chosen[-1]]))
-    plan = [options[k] for options, k in zip(forms, reversed(chosen), strict=True)]
+    gaps = (np.array([[_gap(a, b) for a in before] for b in after]) for before, after in pairwise(forms))
+    chosen = cheapest_path([np.zeros(len(options)) for options in forms], gaps)
+    plan = [options[k] for options, k in zip(forms, chosen, strict=True)]
     for number, (first, second) in enumerate(pairwise(plan), start=2):
         if (gap := _gap(first, second)) > _MEETS_M:
             raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the one before it")

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, read_only
+from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
 from railfix.track.network import Candidates, Network
 
 #: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0:
@@ -261,14 +261,7 @@ def _forward(
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
     """The sequence of the largest gains: neighbouring pairs expected to be right, less what changes have to gain."""
-    n, states = probability.shape
-    best, back = np.zeros(states), np.zeros((n, states), dtype=np.intp)
-    for k in range(1, n):
-        total = best[:, None] + gains[k - 1]
-        back[k] = np.argmax(total, axis=0)
-        best = total[back[k], np.arange(states)]
-    path = np.zeros(n, dtype=np.intp)
-    path[-1] = int(np.argmax(best if n > 1 else probability[0]))
-    for k in range(n - 1, 0, -1):
-        path[k - 1] = back[k, path[k]]
-    return path
+    if len(probability) == 1:
+        return np.asarray(probability.argmax(axis=1))
+    nothing = np.zeros(probability.shape[1])
+    return np.array(cheapest_path([nothing] * len(probability), (-gain.T for gain in gains)), dtype=np.intp)

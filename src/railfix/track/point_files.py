@@ -410,10 +410,9 @@ def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = No
     }
     for column, (name, factor, _) in OPTIONAL_COLUMNS.items():
         values = getattr(track, name) / factor
-        if np.isfinite(values).any() or np.isinf(values).any():
-            columns[column] = ["" if np.isnan(v) else f"{v:.10g}" for v in values]
-            if column == "radius_m" and np.isnan(values).any():
-                columns[column] = ["nan" if np.isnan(v) else f"{v:.10g}" for v in values]
+        if not np.isnan(values).all():
+            unknown = "nan" if column == "radius_m" else ""  # blank is straight
+            columns[column] = [unknown if np.isnan(v) else f"{v:.10g}" for v in values]
     if sigma_m is not None:
         columns |= {name: [f"{v:.3f}" for v in sigma_m[:, i]] for i, name in enumerate(SIGMA_COLUMNS)}
     lines = [

@@ -25,6 +25,10 @@ _CRC24_POLYNOMIAL: Final = 0x1864CFB
 #: Whether a byte can be the first and the second of the address of an NMEA sentence; 0 stands beyond the buffer's end.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
+#: Value of each byte as a hexadecimal digit, 255 for others.
+_HEX: Final = np.full(256, 255)
+_HEX[np.frombuffer(b"0123456789ABCDEFabcdef", np.uint8)] = [*range(16), *range(10, 16)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Frames:
@@ -226,21 +230,12 @@ def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     complete = end + 3 <= len(data)
     valid = np.zeros(len(frame), dtype=bool)
     first, stop = frame[complete] + 1, end[complete]
-    valid[complete] = (sums[stop] ^ sums[first]) == (_hex(data[stop + 1]) << 4 | _hex(data[stop + 2]))
+    valid[complete] = (sums[stop] ^ sums[first]) == (_HEX[data[stop + 1]] << 4 | _HEX[data[stop + 2]])
     line_end = end + 3 + (_at(data, end + 3) == ord("\r"))
     frame_end = line_end + (_at(data, line_end) == ord("\n"))
     if not at_end:  # a sentence whose line may go on waits for the rest of it
         frame_end = np.where(line_end >= len(data), len(data) + 1, frame_end)
     return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
-
-
-def _hex(digit: Bytes) -> Integers:
-    """Values of hexadecimal digits, 255 for anything else."""
-    value = np.full(256, 255, dtype=np.int64)
-    value[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
-    value[np.frombuffer(b"ABCDEF", np.uint8)] = np.arange(10, 16)
-    value[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
-    return value[digit]
 
 
 _HEAD_BYTES: Final = 1 << 16  #: Bytes in which a log must show a frame with a valid checksum to be taken for one.

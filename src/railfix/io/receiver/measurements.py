@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, join_rows
 from railfix.core.timescale import from_week, gpst_to_utc, nearest_day, nearest_week, to_week
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.receiver import nav_messages
@@ -151,32 +151,22 @@ def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> 
     )
 
 
-#: Arrays of `Measurements` with a value for each of N rows, but `epoch`.
-ROW_ARRAYS: Final = (
-    "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel".split()
-)
-
-
 def no_measurements(receiver: str) -> Measurements:
     """Create measurements without a row."""
-    kinds = {"satellite": "<U3", "signal": "<U3", "half_cycle": "?", "polarity": "<i8", "glonass_channel": "<i8"}
-    rows: dict[str, Any] = {name: np.zeros(0, dtype=kinds.get(name, "<f8")) for name in ROW_ARRAYS}
+    kinds = {
+        **dict.fromkeys(("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "lock_s"), "<f8"),
+        "satellite": "<U3", "signal": "<U3", "half_cycle": "?", "polarity": "<i8", "glonass_channel": "<i8",
+    }  # fmt: skip
+    rows: dict[str, Any] = {name: np.zeros(0, dtype=kind) for name, kind in kinds.items()}
     nothing = np.zeros(0, dtype=np.intp)
     return Measurements(time=nothing.astype("datetime64[ns]"), epoch=nothing, receiver=receiver, **rows)
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
-    """Measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
+    """Rows of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
-    leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
-    return Measurements(
-        time=np.concatenate([part.time for part in parts]),
-        epoch=np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)]),
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in ROW_ARRAYS},
-        leap_seconds=leap[-1] if leap else None,
-        receiver=next((part.receiver for part in parts if part.receiver), ""),
-        skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),
-    )
+    epoch = np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)])
+    return replace(join_rows(parts), epoch=epoch)
 
 
 Record = tuple[RawRecord, tuple[float, ...]]  #: A record, and what tells it from the satellite's next one.

@@ -17,7 +17,7 @@ from railfix.core.timescale import bdt_to_gpst, gpst_to_utc, nearest_week, utc_t
 from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
-from railfix.io.receiver.measurements import ROW_ARRAYS, Measurements, join_measurements, no_measurements
+from railfix.io.receiver.measurements import Measurements, join_measurements, no_measurements
 from railfix.io.receiver.nav_messages import Coding, layout
 
 #: Constellation letter by tens of the message number of an MSM.
@@ -111,8 +111,8 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
-    measurements = Measurements(
-        **{name: getattr(rows, name) for name in ROW_ARRAYS},
+    measurements = replace(
+        rows,
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",

@@ -133,30 +133,20 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
     dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != _NO_WEEK) & (head["size1"] >= 20) & (head["size2"] >= 12)
     scrambled = dated & (head["flags"] & _SCRAMBLED != 0)
     dated &= ~scrambled
-    epochs, places, kinds, masters, broken, before = [], [], [], [], 0, 0
-    for row in np.flatnonzero(dated).tolist():
-        found = _sub_blocks(frames, int(chosen[row]), head[row])
-        if found is None:
-            broken += 1
-            continue
-        place, kind, master = found
-        epochs.append(row)
-        places.append(place)
-        kinds.append(kind)
-        masters.append(master + before)
-        before += len(place)
+    blocks = [(row, _sub_blocks(frames, int(chosen[row]), head[row])) for row in np.flatnonzero(dated).tolist()]
+    whole = [(row, found) for row, found in blocks if found is not None]
     skipped = {
-        "broken MeasEpoch": broken,
+        "broken MeasEpoch": len(blocks) - len(whole),
         "MeasEpoch without time": int(np.count_nonzero(~dated & ~scrambled)),
         "scrambled MeasEpoch": int(np.count_nonzero(scrambled)),
     }
-    none = np.zeros(0, dtype=np.intp)
-    place, kind, master = (np.concatenate([none, *parts]) for parts in (places, kinds, masters))
-    epoch = np.repeat(np.arange(len(epochs)), np.array([len(p) for p in places], dtype=np.intp))
-    rows = head[np.array(epochs, dtype=np.intp)]
-    main = frames.data[place + np.where(kind == 0, 1, 0)] >> 5 == 0
+    pairs = [pair for _, found in whole for pair in found]
+    place, master = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+    epoch = np.repeat(np.arange(len(whole)), np.array([len(found) for _, found in whole], dtype=np.intp))
+    rows = head[np.array([row for row, _ in whole], dtype=np.intp)]
+    main = frames.data[place + (place == master)] >> 5 == 0
     skipped["measurements of further antennas of a MeasEpoch"] = int(np.count_nonzero(~main))
-    values = {name: array[main] for name, array in _decode(frames, place, kind, master).items()}
+    values = {name: array[main] for name, array in _decode(frames, place, master).items()}
     return Measurements(
         time=from_week(rows["week"].astype(np.int64), rows["tow_ms"] * 1e-3),
         epoch=epoch[main],
@@ -166,38 +156,27 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
     )
 
 
-def _sub_blocks(frames: Frames, index: int, head: np.void) -> tuple[Indices, Indices, Indices] | None:
-    """Places of the sub-blocks of one block, which are of the second type, and each one's first-type sub-block."""
-    first, end = int(frames.start[index]) + _HEAD.itemsize, int(frames.end[index])
+def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, int]] | None:
+    """Places of the sub-blocks of one block, each with that of its first-type sub-block; None of a broken one."""
+    cursor, end = int(frames.start[index]) + _HEAD.itemsize, int(frames.end[index])
     size1, size2 = int(head["size1"]), int(head["size2"])
-    places: list[int] = []
-    kinds: list[int] = []
-    masters: list[int] = []
-    cursor = first
+    places: list[tuple[int, int]] = []
     for _ in range(int(head["count"])):
-        if cursor + size1 > end:
+        master = cursor
+        if master + size1 > end:
             return None
-        master = len(places)
-        places.append(cursor)
-        kinds.append(0)
-        masters.append(master)
-        others = int(frames.data[cursor + 19])
-        cursor += size1
-        if cursor + others * size2 > end:
+        cursor += size1 + size2 * int(frames.data[master + 19])
+        if cursor > end:
             return None
-        for _ in range(others):
-            places.append(cursor)
-            kinds.append(1)
-            masters.append(master)
-            cursor += size2
-    return np.array(places, dtype=np.intp), np.array(kinds, dtype=np.intp), np.array(masters, dtype=np.intp)
+        places += [(master, master), *((place, master) for place in range(master + size1, cursor, size2))]
+    return places
 
 
-def _decode(frames: Frames, place: Indices, kind: Indices, master: Indices) -> dict[str, Any]:
+def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
     """Measurements of sub-blocks: those of the first type whole, those of the second as offsets from theirs."""
-    first = gather_structures(frames.data, place[master], _FIRST)
-    other = gather_structures(frames.data, np.where(kind == 1, place, 0), _OTHER) if len(frames.data) >= 12 else first
-    own = kind == 0
+    own = place == master
+    first = gather_structures(frames.data, master, _FIRST)
+    other = gather_structures(frames.data, np.where(own, 0, place), _OTHER) if len(frames.data) >= 12 else first
     number = _signal_number(np.where(own, first["type"], other["type"]), np.where(own, first["info"], other["info"]))
     name = _SIGNAL_NAMES[number]
     satellite = _NAMES[first["sv"]]

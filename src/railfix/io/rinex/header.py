@@ -22,6 +22,7 @@ _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZ
 ALL: Final = ""  #: Key of the types of a RINEX 2 file, which hold for all constellations.
 #: Longest header; a longer file without END OF HEADER is no RINEX file.
 _MAX_HEADER_BYTES: Final = 4 << 20
+Note = Callable[[str], None]  #: What takes a note on a record that was skipped.
 _FILE_TYPES: Final = {
     "N": "a RINEX navigation file; give it with --nav",
     "G": "a RINEX navigation file (GLONASS); give it with --nav",
@@ -94,8 +95,8 @@ def _check_kind(path: str, line: str) -> None:
         raise InputFileError(path, f"is {what} (an observation file was expected)", line=1)
 
 
-def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = None) -> RinexHeader:
-    """Parse the header of an observation file; unreadable records that do not matter go into `notes` if given."""
+def parse_header(path: str, lines: Sequence[str], *, note: Note | None = None) -> RinexHeader:
+    """Parse the header of an observation file; `note` takes unreadable records that do not matter, else errors."""
     version = read_version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
     if system not in SYSTEMS + "M":
@@ -103,7 +104,7 @@ def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = N
     start = RinexHeader(
         version=version, system=system, time_system=_DEFAULT_TIME[system], public=ObservationHeader(version=version)
     )
-    header = apply_records(path, start, lines[1:], first_line=2, notes=notes)
+    header = apply_records(path, start, lines[1:], first_line=2, note=note)
     if not header.types:
         label = "# / TYPES OF OBSERV" if version < 3.0 else "SYS / # / OBS TYPES"
         raise InputFileError(path, f"the header has no {label} record; the observation types are unknown")
@@ -123,10 +124,10 @@ def read_version(path: FilePath, line: str) -> float:
 
 
 def apply_records(
-    path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, notes: list[str] | None = None
+    path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, note: Note | None = None
 ) -> RinexHeader:
     """Apply header records in the middle of a file (epoch flags 2 to 4); `first_line` is the number of the first."""
-    reader = _HeaderRecords(path, header, notes)
+    reader = _HeaderRecords(path, header, note)
     for number, line in enumerate(lines, start=first_line):
         reader.read(line, number)
     return reader.finish()
@@ -135,10 +136,10 @@ def apply_records(
 class _HeaderRecords:
     """Reader of header records into a copy of a header."""
 
-    def __init__(self, path: str, header: RinexHeader, notes: list[str] | None) -> None:
+    def __init__(self, path: str, header: RinexHeader, note: Note | None) -> None:
         self._path = path
         self._header = header
-        self._notes = notes
+        self._note = note
         self._line = 0
         self._types = dict(header.types)
         self._scale = dict(header.scale)
@@ -162,9 +163,9 @@ class _HeaderRecords:
                 self._changes[name] = read(text)
             except ValueError as error:
                 message = f"{label}: '{text.strip()}' cannot be read as the numbers expected"
-                if self._notes is None:
+                if self._note is None:
                     raise InputFileError(self._path, message, line=number) from error
-                self._notes.append(f"{self._path}, line {number}: {message}; the record was skipped")
+                self._note(f"{self._path}, line {number}: {message}; the record was skipped")
 
     def finish(self) -> RinexHeader:
         """Return the header with all records applied."""

@@ -70,10 +70,7 @@ class BlockReader:
         """Yield runs of epochs in the order of the file; a run may be empty."""
         with open_stream(self.path) as stream:
             head, rest = read_header_bytes(stream)
-            notes: list[str] | None = None if self._log.stops else []
-            header = parse_header(self.path, head, notes=notes)
-            for note in notes or ():
-                self._log.note(note)
+            header = parse_header(self.path, head, note=None if self._log.stops else self._log.note)
             number = len(head) + 1
             at_end = False
             while not at_end and self.last_ns < self._selection.end_ns:
@@ -132,12 +129,9 @@ class BlockReader:
 
     def _event(self, lines: Lines, header: RinexHeader) -> RinexHeader:
         records = [lines.text(i) for i in range(len(lines))]
-        notes: list[str] | None = None if self._log.stops else []
         number = int(lines.number[0]) if records else 0
-        changed = apply_records(self.path, header, records, first_line=number, notes=notes)
-        for note in notes or ():
-            self._log.note(note)
-        return changed
+        note = None if self._log.stops else self._log.note
+        return apply_records(self.path, header, records, first_line=number, note=note)
 
     def _observations(self, lines: Lines, table: EpochHeads, header: RinexHeader) -> Observations:
         self._log.count(CYCLE_SLIPS, int((table.flag == 6).sum()))

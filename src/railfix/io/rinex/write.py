@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import gzip
-import importlib.resources
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -20,7 +18,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import OutputError
-from railfix.core.files import FilePath, stage_file
+from railfix.core.files import FilePath, hatanaka_program, stage_file
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.observations_lines import KINDS
 
@@ -59,9 +57,8 @@ def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[I
 @contextmanager
 def _hatanaka(path: FilePath, sink: IO[bytes]) -> Iterator[IO[bytes]]:
     """Open a stream that `rnx2crx` of the `hatanaka` package compresses into `sink`."""
-    name = "rnx2crx.exe" if sys.platform == "win32" else "rnx2crx"
     with (
-        importlib.resources.as_file(importlib.resources.files("hatanaka.bin") / name) as program,
+        hatanaka_program("rnx2crx") as program,
         tempfile.TemporaryFile(prefix="railfix-") as packed,
         tempfile.TemporaryFile(prefix="railfix-") as log,
     ):
