@@ -68,7 +68,7 @@ class RunFolder(RunRecord):
     @property
     def line_name(self) -> str:
         """Name of the track."""
-        return str((self._line.get("track") or {}).get("name") or "unnamed line")
+        return str(self.track_facts.get("name") or "unnamed line")
 
     @property
     def track_facts(self) -> Mapping[str, Any]:

@@ -133,7 +133,7 @@ def unit_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFram
     mapped = np.interp(chainage, line.point_chainage_m(), line.track().chainage_m)
     lateral = np.array([unit.lateral_m for unit in settings.units])
     names = [unit.name for unit in settings.units]
-    columns = {"chainage_m": mapped, "lateral_m": lateral, "x_m": place[:, 0], "y_m": place[:, 1], "z_m": place[:, 2]}
+    columns = {"chainage_m": mapped, "lateral_m": lateral, **dict(zip(("x_m", "y_m", "z_m"), place.T, strict=True))}
     return pl.DataFrame({"unit": pl.Series(names, dtype=pl.String), **columns})
 
 

@@ -10,12 +10,12 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, places_in_groups, read_only, take_rows
+from railfix.core.arrays import Floats, Indices, Integers, Masks, join_rows, places_in_groups, read_only, take_rows
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files
@@ -204,17 +204,15 @@ class Network:
 
     def _samples_near(self, points_m: Floats, within_m: float) -> tuple[Floats, Indices]:
         """Distance and number of every sample near each point, shape (n, k); infinite where there are fewer."""
-        tree, segment, _, reach = self._index
-        count = min(_SAMPLES, len(segment))
+        tree, _, _, reach = self._index
+        count, short = _SAMPLES, np.arange(len(points_m))
         distance, sample = np.full((len(points_m), count), np.inf), np.zeros((len(points_m), count), dtype=np.intp)
-        short = np.arange(len(points_m))
         while len(short):
             more = ((0, 0), (0, count - distance.shape[1]))
             distance, sample = np.pad(distance, more, constant_values=np.inf), np.pad(sample, more)
             near = tree.query(points_m[short], k=np.arange(1, count + 1), distance_upper_bound=within_m + reach + 1e-3)
             distance[short], sample[short] = near
-            full = np.isfinite(distance[short, -1]) & (count < len(segment))
-            short, count = short[full], min(4 * count, len(segment))
+            short, count = short[np.isfinite(distance[short, -1])], 4 * count
         return distance, np.where(np.isfinite(distance), sample, 0).astype(np.intp)
 
     def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
@@ -223,12 +221,7 @@ class Network:
             self._near(latitude_deg[k : k + _TOGETHER], longitude_deg[k : k + _TOGETHER], within_m, most)
             for k in range(0, max(len(latitude_deg), 1), _TOGETHER)
         ]
-        return Candidates(
-            **{
-                name: np.concatenate([_pad(getattr(part, name), parts, empty) for part in parts])
-                for name, empty in (("track", -1), ("chainage_m", np.nan), ("offset_m", np.inf))
-            }
-        )
+        return join_rows(parts)
 
     def _near(self, latitude_deg: Floats, longitude_deg: Floats, within_m: float, most: int) -> Candidates:
         """Some of `near`: arrays have every sample near each position."""
@@ -336,12 +329,6 @@ class Network:
                 return None
             best = reached
         return min(best.values(), key=lambda item: item[0])[1]
-
-
-def _pad(values: Any, parts: Sequence[Candidates], empty: float) -> Any:
-    """Columns of candidates, with empty ones to the most that a part has."""
-    width = max(part.track.shape[1] for part in parts)
-    return np.pad(values, ((0, 0), (0, width - values.shape[1])), constant_values=empty)
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:
