@@ -163,10 +163,17 @@ def no_measurements(receiver: str) -> Measurements:
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
-    """Rows of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
+    """Measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
     epoch = np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)])
-    return replace(join_rows(parts), epoch=epoch)
+    leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
+    return replace(
+        join_rows(parts),
+        epoch=epoch,
+        leap_seconds=leap[-1] if leap else None,
+        receiver=next((part.receiver for part in parts if part.receiver), ""),
+        skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),
+    )
 
 
 Record = tuple[RawRecord, tuple[float, ...]]  #: A record, and what tells it from the satellite's next one.
