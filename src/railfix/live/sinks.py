@@ -24,6 +24,7 @@ from railfix.core.errors import OutputError, SettingsError
 from railfix.live.engine import LiveOutput
 from railfix.live.forms import Form, forms, wants, whole_message
 from railfix.live.settings import LiveSettings
+from railfix.live.sources import hidden
 
 Item = TypeVar("Item")
 
@@ -317,8 +318,7 @@ async def open_sink(
     form = forms(settings).get(name)
     if not at or form is None or not target:
         raise SettingsError(f"--send {text!r}: {_HELP}")
-    parts = urlsplit(target)
-    shown = text if parts.password is None else text.replace(f":{parts.password}@", ":***@", 1)
+    parts, shown = urlsplit(target), f"{name}@{hidden(target)}"
     opened: Any
     if target == "-":
         opened = ByteTarget(form, standard_output())
