@@ -105,21 +105,10 @@ _HELP: Final = (
 class Sink(Protocol):
     """Something that takes outputs, never waits, and counts what its reader has missed."""
 
-    @property
-    def name(self) -> str:
-        """Name for counts and messages."""
-
-    @property
-    def dropped(self) -> int:
-        """Messages that the reader was too slow for."""
-
-    @property
-    def failed(self) -> int:
-        """Messages that the target refused."""
-
-    @property
-    def failure(self) -> str:
-        """Why the last message was refused; blank where it was not."""
+    name: str  #: For counts and messages.
+    dropped: int  #: Messages that the reader was too slow for.
+    failed: int  #: Messages that the target refused.
+    failure: str  #: Why the last message was refused; blank where it was not.
 
     def send(self, item: LiveOutput, /) -> None:
         """Take one output."""
