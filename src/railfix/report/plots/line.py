@@ -144,9 +144,21 @@ class LocalFrame:
         axes = enu_axes(latitude, longitude)
         return cls(origin_ecef_m=origin, axes=axes, latitude_deg=latitude, longitude_deg=longitude, height_m=height)
 
+    @classmethod
+    def at(cls, latitude_deg: float, longitude_deg: float) -> LocalFrame:
+        """Frame at a place on the ellipsoid."""
+        origin, axes = ecef_from_geodetic(latitude_deg, longitude_deg, 0.0), enu_axes(latitude_deg, longitude_deg)
+        return cls(
+            origin_ecef_m=origin, axes=axes, latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=0.0
+        )
+
     def plane(self, ecef_m: Floats) -> Floats:
         """East and north of points, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
+
+    def plane_of(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
+        """East and north of points of the height of the origin, shape (P, 2) [m]."""
+        return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
 
 def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
@@ -154,7 +166,7 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
     parts: list[Floats] = []
     gap = np.full((1, 2), np.nan)
     for line in lines:
-        plane = frame.plane(ecef_from_geodetic(line[:, 1], line[:, 0], np.full(len(line), frame.height_m)))
+        plane = frame.plane_of(line[:, 1], line[:, 0])
         inside = np.asarray(((plane > low) & (plane < high)).all(axis=1))
         # neighbours outside stay, so that lines reach the edge
         kept = inside | np.append(inside[1:], False) | np.append(False, inside[:-1])
