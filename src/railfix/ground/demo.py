@@ -344,7 +344,6 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
 
 
 def _figures(traffic: LinkedTraffic, trains: dict[int, TrainLinks], centre: CentreLinks) -> dict[str, Any]:
-    """Return what happened, by name."""
     control, monitor = traffic.control, traffic.control.monitor
     return {
         "simulated time [s]": traffic.now_s,

@@ -240,7 +240,6 @@ def _uses_section(train: TrainInterval, section: int, layout: Layout) -> bool:
 
 
 def _under_interval(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether points lie under a train's interval."""
     low, high = layout.zone_m(point)
     return any(
         train.overlaps(low, high) and overlap(layout.pieces(*train.span_m, train.tracks), [(0, low, high)])
