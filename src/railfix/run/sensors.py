@@ -11,21 +11,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.arrays import Datetimes, Strings
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.tables import reading_table
 from railfix.io.mate import mate_table
-from railfix.motion.samples import (
-    BaliseReadings,
-    GroundUnits,
-    InertialSamples,
-    ListedBalises,
-    RadarSpeeds,
-    Samples,
-    SensorSamples,
-    StationRanges,
-    TachometerPulses,
-)
+from railfix.motion.samples import GroundUnits, ListedBalises, Samples, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.run.convert import sensor_table
 from railfix.track import Track
@@ -46,13 +36,8 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
-_SAMPLES: Final[Mapping[str, type[Samples]]] = {
-    "tachometer": TachometerPulses,
-    "inertial": InertialSamples,
-    "radar": RadarSpeeds,
-    "ranging": StationRanges,
-    "balises": BaliseReadings,
-}
+#: Class of the samples of each sensor.
+_CLASSES: Final = {name: type(samples) for name, samples in SensorSamples().tables.items()}
 #: Sensors that may have nothing to say for a while, and say so by rows with the time alone.
 _SILENT: Final = ("tachometer", "ranging", "balises")
 #: Tables without a time, and columns of names.
@@ -94,7 +79,7 @@ def samples_of(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any]]
         values = {"force_mps2": six[:, :3], "rate_radps": six[:, 3:]}
     elif sensor == "ranging":
         values["station"] = values.pop("unit")
-    return _SAMPLES[sensor](time=time, **values)
+    return _CLASSES[sensor](time=time, **values)
 
 
 def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
@@ -152,10 +137,11 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
         raise InputFileError(
             path, f"lists no balise on the line (0 to {track.chainage_m[-1]:.0f} m); give chainages of this line"
         )
+    sigma = table.get_column("sigma_m", default=pl.zeros(len(table), eager=True))
     return ListedBalises(
         name=names[inside],
         chainage_m=chainage[inside],
-        sigma_m=_sigmas(table, 0.0)[inside],
+        sigma_m=sigma.fill_null(0.0).to_numpy()[inside],
         virtual=np.full(int(inside.sum()), virtual),
     )
 
@@ -228,13 +214,6 @@ def _names(path: Path, table: pl.DataFrame, name: str) -> Strings:
     if (empty := table[name].is_null()).any():
         raise InputFileError(path, f"row {int(empty.arg_max() or 0) + 2}: {name} is empty; name it")
     return table[name].cast(pl.String).to_numpy().astype(np.str_)
-
-
-def _sigmas(table: pl.DataFrame, absent: float) -> Floats:
-    """Standard deviations of rows, where they are given."""
-    if "sigma_m" not in table.columns:
-        return np.full(len(table), absent)
-    return table["sigma_m"].cast(pl.Float64).fill_null(absent).to_numpy()
 
 
 def _table(path: Path, kind: str) -> pl.DataFrame:

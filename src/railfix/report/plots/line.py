@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -69,9 +70,9 @@ def plan(
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
-    name, labels = "plan", ("east [m]", "north [m]")
+    chart = partial(Chart, name="plan", title=title, x_label="east [m]", y_label="north [m]", equal=True)
     if not has.any():
-        return Chart(name=name, title=title, caption="", x_label=labels[0], y_label=labels[1], layers=(), equal=True)
+        return chart(caption="", layers=())
     frame = LocalFrame.around(ecef[has])
     here, there = frame.plane(ecef), frame.plane(conventional)
     low, high = here[has].min(axis=0), here[has].max(axis=0)
@@ -101,15 +102,10 @@ def plan(
     thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
     far = f" {outside:,} conventional positions lie outside." if outside else ""
-    return Chart(
-        name=name,
-        title=title,
+    return chart(
         caption=f"Positions on the map, coloured by {coloured}; conventional positions in grey.{far} Origin at "
         f"latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}.{thinned}",
-        x_label=labels[0],
-        y_label=labels[1],
         layers=tuple(layers),
-        equal=True,
     )
 
 
