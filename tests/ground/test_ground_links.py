@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from attacked_link import AttackedLink, AttackSettings
 from railfix.core.errors import OutputError
-from railfix.ground.demo import LinkDisturbance, Relay, RelaySettings
+from railfix.ground.demo import Relay, RelaySettings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.links import (
     BEARERS,
@@ -255,10 +256,11 @@ def test_two_lossy_bearers_carry_each_message_once(keys: Path) -> None:
         await centre.start()
         relays = {}
         for k, name in enumerate(BEARERS):
-            settings = RelaySettings(
+            settings = AttackSettings(
                 loss=0.2 if name == "A" else 0.0, delay_s=0.02, jitter_s=0.01, bit_errors=0.05, seed=k
             )
             relays[name] = Relay(centre.addresses[name], settings)
+            relays[name].disturbance = AttackedLink(settings)
             await relays[name].open(HOSTS[name])
         train = TrainLinks(
             7, keys, bearers_of({n: r.address for n, r in relays.items()}, LOCAL), received=orders.append
@@ -292,12 +294,12 @@ def test_two_lossy_bearers_carry_each_message_once(keys: Path) -> None:
 
 #: Trains of the test on the wire, by the threat that both of their bearers are under.
 ON_THE_WIRE = {
-    1: (Threat.REPETITION, RelaySettings(repeats=0.7, delay_s=0.005, seed=1)),
-    2: (Threat.DELETION, RelaySettings(loss=0.4, seed=2)),
-    3: (Threat.INSERTION, RelaySettings(insertions=0.7, seed=3)),
-    4: (Threat.RESEQUENCING, RelaySettings(jitter_s=0.2, seed=4)),
-    5: (Threat.CORRUPTION, RelaySettings(bit_errors=0.4, seed=5)),
-    6: (Threat.DELAY, RelaySettings(delay_s=0.01, seed=6)),
+    1: (Threat.REPETITION, AttackSettings(repeats=0.7, delay_s=0.005, seed=1)),
+    2: (Threat.DELETION, AttackSettings(loss=0.4, seed=2)),
+    3: (Threat.INSERTION, AttackSettings(insertions=0.7, seed=3)),
+    4: (Threat.RESEQUENCING, AttackSettings(jitter_s=0.2, seed=4)),
+    5: (Threat.CORRUPTION, AttackSettings(bit_errors=0.4, seed=5)),
+    6: (Threat.DELAY, AttackSettings(delay_s=0.01, seed=6)),
 }
 
 
@@ -318,12 +320,12 @@ def test_each_threat_on_the_wire(tmp_path: Path) -> None:
         )
         await centre.start()
         trains, relays = {}, {}
-        for number, (_, settings) in {**ON_THE_WIRE, 7: (None, RelaySettings())}.items():
+        for number, (_, settings) in {**ON_THE_WIRE, 7: (None, AttackSettings())}.items():
             for k, name in enumerate(BEARERS):
                 relay = relays[number, name] = Relay(centre.addresses[name], RelaySettings())
                 await relay.open(HOSTS[name])
-                relay.disturbance = LinkDisturbance(settings.replaced(seed=settings.seed + 10 * k))
-                relay.disturbance.settings = RelaySettings()  # until it is connected
+                relay.disturbance = AttackedLink(settings.replaced(seed=settings.seed + 10 * k))
+                relay.disturbance.settings = AttackSettings()  # until it is connected
             local = {"A": f"127.0.1.{40 + number}", "B": f"127.0.2.{40 + number}"}
             given = bearers_of({n: relays[number, n].address for n in BEARERS}, local)
             trains[number] = TrainLinks(number, tmp_path, given)
@@ -335,7 +337,7 @@ def test_each_threat_on_the_wire(tmp_path: Path) -> None:
         for k in range(80):
             if k == 60:  # 1.5 s longer than before, to the end: nothing newer overtakes them
                 for name in BEARERS:
-                    relays[6, name].disturbance.settings = RelaySettings(delay_s=1.5)
+                    relays[6, name].disturbance.settings = AttackSettings(delay_s=1.5)
             for number, train in trains.items():
                 train.send(b"%d of %d" % (k, number))
             await asyncio.sleep(0.02)

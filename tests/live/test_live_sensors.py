@@ -23,7 +23,7 @@ from railfix.io.train_message import MessageStatus, Source
 from railfix.live import console
 from railfix.live.console import SensorWatch
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
-from railfix.live.forms import passing_rows
+from railfix.live.forms import ROW_FORMS
 from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, load_state, write_state
 from railfix.live.stream import FOREVER, Sensed, SensorLines
@@ -157,7 +157,7 @@ def test_a_live_session_with_sensors_gives_what_the_log_gives(case: Ride, tmp_pa
     np.testing.assert_array_equal(found.sensed.state, whole.sensed.state)
     np.testing.assert_allclose(found.sensed.curvature_1pm, whole.sensed.curvature_1pm, atol=1e-9)
     np.testing.assert_array_equal(found.tracked.used, whole.tracked.used)
-    passed = [json.loads(row) for output in outputs for row in passing_rows(output).splitlines()]
+    passed = [json.loads(row) for output in outputs for row in ROW_FORMS["passings"](output).splitlines()]
     assert [row["balise"] for row in passed] == [passing.balise for passing in whole.passings]
     assert {(row["balise"], row["verdict"]) for row in passed if row["verdict"] != "read"} == {
         ("B003", "missing"), ("B004", "missing"), ("B007", "contradicts"),

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar
 import typer
 
 from railfix import __version__
-from railfix.cli.command import LazyCommands, run_program
+from railfix.cli.command import LazyCommands, command_group, run_program
 from railfix.core.files import source_commit
 
 # Threads of linear algebra spin while they wait for the next product. It must be set before numpy is imported.
@@ -63,15 +63,7 @@ class _Program(LazyCommands):
     }
 
 
-app = typer.Typer(
-    name="railfix",
-    cls=_Program,
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = command_group("railfix", cls=_Program, context_settings={"help_option_names": ["-h", "--help"]})
 
 
 def version_text() -> str:

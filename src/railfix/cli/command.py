@@ -117,9 +117,9 @@ _TYPER: Final[dict[str, Any]] = {
 }  # fmt: skip
 
 
-def command_group(name: str, **options: Any) -> typer.Typer:
+def command_group(name: str, *, cls: type[Commands] = Commands, **options: Any) -> typer.Typer:
     """Return a group of commands; without one of them it shows its help."""
-    return typer.Typer(name=name, cls=Commands, no_args_is_help=True, **_TYPER, **options)
+    return typer.Typer(name=name, cls=cls, no_args_is_help=True, **_TYPER, **options)
 
 
 class LazyCommands(Commands):

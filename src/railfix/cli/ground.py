@@ -412,7 +412,6 @@ def train(
 
 
 def _show_figures(figures: dict[str, Any]) -> None:
-    """Print a table of what happened."""
     rows = [
         [name, (", ".join(f"{k} {v}" for k, v in value.items()) or "none") if isinstance(value, dict) else str(value)]
         for name, value in figures.items()

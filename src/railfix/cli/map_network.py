@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
+import polars as pl
 import typer
 from pydantic import model_validator
 
 from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_table
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
+from railfix.core.arrays import Floats
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.settings import INPUTS, Settings, option
@@ -284,28 +286,30 @@ def match_command(
 
 
 def _write_matches(net: Network, log: PlanLog, matched: Matched, filled: Filled) -> str:
-    names = (*net.names, "")
-    kilometrage = net.kilometrage_on(filled.track, filled.chainage_m)
+    names = (*net.names, None)
     other = np.where(matched.candidates.track == matched.track[:, None], -1.0, matched.probabilities)
-    second = np.argmax(other, axis=1)
-    rows_of = np.arange(len(second))
-    next_track = np.where(other[rows_of, second] > 0.0, matched.candidates.track[rows_of, second], -1)
-    lines = [
-        "time_gpst,latitude_deg,longitude_deg,track,chainage_m,kilometrage_m,offset_m,probability,next_track,"
-        "next_probability,unmapped_probability,filled_bound_m"
-    ]
-    unmapped = np.clip(1.0 - matched.probabilities.sum(axis=1), 0.0, 1.0)
+    rows, second = np.arange(len(other)), np.argmax(other, axis=1)
+    next_probability = other[rows, second]
+    next_track = np.where(next_probability > 0.0, matched.candidates.track[rows, second], -1)
 
-    def number(value: float, digits: int) -> str:
-        return "" if np.isnan(value) else f"{value:.{digits}f}"
+    def texts(values: Floats, digits: int) -> list[str | None]:
+        return [None if np.isnan(value) else f"{value:.{digits}f}" for value in values.tolist()]
 
-    for k in range(len(second)):
-        quoted = [f'"{names[t]}"' if "," in names[t] else names[t] for t in (int(filled.track[k]), int(next_track[k]))]
-        lines.append(
-            f"{'' if np.isnat(log.time[k]) else log.time[k]},{number(log.latitude_deg[k], 9)},"
-            f"{number(log.longitude_deg[k], 9)},{quoted[0]},{number(filled.chainage_m[k], 3)},"
-            f"{number(kilometrage[k], 3)},{number(matched.offset_m[k], 3)},{matched.probability[k]:.6f},{quoted[1]},"
-            f"{max(other[k, second[k]], 0.0):.6f},{unmapped[k]:.6f},"
-            f"{number(filled.bound_m[k], 1)}"
-        )
-    return "\n".join(lines) + "\n"
+    def shares(values: Floats) -> list[str]:
+        return [f"{value:.6f}" for value in values.tolist()]
+
+    columns = {
+        "time_gpst": [None if np.isnat(time) else str(time) for time in log.time],
+        "latitude_deg": texts(log.latitude_deg, 9),
+        "longitude_deg": texts(log.longitude_deg, 9),
+        "track": [names[k] for k in filled.track.tolist()],
+        "chainage_m": texts(filled.chainage_m, 3),
+        "kilometrage_m": texts(net.kilometrage_on(filled.track, filled.chainage_m), 3),
+        "offset_m": texts(matched.offset_m, 3),
+        "probability": shares(matched.probability),
+        "next_track": [names[k] for k in next_track.tolist()],
+        "next_probability": shares(np.maximum(next_probability, 0.0)),
+        "unmapped_probability": shares(np.clip(1.0 - matched.probabilities.sum(axis=1), 0.0, 1.0)),
+        "filled_bound_m": texts(filled.bound_m, 1),
+    }
+    return pl.DataFrame(columns, schema=dict.fromkeys(columns, pl.String)).write_csv()

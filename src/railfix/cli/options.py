@@ -56,14 +56,11 @@ def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, input
     return [path for path, _ in asked]
 
 
-@dataclass(frozen=True)
 class Without:
     """Fields of a model that a command has no option for."""
 
-    names: tuple[str, ...]
-
     def __init__(self, *names: str) -> None:
-        object.__setattr__(self, "names", names)
+        self.names = names
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from railfix.ground.centre import ReferenceCurve, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stop_orders, to_documents
+from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stop_orders, stop_trains, to_documents
 from railfix.ground.layout import PointName
-from railfix.ground.stops import close_section, open_section, release_train, stop_trains
+from railfix.ground.stops import close_section, open_section, release_train
 from railfix.ground.store import DatabaseError, Store
 from railfix.ground.supervision import Supervision
 from railfix.ground.triangle import STOPPING, MonitorLimits, MonitorState, TriangleVerdict, advance, release

@@ -9,7 +9,6 @@ import asyncio
 import contextlib
 import random
 import tempfile
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,50 +42,24 @@ class RelaySettings(Settings):
     #: Delay of each datagram, and the largest random one on top of it: datagrams overtake each other.
     delay_s: float = Field(default=0.0, ge=0)
     jitter_s: float = Field(default=0.0, ge=0)
-    bit_errors: float = Field(default=0.0, ge=0, le=1)  #: Probability that one bit of a datagram is flipped.
-    #: Probability that a datagram is sent a second time, up to `repeat_s` later.
-    repeats: float = Field(default=0.0, ge=0, le=1)
-
-    repeat_s: float = Field(default=0.5, ge=0)
-    #: Probability that a foreign datagram of random bytes, with the head of the one before, is put after a datagram.
-    insertions: float = Field(default=0.0, ge=0, le=1)
-
     seed: int = 0
 
 
 class LinkDisturbance:
-    """Seeded disturbance of packets of any kind, counted by what happened to them.
+    """Seeded disturbance of packets of any kind.
 
     `settings` may be replaced while packets pass; while `up` is False, an outage, every packet is lost.
     """
 
     def __init__(self, settings: RelaySettings) -> None:
         self.settings, self.up = settings, True
-        self.counts: Counter[str] = Counter()
         self._random = random.Random(settings.seed)
 
     def packet(self, data: bytes, send: Callable[[bytes], None]) -> None:
         """Pass a packet on, by `send`, or not."""
-        settings, rng = self.settings, self._random
-        self.counts["datagrams"] += 1
-        if not self.up or rng.random() < settings.loss:
-            self.counts["lost"] += 1
+        if not self.up or self._random.random() < self.settings.loss:
             return
-        if rng.random() < settings.bit_errors:
-            self.counts["bit errors"] += 1
-            bit = rng.randrange(8 * len(data))
-            data = data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]
-        delay = settings.delay_s + rng.uniform(0.0, settings.jitter_s)
-        self._later(delay, data, send)
-        if rng.random() < settings.repeats:
-            self.counts["repeated"] += 1
-            self._later(delay + rng.uniform(0.0, settings.repeat_s), data, send)
-        if rng.random() < settings.insertions:
-            self.counts["inserted"] += 1
-            self._later(delay, data[:20] + rng.randbytes(max(len(data) - 20, 1)), send)
-
-    @staticmethod
-    def _later(delay_s: float, data: bytes, send: Callable[[bytes], None]) -> None:
+        delay_s = self.settings.delay_s + self._random.uniform(0.0, self.settings.jitter_s)
         if delay_s > 0.0:
             asyncio.get_running_loop().call_later(delay_s, send, data)
         else:
@@ -371,7 +344,6 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
 
 
 def _figures(traffic: LinkedTraffic, trains: dict[int, TrainLinks], centre: CentreLinks) -> dict[str, Any]:
-    """Return what happened, by name."""
     control, monitor = traffic.control, traffic.control.monitor
     return {
         "simulated time [s]": traffic.now_s,

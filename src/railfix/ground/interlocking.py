@@ -24,7 +24,7 @@ from pydantic import Field
 
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
-from railfix.ground.layout import Layout, PointName, overlap
+from railfix.ground.layout import Layout, PointName, along, overlap
 
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
 #: Largest sum of over- and under-reading amount of a report that is taken.
@@ -79,6 +79,14 @@ class TrainInterval:
         low, high = sorted(self.interval_m)
         return low, high
 
+    def overlaps(self, low_m: float, high_m: float) -> bool:
+        """Whether some chainage between two is occupied."""
+        return self.span_m[0] < high_m and low_m < self.span_m[1]
+
+    def has_passed(self, low_m: float, high_m: float) -> bool:
+        """Whether the rear end is beyond what lies between two chainages, in running direction."""
+        return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
+
 
 @dataclass(frozen=True, kw_only=True)
 class PointState:
@@ -129,6 +137,14 @@ def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
     return replace(state, trains={**state.trains, train.train: train})
 
 
+def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Interlocking:
+    """Return the state with trains stopped; one that is stopped already keeps its reason."""
+    for number in trains:
+        known = state.trains[number]
+        state = with_train(state, replace(known, stop=known.stop or reason))
+    return state
+
+
 def stop_orders(state: Interlocking) -> dict[int, str]:
     """Return the trains that are ordered to stop, and why: those stopped themselves, and the nearest on either side."""
     found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
@@ -155,11 +171,7 @@ def points_reported(state: Interlocking, point: PointName, detected: int | None)
     before = state.points[point]
     state = replace(state, points={**state.points, point: replace(before, detected=detected)})
     if before.detected == before.wanted != detected:
-        for number in before.locked:
-            train = state.trains[number]
-            state = with_train(
-                state, replace(train, stop=train.stop or "points of its route have lost their detection")
-            )
+        return stop_trains(state, before.locked, "points of its route have lost their detection")
     return state
 
 
@@ -217,27 +229,20 @@ def route_requested(
 
 def _in_station(train: TrainInterval, station: int, layout: Layout) -> bool:
     """Return whether a train's interval or route still needs its track in a station."""
-    first, last = layout.stations[station].begin_m, layout.stations[station].end_m
-    return train.rear_m < last if train.direction > 0 else train.rear_m > first
+    return not train.has_passed(layout.stations[station].begin_m, layout.stations[station].end_m)
 
 
 def _uses_section(train: TrainInterval, section: int, layout: Layout) -> bool:
     """Return whether a train's route or interval lies between a station and the next, their points left out."""
-    first, last = layout.stations[section].end_m, layout.stations[section + 1].begin_m
-    low, high = train.span_m
-    routed = {section, section + 1} <= set(train.tracks) and (
-        train.rear_m < last if train.direction > 0 else train.rear_m > first
-    )
-    return routed or (low < last and high > first)
+    between = layout.stations[section].end_m, layout.stations[section + 1].begin_m
+    routed = {section, section + 1} <= set(train.tracks) and not train.has_passed(*between)
+    return routed or train.overlaps(*between)
 
 
 def _under_interval(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether points lie under a train's interval."""
     low, high = layout.zone_m(point)
     return any(
-        train.span_m[0] < high
-        and low < train.span_m[1]
-        and overlap(layout.pieces(*train.span_m, train.tracks), [(0, low, high)])
+        train.overlaps(low, high) and overlap(layout.pieces(*train.span_m, train.tracks), [(0, low, high)])
         for train in nearby.between(state, low, high)
     )
 
@@ -252,8 +257,7 @@ def release_points(state: Interlocking, now_s: float, layout: Layout, *, limits:
         locked: dict[int, float | None] = {}
         for train, since in point.locked.items():
             known = state.trains[train]
-            passed = known.rear_m >= high if known.direction > 0 else known.rear_m <= low
-            due = None if not passed else now_s + limits.release_s if since is None else since
+            due = None if not known.has_passed(low, high) else now_s + limits.release_s if since is None else since
             if due is None or due > now_s:
                 locked[train] = due
         if locked != point.locked:
@@ -295,12 +299,10 @@ def _limit_m(
 ) -> float:
     """Return the furthest end of a train's authority [m]."""
     direction = train.direction
-    inner = layout.stations[train.station].inner_m
-    end = direction * (inner[1] if direction > 0 else inner[0])
+    end = direction * layout.track_end_m(train.station, direction)
     for name in layout.points_between(*sorted((train.rear_m, direction * end))):
         point = state.points[name]
-        low, high = layout.zone_m(name)
-        near, far = (low, high) if direction > 0 else (-high, -low)
+        near, far = along(layout.zone_m(name), direction)
         if far <= direction * train.rear_m or near >= end:
             continue
         wanted = train.tracks.get(name[0])
@@ -308,14 +310,13 @@ def _limit_m(
         if not (train.train in point.locked and point.wanted == wanted == point.detected):
             end = min(end, near)
     for block in state.closed:
-        low, high = layout.block_m(block)
-        near, far = (low, high) if direction > 0 else (-high, -low)
+        near, far = along(layout.block_m(block), direction)
         if far > direction * train.rear_m:
             end = min(end, near)
     path = layout.pieces(train.rear_m, direction * end, train.tracks)
     first_m, last_m = sorted((train.rear_m, direction * end))
     for other in nearby.between(state, first_m, last_m):
-        if other.train == train.train or other.span_m[0] >= last_m or other.span_m[1] <= first_m:
+        if other.train == train.train or not other.overlaps(first_m, last_m):
             continue
         for lane, low, high in layout.pieces(*other.span_m, other.tracks):
             for mine, first, last in path:

@@ -98,6 +98,11 @@ class Layout(Settings):
             return station.begin_m, station.inner_m[0]
         return station.inner_m[1], station.end_m
 
+    def track_end_m(self, station: int, direction: int) -> float:
+        """Chainage where the tracks of a station end for a train that runs in a direction [m]."""
+        first, last = self.stations[station].inner_m
+        return last if direction > 0 else first
+
     def points(self) -> Iterator[PointName]:
         """All points; the outer ones of the first and the last station do not exist."""
         return self.points_between(-math.inf, math.inf)
@@ -136,6 +141,12 @@ class Layout(Settings):
 def lane_of(station: int, track: int) -> int:
     """Return the number of the lane of a station's track; 0 is the single line."""
     return 2 * station + track
+
+
+def along(between_m: tuple[float, float], direction: int) -> tuple[float, float]:
+    """Return two chainages, lower first, as distances in a running direction: the near one and the far one [m]."""
+    low, high = between_m
+    return (low, high) if direction > 0 else (-high, -low)
 
 
 def overlap(first: list[Piece], second: list[Piece]) -> bool:

@@ -31,7 +31,7 @@ from railfix.ground.quic import check_keys
 from railfix.ground.station_fixes import stream_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
-from railfix.ground.triangle import MonitorLimits, TriangleLimits, TriangleVerdict, compare_triangle
+from railfix.ground.triangle import MonitorLimits, TriangleLimits, TriangleVerdict, judge_fixes
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io import read_navigation
 from railfix.track.network_read import read_network
@@ -330,9 +330,7 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
         navigation = read_navigation([path.parent / name for name in triangle.nav]) if triangle.nav else None
         points = triangle.points_ecef_m()
         async for fixes in stream_fixes(triangle.sources, points, navigation=navigation):
-            result = compare_triangle(
-                fixes.points_m, fixes.fixes_m, limits=triangle.limits, cn0_fallen=fixes.cn0_fallen
-            )
+            result = judge_fixes(fixes, triangle.limits)
             age_s = float((utc_to_gpst(np.datetime64(time.time_ns(), "ns")) - fixes.time[0]) / np.timedelta64(1, "s"))
             control.judge(TriangleVerdict(int(result.verdict[0])), int(result.receiver[0]), age_s=age_s)
         control.log("triangle: every stream has ended")

@@ -21,7 +21,7 @@ from railfix.live.settings import LiveSettings
 from railfix.live.stream import ReceivedData, arrivals, fresh_state, next_arrival
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
+from railfix.pipeline.corrected_ranges import usable_ranges
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
 from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
@@ -86,7 +86,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         code[k, rows], cn0[k, rows] = log.code_m[:, columns], log.cn0_dbhz[:, columns]
     frequency = channels[0].frequency_hz[[names[0].index(name) for name in common]]
     klobuchar = known_from_start(config, navigation=navigation).klobuchar
-    corrected, sigma, usable, position = np.empty(shape), np.empty(shape), np.empty(shape, bool), np.empty((*shape, 3))
+    corrected, sigma, usable, states_of = np.empty(shape), np.empty(shape), np.empty(shape, bool), []
     for k, point in enumerate(points_ecef_m):
         states = satellite_states(tags[k], satellite, signal, code[k], navigation, max_age_s=config.max_ephemeris_age_s)
         seen = SeenFrom.of(np.broadcast_to(point, (len(time), 3)), states.position_ecef_m)
@@ -95,7 +95,8 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         corrected[k], sigma[k] = clean, code_sigma_m(cn0[k], seen.elevation_deg, noise=config.noise)
         plausible = (code[k] > PLAUSIBLE_CODE_M[0]) & (code[k] < PLAUSIBLE_CODE_M[1])
         bad = states.no_record | states.too_old | states.unhealthy | (seen.elevation_deg < config.elevation.mask_deg)
-        usable[k], position[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k]), states.position_ecef_m
+        usable[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k])
+        states_of.append(states)
     there = np.stack([np.isin(time, epoch) for epoch in epochs])
     # a receiver without an epoch takes no satellite away from the others: their own fixes still count
     shared = (usable | ~there[:, :, None]).all(axis=0)
@@ -104,7 +105,8 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
     common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
     groups = clock_groups([name[0] for name in satellite.tolist()])
     ranges = [
-        _ranges(position[k], corrected[k], common_sigma, usable[k] & shared, groups) for k in range(len(points_ecef_m))
+        usable_ranges(states, corrected[k], 1.0 / common_sigma**2, np.where(usable[k] & shared, 0, 1), groups)
+        for k, states in enumerate(states_of)
     ]
     return fixes_of_ranges(time, ranges, points_ecef_m, cn0_fallen=_fallen(cn0))
 
@@ -145,15 +147,6 @@ def round_tags(time: Datetimes) -> Datetimes:
     step = SAME_EPOCH.astype("timedelta64[ns]").astype(np.int64)
     rounded = (time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step
     return np.asarray(rounded.astype("datetime64[ns]"))
-
-
-def _ranges(position: Floats, code: Floats, sigma: Floats, used: Masks, groups: tuple[slice, ...]) -> Ranges:
-    return Ranges(
-        sat_ecef_m=np.where(used[..., None], position, SOMEWHERE_ABOVE_M),
-        code_m=np.where(used, code, 0.0),
-        weight=np.where(used, 1.0 / sigma**2, 0.0),
-        groups=groups,
-    )
 
 
 def _fallen(cn0: Floats) -> Masks:

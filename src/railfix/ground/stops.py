@@ -7,11 +7,10 @@ lengthen it again by being late.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
-from railfix.ground.interlocking import Interlocking, InterlockingLimits, TrainInterval, with_train
+from railfix.ground.interlocking import Interlocking, InterlockingLimits, stop_trains, with_train
 from railfix.ground.layout import Layout, overlap
 from railfix.io.train_message import TrainMessage
 
@@ -28,12 +27,8 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
                 continue
             one, two = (layout.pieces(*train.span_m, train.tracks) for train in (first, second))
             if overlap(one, two):
-                state = with_train(
-                    state, replace(first, stop=first.stop or f"its interval meets that of train {other}")
-                )
-                state = with_train(
-                    state, replace(second, stop=second.stop or f"its interval meets that of train {number}")
-                )
+                state = stop_trains(state, [number], f"its interval meets that of train {other}")
+                state = stop_trains(state, [other], f"its interval meets that of train {number}")
     return state
 
 
@@ -49,13 +44,11 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
         return state, f"train {train} is not stopped"
     if not known.standstill:
         return state, f"train {train} does not stand still"
-    if any(_touches(known, block, layout) for block in state.closed):
+    if any(known.overlaps(*layout.block_m(block)) for block in state.closed):
         return state, f"the section where train {train} is or may run is closed"
     points = dict(state.points)
-    low, high = known.span_m
-    for name in layout.points_between(low, high):
-        first, last = layout.zone_m(name)
-        if first < high and low < last:
+    for name in layout.points_between(*known.span_m):
+        if known.overlaps(*layout.zone_m(name)):
             if not points[name].wanted == points[name].detected == known.tracks.get(name[0]):
                 return state, f"points {layout.stations[name[0]].name} under its interval are not set for train {train}"
             points[name] = replace(points[name], locked={**points[name].locked, train: None})
@@ -71,28 +64,16 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     return released_state, None
 
 
-def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Interlocking:
-    """Return the state with trains stopped by order."""
-    for number in trains:
-        known = state.trains[number]
-        state = with_train(state, replace(known, stop=known.stop or reason))
-    return state
-
-
 def close_section(state: Interlocking, block: int, layout: Layout, reason: str) -> Interlocking:
     """Return the state with a block closed: no authority reaches into it any more, trains that have one are stopped."""
     state = replace(state, closed=state.closed | {block})
-    return stop_trains(state, [n for n, train in state.trains.items() if _touches(train, block, layout)], reason)
+    touched = [number for number, train in state.trains.items() if train.overlaps(*layout.block_m(block))]
+    return stop_trains(state, touched, reason)
 
 
 def open_section(state: Interlocking, block: int) -> Interlocking:
     """Return the state with a block open; trains that were stopped by it are released one by one."""
     return replace(state, closed=state.closed - {block})
-
-
-def _touches(train: TrainInterval, block: int, layout: Layout) -> bool:
-    low, high = layout.block_m(block)
-    return train.span_m[0] < high and train.span_m[1] > low
 
 
 #: Difference of an end that is rounding [m].
@@ -109,8 +90,7 @@ def ask_route_back(
     direction, base = known.direction, known.station - known.direction
     if base not in known.tracks:
         return state, "the train has no route to take back"
-    inner = layout.stations[base].inner_m
-    end = direction * (inner[1] if direction > 0 else inner[0])
+    end = direction * layout.track_end_m(base, direction)
     if known.stop is not None or direction * (known.front_m - known.end_m) > 0.0:
         return state, "the train is stopped, or beyond its authority"
     if direction * known.front_m > end:

@@ -44,7 +44,6 @@ LOG: Final = sql.Table(
     sql.Column("train", sql.BigInteger),
     sql.Column("text", sql.Text, nullable=False),
 )
-_KEYS: Final[dict[sql.Table, sql.Column[Any]]] = {TRAINS: TRAINS.c.train, DOCUMENTS: DOCUMENTS.c.name}
 
 
 class DatabaseError(OutputError):
@@ -71,7 +70,6 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
-        self._known: dict[str, set[Any]] = {}
 
     def take_charge(self) -> None:
         """Make this process the only one that writes: a centre in charge before cannot commit any more.
@@ -93,7 +91,6 @@ class Store:
             if self._connection.execute(charge).rowcount == 0:
                 self._connection.execute(DOCUMENTS.insert().values(name=_IN_CHARGE, text=token))
         self._token = token
-        self._known.clear()  # a centre before may have written until now
 
     def __enter__(self) -> Self:
         return self
@@ -136,15 +133,11 @@ class Store:
                 if self._connection.execute(DOCUMENTS.update().where(mine).values(text=self._token)).rowcount != 1:
                     self._notes.clear()
                     raise InputFileError(self._url, "another centre has taken charge of this database; this one ends")
-            added = [
-                self._put(TRAINS, trains),
-                self._put(DOCUMENTS, [{"name": name, "text": text} for name, text in documents.items()]),
-            ]
+            self._put(TRAINS.c.train, trains)
+            self._put(DOCUMENTS.c.name, [{"name": name, "text": text} for name, text in documents.items()])
             if self._notes:
                 self._connection.execute(LOG.insert(), self._notes)
         self._notes.clear()
-        for table, keys in zip((TRAINS, DOCUMENTS), added, strict=True):
-            self._known[table.name] = keys
 
     def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
         """Take a line of the log, to be committed with the next `save` or at the end."""
@@ -184,21 +177,13 @@ class Store:
             rows = self._connection.execute(query).all()
         return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
 
-    def _put(self, table: sql.Table, rows: list[dict[str, Any]]) -> set[Any]:
-        """Update the rows that the table has, insert the others; return all keys that it then has."""
-        column = _KEYS[table]
-        if table.name not in self._known:
-            self._known[table.name] = set(self._connection.execute(sql.select(column)).scalars())
-        known = self._known[table.name]
-        old = [{"of": row[column.name], **row} for row in rows if row[column.name] in known]
-        new = [row for row in rows if row[column.name] not in known]
-        if old:
-            names = [name for name in rows[0] if name != column.name]
-            update = table.update().where(column == sql.bindparam("of")).values({n: sql.bindparam(n) for n in names})
-            self._connection.execute(update, old)
-        if new:
-            self._connection.execute(table.insert(), new)
-        return known | {row[column.name] for row in new}
+    def _put(self, key: sql.Column[Any], rows: list[dict[str, Any]]) -> None:
+        """Put rows in the place of those with the same key."""
+        if rows:
+            self._connection.execute(
+                key.table.delete().where(key == sql.bindparam("of")), [{"of": row[key.name]} for row in rows]
+            )
+            self._connection.execute(key.table.insert(), rows)
 
 
 def _durable(connection: Any, _record: object) -> None:

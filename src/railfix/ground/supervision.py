@@ -338,9 +338,9 @@ class Supervision:
             return False
         if not 0 <= ahead < len(self.layout.stations):
             return False
-        inner = self.layout.stations[train.station].inner_m
-        way = train.direction * ((inner[1] if train.direction > 0 else inner[0]) - train.front_m)
-        return way < ROUTE_AHEAD_M
+        return (
+            train.direction * (self.layout.track_end_m(train.station, train.direction) - train.front_m) < ROUTE_AHEAD_M
+        )
 
 
 def standing_train(

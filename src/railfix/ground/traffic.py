@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from railfix.ground.interlocking import TrainInterval
-from railfix.ground.layout import Layout, LoopStation, PointName, overlap
+from railfix.ground.layout import Layout, LoopStation, PointName, along, overlap
 from railfix.ground.supervision import Supervision, standing_train
 from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import MessageStatus, TrainMessage
@@ -186,9 +186,8 @@ class Traffic:
     def _lead(self, train: SimulatedTrain, before_m: float) -> None:
         """Let points lead a train that runs onto them."""
         for name, point in self.centre.state.points.items():
-            low, high = self.layout.zone_m(name)
-            entered = (low, high) if train.direction > 0 else (-high, -low)
-            if not train.direction * before_m < entered[0] <= train.direction * train.front_m:
+            near, _ = along(self.layout.zone_m(name), train.direction)
+            if not train.direction * before_m < near <= train.direction * train.front_m:
                 continue
             if name in self.moving:
                 self.violations["train on moving points"] += 1
@@ -232,9 +231,7 @@ class Traffic:
     def _check_sections(self) -> None:
         for k in range(len(self.layout.stations) - 1):
             first, last = self.layout.stations[k].end_m, self.layout.stations[k + 1].begin_m
-            directions = {
-                t.direction for t in self.centre.state.trains.values() if t.span_m[0] < last and t.span_m[1] > first
-            }
+            directions = {t.direction for t in self.centre.state.trains.values() if t.overlaps(first, last)}
             if len(directions) > 1:
                 self.violations["opposing trains in a section"] += 1
 

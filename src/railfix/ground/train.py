@@ -17,12 +17,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from railfix.core.settings import Settings, option
 from railfix.ground.links import Bearer, LinkMode, LinkName, TrainLinks, first_sequence
 from railfix.ground.quic import check_keys
-from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
+from railfix.io.train_message import MessageError, TrainMessage, encode, from_json, validated_message
 
 #: Version of the message; a receiver rejects others.
 VERSION: Final = 2
@@ -63,11 +63,7 @@ class Authority(Settings):
         version, *values = _FORM.unpack(data)
         if version != VERSION:
             raise MessageError(f"is an authority of version {version}, {VERSION} was expected")
-        try:
-            return cls.model_validate(dict(zip(cls.model_fields, values, strict=True)))
-        except ValidationError as error:
-            first = error.errors()[0]
-            raise MessageError(f"{first['loc'][0]}: {first['msg']}") from None
+        return validated_message(cls, dict(zip(cls.model_fields, values, strict=True)))
 
 
 #: Way back of the safe front end that is no error of two places [m].

@@ -341,7 +341,7 @@ def monitor_log(
     SettingsError: when the sides of the triangle are too short for the limits.
     """
     limits, times = limits or TriangleLimits(), times or MonitorLimits()
-    triangle = _compare(fixes, limits)
+    triangle = judge_fixes(fixes, limits)
     seconds = (fixes.time - fixes.time[0]) / np.timedelta64(1, "s")
     state, orders = MonitorState(stopped=False), []
     for k, now in enumerate(seconds.tolist()):
@@ -397,7 +397,7 @@ class LiveMonitor:
 
     def judge(self, fixes: StationFixes, now_s: float) -> tuple[MonitoredLog, tuple[Order, ...]]:
         """Take one epoch; return it judged, and the orders to be sent; SettingsError as `monitor_log`."""
-        triangle = _compare(fixes, self.limits)
+        triangle = judge_fixes(fixes, self.limits)
         verdict, receiver = TriangleVerdict(int(triangle.verdict[0])), int(triangle.receiver[0])
         self.state, orders = advance(self.state, now_s, verdict, receiver=receiver, limits=self.times)
         return MonitoredLog(fixes=fixes, triangle=triangle, orders=()), orders
@@ -410,7 +410,8 @@ class LiveMonitor:
         return orders
 
 
-def _compare(fixes: StationFixes, limits: TriangleLimits) -> TriangleResult:
+def judge_fixes(fixes: StationFixes, limits: TriangleLimits) -> TriangleResult:
+    """Compare fixes with the triangle of their points; SettingsError: its sides are too short for the limits."""
     try:
         return compare_triangle(fixes.points_m, fixes.fixes_m, limits=limits, cn0_fallen=fixes.cn0_fallen)
     except ValueError as error:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import Field, ValidationError, model_validator
 
 from railfix.core.errors import InputFileError
-from railfix.core.settings import Settings
+from railfix.core.settings import Model, Settings
 
 VERSION: Final = 1  #: Version of the schema; a receiver rejects other major versions.
 LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected unread.
@@ -143,7 +143,7 @@ def decode(data: bytes) -> TrainMessage:
         expected = bool if name in _TRUTHS else int
         if type(value) is not expected:
             raise MessageError(f"{name}: {type(value).__name__} instead of {expected.__name__}")
-    return _validate(named)
+    return validated_message(TrainMessage, named)
 
 
 def _entries(data: bytes) -> int:
@@ -152,9 +152,10 @@ def _entries(data: bytes) -> int:
     return size if size < 24 else int.from_bytes(data[1 : 1 + (1 << (size - 24))], "big") if size < 28 else -1
 
 
-def _validate(values: dict[str, Any]) -> TrainMessage:
+def validated_message(kind: type[Model], values: dict[str, Any]) -> Model:
+    """Return a message of a kind from its values; MessageError where they are out of range."""
     try:
-        return TrainMessage.model_validate(values, strict=False)
+        return kind.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "message"
@@ -189,7 +190,7 @@ def from_json(line: str) -> TrainMessage:
             values["interference"] = SuspectedInterference[str(values["interference"]).upper()]
     except (KeyError, TypeError):
         raise MessageError("has an unknown status, source or interference") from None
-    return _validate(values)
+    return validated_message(TrainMessage, values)
 
 
 _LARGEST_LENGTH: Final = 32_766  #: Largest value of a length of packet 0; one more means unknown.

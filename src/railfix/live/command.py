@@ -22,6 +22,7 @@ from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
 from railfix.live.console import PlaceWatch, SensorWatch, SessionLog, check_log_file, serve_metrics
 from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.forms import TABLES
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.live.sinks import Outlet, file_of, open_sink
@@ -33,7 +34,7 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.pipeline.tables import passing_table, positions_table, rounded, train_table
+from railfix.pipeline.tables import rounded
 from railfix.run.driver import time_of
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
 from railfix.run.processor import check_base_place, place_of, processor_of
@@ -49,9 +50,7 @@ class ResultTables:
 
     def __init__(self, out: Path, *, overwrite: Overwrite, inputs: Sequence[Path]) -> None:
         self._folder = OutputFolder(out, overwrite=overwrite, inputs=list(inputs))
-        self._positions: list[pl.DataFrame] = []
-        self._train: list[pl.DataFrame] = []
-        self._passings: list[pl.DataFrame] = []
+        self._parts: dict[str, list[pl.DataFrame]] = {name: [] for name in TABLES}
 
     def __enter__(self) -> ResultTables:
         self._folder.__enter__()
@@ -61,16 +60,14 @@ class ResultTables:
         """Take the rows of one output."""
         if output.result is None or output.part == "message":
             return
-        self._positions.append(positions_table(output.result))
-        if output.result.fusion:
-            self._train.append(train_table(output.result))
-        if any(own.passings for own in output.result.fusion.values()):
-            self._passings.append(passing_table(output.result))
-        if len(self._positions) >= _BLOCK:
+        for name, table_of in TABLES.items():
+            if (table := table_of(output.result)) is not None:
+                self._parts[name].append(table)
+        if len(self._parts["positions"]) >= _BLOCK:
             self._write()
 
     def _write(self) -> None:
-        for name, tables in (("positions", self._positions), ("train", self._train), ("passings", self._passings)):
+        for name, tables in self._parts.items():
             if tables:
                 table = pl.concat(tables)
                 self._folder.append_parquet(f"{name}.parquet", table)

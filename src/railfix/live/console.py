@@ -16,7 +16,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
@@ -44,15 +44,8 @@ from railfix.tracking import Kind
 _WAITING: Final = 1000
 
 
-@dataclass(frozen=True)
-class StatusLine:
-    """A text that takes the place of the one before."""
-
-    text: str
-
-
 class _Terminal:
-    """The standard error output: lines of the log, and below them the status line."""
+    """The standard error output: lines of the log, and below them the status line, which is a `Text`."""
 
     def __init__(self, *, status: bool) -> None:
         self._console = Console(stderr=True, highlight=False)
@@ -60,12 +53,12 @@ class _Terminal:
         if self._live is not None:
             self._live.start()
 
-    def show(self, item: str | StatusLine) -> None:
+    def show(self, item: str | Text) -> None:
         """Show a line, or renew the status."""
         if isinstance(item, str):
             self._console.print(item, markup=False, soft_wrap=True)
         elif self._live is not None:
-            self._live.update(Text(item.text, no_wrap=True, overflow="ellipsis"), refresh=True)
+            self._live.update(item, refresh=True)
 
     def close(self) -> None:
         """Remove the status line."""
@@ -73,28 +66,16 @@ class _Terminal:
             self._live.stop()
 
 
-class _OnScreen(logging.Handler):
-    """Hands formatted lines to the terminal's outlet, so that logging never waits."""
+class _Behind(logging.Handler):
+    """Hands formatted lines, or whole records, to an outlet, so that logging never waits."""
 
-    def __init__(self, outlet: Outlet[str | StatusLine]) -> None:
+    def __init__(self, outlet: Outlet[Any], *, line: logging.Formatter | None = None) -> None:
         super().__init__()
-        self._outlet = outlet
+        self._outlet, self._line = outlet, line
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand over one line."""
-        self._outlet.send(self.format(record))
-
-
-class _InFile(logging.handlers.QueueHandler):
-    """Hands records to the outlet of the log file."""
-
-    def __init__(self, outlet: Outlet[logging.LogRecord]) -> None:
-        super().__init__(outlet)  # type: ignore[arg-type]  # of a queue it uses `enqueue` alone
-        self._outlet = outlet
-
-    def enqueue(self, record: logging.LogRecord) -> None:
-        """Hand over one record."""
-        self._outlet.send(record)
+        """Hand over one line or record."""
+        self._outlet.send(record if self._line is None else self._line.format(record))
 
 
 class _Rotating(logging.handlers.RotatingFileHandler):
@@ -135,10 +116,8 @@ class SessionLog:
         self._logger = logging.getLogger("railfix.live")
         self._logger.setLevel(logging.INFO)
         self._logger.propagate = False
-        self._screen: Outlet[str | StatusLine] = Outlet("log", self._terminal.show, waiting=_WAITING)
-        shown = _OnScreen(self._screen)
-        shown.setFormatter(logging.Formatter("railfix live: %(message)s"))
-        self._handlers: list[logging.Handler] = [shown]
+        self._screen: Outlet[str | Text] = Outlet("log", self._terminal.show, waiting=_WAITING)
+        self._handlers = [_Behind(self._screen, line=logging.Formatter("railfix live: %(message)s"))]
         self._file: _Rotating | None = None
         self._written: Outlet[logging.LogRecord] | None = None
         if path is not None:
@@ -151,7 +130,7 @@ class SessionLog:
                 raise OutputError(f"{path}: cannot be opened as a log file ({error.strerror or error})") from None
             self._file.setFormatter(logging.Formatter("%(asctime)s.%(msecs)03d %(message)s", "%Y-%m-%dT%H:%M:%S"))
             self._written = Outlet("log file", self._file.emit, waiting=_WAITING)
-            self._handlers.append(_InFile(self._written))
+            self._handlers.append(_Behind(self._written))
         for handler in self._handlers:
             self._logger.addHandler(handler)
 
@@ -162,7 +141,7 @@ class SessionLog:
     def show(self, status: str) -> None:
         """Renew the status line; nothing where the terminal has none."""
         if self.shows_status:
-            self._screen.send(StatusLine(status))
+            self._screen.send(Text(status, no_wrap=True, overflow="ellipsis"))
 
     def close(self) -> None:
         """Write what is left; lines that the file lacks are told on the screen."""

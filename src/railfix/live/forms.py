@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -21,6 +21,7 @@ from railfix.io.train_message import MessageStatus, TrainMessage, encode, etcs_r
 from railfix.live.engine import LiveOutput
 from railfix.live.message import antenna_of
 from railfix.live.settings import LiveSettings
+from railfix.pipeline.results import Result
 from railfix.pipeline.tables import passing_table, positions_table, train_table
 
 Form = Callable[[LiveOutput], bytes]
@@ -102,22 +103,26 @@ def etcs_form(settings: LiveSettings) -> Form:
     return etcs_bytes
 
 
-def positions_rows(output: LiveOutput) -> bytes:
-    """Rows of ``positions.parquet``, a line of JSON an antenna; nothing without input."""
-    return b"" if output.result is None else _json_rows(positions_table(output.result))
+#: Tables of results, each None where an epoch has no rows of it.
+TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
+    "positions": positions_table,
+    "train": lambda result: train_table(result) if result.fusion else None,
+    "passings": lambda result: passing_table(result) if any(own.passings for own in result.fusion.values()) else None,
+}
 
 
-def train_rows(output: LiveOutput) -> bytes:
-    """Rows of ``train.parquet``, a line of JSON an antenna; nothing without input or filter."""
-    return b"" if output.result is None or not output.result.fusion else _json_rows(train_table(output.result))
+def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
+    """Rows of a table, a line of JSON each; nothing without input or rows."""
+
+    def rows_bytes(output: LiveOutput) -> bytes:
+        table = None if output.result is None else table_of(output.result)
+        return b"" if table is None else _json_rows(table)
+
+    return rows_bytes
 
 
-def passing_rows(output: LiveOutput) -> bytes:
-    """Rows of ``passings.parquet``: balises and virtual ones whose passing has ended, and wrong readings."""
-    result = output.result
-    if result is None or not any(own.passings for own in result.fusion.values()):
-        return b""
-    return _json_rows(passing_table(result))
+#: Forms that are rows of `TABLES`.
+ROW_FORMS: Final = {name: _rows_form(table_of) for name, table_of in TABLES.items()}
 
 
 def _json_rows(table: pl.DataFrame) -> bytes:
@@ -141,9 +146,7 @@ def forms(settings: LiveSettings) -> dict[str, Form]:
         "nmea": nmea_bytes,
         "tpv": tpv_bytes,
         "etcs": etcs_form(settings),
-        "positions": positions_rows,
-        "train": train_rows,
-        "passings": passing_rows,
+        **ROW_FORMS,
     }
 
 
@@ -183,7 +186,7 @@ def _sentence(body: str) -> bytes:
 
 def wants(form: Form, output: LiveOutput) -> bool:
     """Whether a form takes an output: rows of tables those with rows, all others those with a message."""
-    return output.part != ("message" if form in (positions_rows, train_rows, passing_rows) else "rows")
+    return output.part != ("message" if form in ROW_FORMS.values() else "rows")
 
 
 def whole_message(form: Form, output: LiveOutput) -> bytes:

@@ -24,6 +24,7 @@ from railfix.core.errors import OutputError, SettingsError
 from railfix.live.engine import LiveOutput
 from railfix.live.forms import Form, forms, wants, whole_message
 from railfix.live.settings import LiveSettings
+from railfix.live.sources import hidden
 
 Item = TypeVar("Item")
 
@@ -104,21 +105,10 @@ _HELP: Final = (
 class Sink(Protocol):
     """Something that takes outputs, never waits, and counts what its reader has missed."""
 
-    @property
-    def name(self) -> str:
-        """Name for counts and messages."""
-
-    @property
-    def dropped(self) -> int:
-        """Messages that the reader was too slow for."""
-
-    @property
-    def failed(self) -> int:
-        """Messages that the target refused."""
-
-    @property
-    def failure(self) -> str:
-        """Why the last message was refused; blank where it was not."""
+    name: str  #: For counts and messages.
+    dropped: int  #: Messages that the reader was too slow for.
+    failed: int  #: Messages that the target refused.
+    failure: str  #: Why the last message was refused; blank where it was not.
 
     def send(self, item: LiveOutput, /) -> None:
         """Take one output."""
@@ -317,8 +307,7 @@ async def open_sink(
     form = forms(settings).get(name)
     if not at or form is None or not target:
         raise SettingsError(f"--send {text!r}: {_HELP}")
-    parts = urlsplit(target)
-    shown = text if parts.password is None else text.replace(f":{parts.password}@", ":***@", 1)
+    parts, shown = urlsplit(target), f"{name}@{hidden(target)}"
     opened: Any
     if target == "-":
         opened = ByteTarget(form, standard_output())

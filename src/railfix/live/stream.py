@@ -28,16 +28,8 @@ from railfix.io.receiver.measurements import Tracking, observations_of
 from railfix.io.rinex import scan_observations
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Connected, Lost, Place, is_file, read_source
-from railfix.motion.samples import (
-    BaliseReadings,
-    GroundUnits,
-    InertialSamples,
-    RadarSpeeds,
-    SensorSamples,
-    StationRanges,
-    TachometerPulses,
-)
-from railfix.run.sensors import COLUMNS
+from railfix.motion.samples import GroundUnits, SensorSamples
+from railfix.run.sensors import COLUMNS, samples_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,19 +266,11 @@ class SensorLines:
     def _samples(self, times: list[np.datetime64], rows: list[Mapping[str, float | str]]) -> SensorSamples:
         if not rows:
             return SensorSamples()
-        columns: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        time = np.array(times, dtype="datetime64[ns]")
-        if self.sensor == "tachometer":
-            whole = {name: np.nan_to_num(values).astype(np.int64) for name, values in columns.items()}
-            return SensorSamples(tachometer=TachometerPulses(time=time, **whole))
-        if self.sensor == "radar":
-            return SensorSamples(radar=RadarSpeeds(time=time, **columns))
-        if self.sensor == "balises":
-            return SensorSamples(balises=BaliseReadings(time=time, **columns))
-        if self.sensor == "ranging":
-            return SensorSamples(ranging=StationRanges(time=time, station=columns.pop("unit"), **columns))
-        six = np.stack([columns[name] for name in COLUMNS["inertial"]], axis=1)
-        return SensorSamples(inertial=InertialSamples(time=time, force_mps2=six[:, :3], rate_radps=six[:, 3:]))
+        columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        samples: dict[str, Any] = {
+            self.sensor: samples_of(self.sensor, np.array(times, dtype="datetime64[ns]"), columns)
+        }
+        return SensorSamples(**samples)
 
 
 #: Largest drift of the computer's clock against the receivers' time; the shortest delay is forgotten at this rate.

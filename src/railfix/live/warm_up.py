@@ -98,7 +98,6 @@ def _run(settings: _Settings) -> None:
 
 
 def _process(settings: _Settings) -> None:
-    """Process epochs with each of the settings."""
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)

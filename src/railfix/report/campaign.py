@@ -184,7 +184,6 @@ def _charts(done: pl.DataFrame, pieces: pl.DataFrame, quantity: str) -> list[Cha
 
 
 def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[str]:
-    """At most five sentences on a campaign."""
     failed = len(whole) - len(done)
     lines = [
         f"{len(done):,} of {plural(whole, 'run')} done, {int(done['epochs'].sum() or 0):,} epochs of their antennas"

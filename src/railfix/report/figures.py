@@ -61,7 +61,6 @@ def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
 
 
 def _assumptions(run: ReportedRun, kind: str) -> Table:
-    """Assumptions of the levels of a run."""
     stated: Mapping[str, Any] = run.record.get("protection") or {}
     model = run.config.error_model
     sigmas = f"error model {model}" if model is not None else str(stated.get("sigmas", "not recorded"))

@@ -211,7 +211,6 @@ def _larger_error(compared: _Compared) -> list[str]:
 
 
 def _describe_marked(compared: _Compared) -> list[str]:
-    """A sentence on the positions that failed a check."""
     if not len(compared.marked_m):
         return []
     statuses = ", ".join(status.replace("_", " ") for status in compared.statuses)

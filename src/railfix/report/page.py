@@ -243,7 +243,6 @@ def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list
 
 
 def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers: Iterator[int]) -> PagePart:
-    """Range of the errors of all runs."""
     if evaluation is None:
         return PagePart(title="", figures=())
     series = {

@@ -203,7 +203,6 @@ def position_run(run: CampaignRun) -> dict[str, Any]:
 
 
 def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
-    """Return the row of a run."""
     absent = dict.fromkeys(("error", "epochs", "positioning_rate", "ok_rate", "wall_s"))
     reference = None if run.reference is None else str(run.reference)
     return {**run.fields, "status": "done", **absent, **values, "reference": reference}

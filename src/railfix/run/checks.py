@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Final, Literal
 
@@ -29,6 +30,7 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import read_vehicle
 
+_SECOND: Final = np.timedelta64(1, "s")
 #: Conventional positions that must all be so far before a run is stopped early.
 ENOUGH_TO_STOP: Final = 10
 #: Navigation records further from the log than this are of another day.
@@ -37,7 +39,11 @@ ANOTHER_DAY: Final = np.timedelta64(24, "h")
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
 
-def navigation_span(navigation: Navigation) -> tuple[np.datetime64, np.datetime64] | None:
+#: First and last time of something.
+Span = tuple[np.datetime64, np.datetime64]
+
+
+def navigation_span(navigation: Navigation) -> Span | None:
     """Reference times of the first and the last record; None where there is none."""
     times = [navigation.kepler.toe, navigation.glonass.toe]
     if navigation.precise is not None:
@@ -47,21 +53,31 @@ def navigation_span(navigation: Navigation) -> tuple[np.datetime64, np.datetime6
     return (known.min(), known.max()) if len(known) else None
 
 
+def _spans(tally: Tally) -> dict[str, Span]:
+    """First and last epoch of the log of each antenna."""
+    return {n: (a.first, a.last) for n, a in tally.antennas.items() if a.first is not None and a.last is not None}
+
+
+def _apart(one: Span, other: Span, *, reach: np.timedelta64 = _SECOND * 0) -> bool:
+    """Whether two spans have no time in common, each reaching further at both ends; False for NaT."""
+    return bool(one[0] - reach > other[1] or one[1] + reach < other[0])
+
+
 def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta64 = ANOTHER_DAY) -> None:
     """Raise MismatchError where no pseudorange was used and the log lies further than `reach` from every record."""
     if any(antenna.used for antenna in tally.antennas.values()):
         return
     span = navigation_span(navigation)
-    for name, antenna in tally.antennas.items():
-        if antenna.first is None or antenna.last is None or not antenna.unrecorded:
+    for name, of_log in _spans(tally).items():
+        if not tally.antennas[name].unrecorded:
             continue
         if span is None:
             files = ", ".join(navigation.sources) or "the navigation files"
             raise MismatchError(f"{files}: no record of any satellite of the {name} log; give its navigation file")
-        if antenna.first - reach > span[1] or antenna.last + reach < span[0]:
+        if _apart(of_log, span, reach=reach):
             raise MismatchError(
                 f"{', '.join(navigation.sources)}: navigation records of {_period(*span)} do not reach the {name} "
-                f"log of {_period(antenna.first, antenna.last)} (GPS time); give the navigation file of that day"
+                f"log of {_period(*of_log)} (GPS time); give the navigation file of that day"
             )
 
 
@@ -88,38 +104,33 @@ def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -
 
 def check_same_time(tally: Tally) -> None:
     """Raise MismatchError where the logs of two antennas have no time in common."""
-    spans = {n: (a.first, a.last) for n, a in tally.antennas.items() if a.first is not None and a.last is not None}
-    if len(spans) < 2:
-        return
-    latest_start = max(first for first, _ in spans.values())
-    earliest_end = min(last for _, last in spans.values())
-    if latest_start > earliest_end:
+    spans = _spans(tally)
+    if any(_apart(one, other) for one, other in combinations(spans.values(), 2)):
         spans_text = " and ".join(f"the {n} log covers {_period(*span)}" for n, span in spans.items())
         raise MismatchError(f"{spans_text} (GPS time), expected logs of one run; give logs that overlap")
 
 
 def check_sbas_time(sbas: SbasCorrections | DfmcService | None, tally: Tally) -> None:
     """Raise MismatchError where not one message of the SBAS was received during a log."""
-    for name, antenna in tally.antennas.items():
-        if sbas is None or antenna.first is None or antenna.last is None:
-            continue
-        first, last = sbas.span
-        if antenna.first > last or antenna.last < first:
+    for name, span in _spans(tally).items():
+        if sbas is not None and _apart(span, sbas.span):
             raise MismatchError(
-                f"the SBAS messages of {_period(first, last)} and the {name} log of "
-                f"{_period(antenna.first, antenna.last)} (GPS time) have no time in common; give those of that day"
+                f"the SBAS messages of {_period(*sbas.span)} and the {name} log of {_period(*span)} (GPS time) have no "
+                "time in common; give those of that day"
             )
 
 
 def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
     """Raise MismatchError where a sensor has not one sample during the logs."""
-    spans = [(a.first, a.last) for a in tally.antennas.values() if a.first is not None and a.last is not None]
+    spans = list(_spans(tally).values())
     for name, samples in sensors.tables.items():
-        time = samples.time
-        if len(time) and spans and not any(first <= time[-1] and time[0] <= last for first, last in spans):
+        if not (spans and len(samples)):
+            continue
+        of_sensor = samples.time[0], samples.time[-1]
+        if all(_apart(span, of_sensor) for span in spans):
             raise MismatchError(
-                f"the samples of --{name} of {_period(time[0], time[-1])} and the logs of "
-                f"{_period(*spans[0])} (GPS time) have no time in common; give those of that day"
+                f"the samples of --{name} of {_period(*of_sensor)} and the logs of {_period(*spans[0])} (GPS time) "
+                "have no time in common; give those of that day"
             )
 
 
@@ -132,7 +143,7 @@ def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajector
             "position (--base-place), or another station"
         )
     first, last = base.span
-    spans = [(a.first, a.last) for a in tally.antennas.values() if a.first is not None and a.last is not None]
+    spans = list(_spans(tally).values())
     if spans and not any(start - last <= timedelta(np.array(LONGEST_AGE_S)) and first <= end for start, end in spans):
         raise MismatchError(
             f"the log of the base station of {_period(first, last)} and the logs of {_period(*spans[0])} (GPS time) "
@@ -188,8 +199,6 @@ def _period(first: np.datetime64, last: np.datetime64) -> str:
 
 
 Kind = Literal["observations", "navigation", "track", "vehicle", "settings", "positions", "unknown"]
-_KINDS: Final[tuple[Kind, ...]] = ("observations", "navigation", "positions", "track", "vehicle", "settings")
-_SECOND: Final = np.timedelta64(1, "s")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +208,7 @@ class FileFinding:
     path: Path
     kind: Kind
     facts: tuple[str, ...]
-    span: tuple[np.datetime64, np.datetime64] | None = None
+    span: Span | None = None
     place_ecef_m: Floats | None = None
 
 
@@ -231,11 +240,11 @@ def examine_files(paths: Sequence[Path]) -> Diagnosis:
 def _examine(path: Path) -> FileFinding:
     """Return what a file is; one that is of no kind has the error of each in its facts."""
     errors: list[str] = []
-    for kind in _KINDS:
+    for kind, read in _READERS.items():
         if (path.suffix.lower() == ".toml") != (kind in ("vehicle", "settings")):
             continue
         try:
-            return _READERS[kind](path)
+            return read(path)
         except RailfixError as error:
             errors.append(f"no {kind}: {error}")
     return FileFinding(path=path, kind="unknown", facts=tuple(errors))
@@ -324,11 +333,12 @@ def _settings(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="settings", facts=(f"changed: {', '.join(changed) or 'nothing'}",))
 
 
+#: What reads each kind of file, in the order in which a file is tried.
 _READERS: Final = {
     "observations": _observations,
     "navigation": _navigation,
-    "track": _track,
     "positions": _positions,
+    "track": _track,
     "vehicle": _vehicle,
     "settings": _settings,
 }
@@ -360,9 +370,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
     for log in logs:
         assert log.span is not None
         spans = [finding.span for finding in navigation if finding.span is not None]
-        if spans and all(
-            log.span[1] < first - RECORD_REACH or log.span[0] > last + RECORD_REACH for first, last in spans
-        ):
+        if spans and all(_apart(log.span, span, reach=RECORD_REACH) for span in spans):
             problems.append(
                 f"{log.path}: no ephemeris reaches its time; give the navigation file of {str(log.span[0])[:10]}"
             )
@@ -377,7 +385,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
         one, two = (log.span for log in logs)
         assert one is not None
         assert two is not None
-        if max(one[0], two[0]) > min(one[1], two[1]):
+        if _apart(one, two):
             problems.append(f"{logs[0].path} and {logs[1].path}: have no time in common")
     return problems
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -89,8 +90,7 @@ def _scan(logs: tuple[Path, ...], date: np.datetime64 | None) -> tuple[Observati
         for name, signal in zip(piece.satellite.tolist(), piece.signal.tolist(), strict=True):
             signals.setdefault(name[0], set()).add(signal)
     joined = {system: tuple(sorted(codes)) for system, codes in sorted(signals.items())}
-    values = {name: getattr(header, name) for name in ObservationHeader.__dataclass_fields__}
-    return ObservationHeader(**{**values, "signals": joined, "glonass_channel": channels}), epochs, skipped
+    return replace(header, signals=joined, glonass_channel=channels), epochs, skipped
 
 
 _RULE: Final = "\n" + "=" * 80 + "\n"

@@ -9,21 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
-from railfix.core.arrays import Floats, Strings
+from railfix.core.arrays import Datetimes, Strings
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.tables import reading_table
 from railfix.io.mate import mate_table
-from railfix.motion.samples import (
-    BaliseReadings,
-    GroundUnits,
-    InertialSamples,
-    ListedBalises,
-    RadarSpeeds,
-    SensorSamples,
-    StationRanges,
-    TachometerPulses,
-)
+from railfix.motion.samples import GroundUnits, ListedBalises, Samples, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.run.convert import sensor_table
 from railfix.track import Track
@@ -44,6 +36,8 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
+#: Class of the samples of each sensor.
+_CLASSES: Final = {name: type(samples) for name, samples in SensorSamples().tables.items()}
 #: Sensors that may have nothing to say for a while, and say so by rows with the time alone.
 _SILENT: Final = ("tachometer", "ranging", "balises")
 #: Tables without a time, and columns of names.
@@ -63,41 +57,29 @@ def read_sensors(
 
     InputFileError: a file is no such table, or its times fall.
     """
-    values: dict[str, Any] = {}
-    if tachometer is not None:
-        table = _table(tachometer, "tachometer")
-        direction = table["direction"] if "direction" in table.columns else pl.Series([0]).new_from_index(0, len(table))
-        values["tachometer"] = TachometerPulses(
-            time=_times(table),
-            pulse=table["pulse"].to_numpy(),
-            direction=direction.cast(pl.Int64).fill_null(0).to_numpy(),
-        )
-    if inertial is not None:
-        table = _table(inertial, "inertial")
-        columns = COLUMNS["inertial"]
-        values["inertial"] = InertialSamples(
-            time=_times(table),
-            force_mps2=table.select(columns[:3]).cast(pl.Float64).to_numpy(),
-            rate_radps=table.select(columns[3:]).cast(pl.Float64).to_numpy(),
-        )
-    if radar is not None:
-        table = _table(radar, "radar")
-        speed = table["speed_mps"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
-        values["radar"] = RadarSpeeds(time=_times(table), speed_mps=speed)
-    if ranging is not None:
-        table = _table(ranging, "ranging")
-        values["ranging"] = StationRanges(
-            time=_times(table),
-            station=table["unit"].cast(pl.String).to_numpy().astype(np.str_),
-            range_m=table["range_m"].cast(pl.Float64).fill_null(float("nan")).to_numpy(),
-            sigma_m=_sigmas(table, float("nan")),
-        )
-    if balises is not None:
-        table = _table(balises, "balises")
-        values["balises"] = BaliseReadings(
-            time=_times(table), balise=_names(balises, table, "balise"), sigma_m=_sigmas(table, float("nan"))
-        )
-    return SensorSamples(**values)
+    paths = {
+        "tachometer": tachometer, "inertial": inertial, "radar": radar, "ranging": ranging, "balises": balises
+    }  # fmt: skip
+    samples: dict[str, Any] = {}
+    for sensor, path in paths.items():
+        if path is not None:
+            table = _table(path, sensor)
+            columns = {name: _column(path, table, name) for name in _names_of_columns(sensor)}
+            samples[sensor] = samples_of(sensor, _times(table), columns)
+    return SensorSamples(**samples)
+
+
+def samples_of(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Samples:
+    """Return samples from all columns of the table of a sensor but the time; NaN where a number is absent."""
+    values = dict(columns)
+    if sensor == "tachometer":
+        values = {name: np.nan_to_num(column).astype(np.int64) for name, column in columns.items()}
+    elif sensor == "inertial":
+        six = np.stack([columns[name] for name in COLUMNS["inertial"]], axis=1)
+        values = {"force_mps2": six[:, :3], "rate_radps": six[:, 3:]}
+    elif sensor == "ranging":
+        values["station"] = values.pop("unit")
+    return _CLASSES[sensor](time=time, **values)
 
 
 def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
@@ -155,10 +137,11 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
         raise InputFileError(
             path, f"lists no balise on the line (0 to {track.chainage_m[-1]:.0f} m); give chainages of this line"
         )
+    sigma = table.get_column("sigma_m", default=pl.zeros(len(table), eager=True))
     return ListedBalises(
         name=names[inside],
         chainage_m=chainage[inside],
-        sigma_m=_sigmas(table, 0.0)[inside],
+        sigma_m=sigma.fill_null(0.0).to_numpy()[inside],
         virtual=np.full(int(inside.sum()), virtual),
     )
 
@@ -206,8 +189,24 @@ def check_filter(config: Config, options: Iterable[str]) -> None:
             raise SettingsError(f"--{name} needs the filter along the track; leave out --filter off")
 
 
-def _times(table: pl.DataFrame) -> np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]:
+def _times(table: pl.DataFrame) -> Datetimes:
     return table["time_gpst"].to_numpy().astype("datetime64[ns]")
+
+
+def _names_of_columns(kind: str) -> list[str]:
+    """Names of the columns of a table, those that may be absent among them."""
+    return [column.strip("[]") for column in COLUMNS[kind]]
+
+
+def _column(path: Path, table: pl.DataFrame, name: str) -> NDArray[Any]:
+    """A column of a table of a sensor; 0 in place of an empty whole number, NaN of another or of an absent column."""
+    if name not in table.columns:
+        return np.full(len(table), np.nan)
+    if name == "balise":
+        return _names(path, table, name)
+    if name == "unit":
+        return table[name].cast(pl.String).to_numpy().astype(np.str_)
+    return table[name].fill_null(0 if table[name].dtype.is_integer() else np.nan).to_numpy()
 
 
 def _names(path: Path, table: pl.DataFrame, name: str) -> Strings:
@@ -215,13 +214,6 @@ def _names(path: Path, table: pl.DataFrame, name: str) -> Strings:
     if (empty := table[name].is_null()).any():
         raise InputFileError(path, f"row {int(empty.arg_max() or 0) + 2}: {name} is empty; name it")
     return table[name].cast(pl.String).to_numpy().astype(np.str_)
-
-
-def _sigmas(table: pl.DataFrame, absent: float) -> Floats:
-    """Standard deviations of rows, where they are given."""
-    if "sigma_m" not in table.columns:
-        return np.full(len(table), absent)
-    return table["sigma_m"].cast(pl.Float64).fill_null(absent).to_numpy()
 
 
 def _table(path: Path, kind: str) -> pl.DataFrame:
@@ -243,7 +235,7 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
 
 def _columns_of(table: pl.DataFrame, kind: str) -> pl.Expr:
     """Those that the table has beside the time."""
-    return pl.col([name for column in COLUMNS[kind] if (name := column.strip("[]")) in table.columns])
+    return pl.col([name for name in _names_of_columns(kind) if name in table.columns])
 
 
 def _columns(path: Path, kind: str) -> pl.DataFrame:
@@ -269,7 +261,7 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
     empty = table.select(pl.all_horizontal(_columns_of(table, kind).is_null())).to_series()
     return table.with_columns(
         _numbers(path, table[name], may_be_empty=empty if name == "pulse" else pl.Series([name != "chainage_m"]))
-        for name in (column.strip("[]") for column in COLUMNS[kind])
+        for name in _names_of_columns(kind)
         if name not in _NAMES and name in table.columns
     )
 

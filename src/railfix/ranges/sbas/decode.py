@@ -233,10 +233,10 @@ def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
     }
 
 
-def _join(parts: Sequence[Decoded], slot: str = "slot") -> Decoded:
+def _join(parts: Sequence[Decoded]) -> Decoded:
     """Rows of several decoders in the order of the messages, without those of empty slots."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    kept = np.flatnonzero((joined[slot] >= 0) & (joined[slot] < SLOTS)) if slot else np.arange(len(joined["row"]))
+    kept = np.flatnonzero((joined["slot"] >= 0) & (joined["slot"] < SLOTS))
     order = kept[np.argsort(joined["row"][kept], kind="stable")]
     return {name: values[order] for name, values in joined.items()}
 

@@ -284,8 +284,7 @@ class DfmcService:
                     [(change == 1) & (rank < 7), change == 2, change == 3], [given, _ONE_MORE, DO_NOT_USE], -1
                 )
             else:
-                table[:, :FIRST] = fields["dfrei"] if kind == 35 else -1
-                table[:, FIRST:] = fields["dfrei"] if kind == 36 else -1
+                table[:, slice(FIRST) if kind == 35 else slice(FIRST, None)] = fields["dfrei"]
             times.append(self._time[kind])
             issues.append(fields["iodm"])
             values.append(table)

@@ -117,25 +117,24 @@ def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMes
     if end is None:
         raise InputFileError(path, "the header has no END OF HEADER; the file is cut, give the whole one")
     rest = [(i, text) for i, text in enumerate(lines[end + 1 :], start=end + 2) if text.strip()]
-    at = 0
+    at, broken = 0, False  # after a broken record or line all is passed over up to the next head
     while at < len(rest):
         number, text = rest[at]
         at += 1
         fields = _RINEX_HEAD.fullmatch(text.strip())
         if fields is None:
-            yield InputFileError(path, f"{text.strip()[:40]!r} is no 'prn yy mm dd hh mm ss'", line=number)
-            while at < len(rest) and _RINEX_HEAD.fullmatch(rest[at][1].strip()) is None:
-                at += 1
+            if not broken:
+                yield InputFileError(path, f"{text.strip()[:40]!r} is no 'prn yy mm dd hh mm ss'", line=number)
+            broken = True
             continue
         prn, date, second, sent_on, length = fields.groups()
         count = int(length or 32)
         body = rest[at : at + -(-count // _RINEX_BYTES)]
         digits = "".join("".join(row[7:].split()) for _, row in body)[: 2 * count]
         head = body[0][1][:7].strip() if body else ""
-        if len(digits) != 2 * count or not re.fullmatch(r"[0-9A-Fa-f]+", digits) or not re.fullmatch(r"\d*", head):
+        broken = len(digits) != 2 * count or not (re.fullmatch(r"[0-9A-Fa-f]+", digits) and re.fullmatch(r"\d*", head))
+        if broken:
             yield InputFileError(path, f"the record has no {count} bytes of two hexadecimal digits", line=number)
-            while at < len(rest) and _RINEX_HEAD.fullmatch(rest[at][1].strip()) is None:
-                at += 1
             continue
         at += len(body)
         if sent_on not in (None, band):

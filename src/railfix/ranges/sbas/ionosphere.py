@@ -124,21 +124,17 @@ class GridTables:
         columns = {name: decoded[name][kept].ravel() for name in ("delay_m", "givei")}
         return Series.of(point.ravel(), np.repeat(time, BLOCK), {**columns, "issue": np.repeat(issue, BLOCK)})
 
-    def _active(self, table: Series, row: Integers, time: Datetimes) -> Masks:
-        received = table.received(row)
-        in_time = seconds(time - received) <= self._mask_limit
-        return np.asarray((row >= 0) & in_time & (received > self._stops.last(time)))
-
     def mask_active(self, issue: Integers, time: Datetimes) -> Masks:
         """Whether the mask of a band and issue (4 band + IODI) is known and not timed out."""
-        return self._active(self._by_issue, self._by_issue.newest(issue, time), time)
+        row = self._by_issue.newest(issue, time)
+        return self._by_issue.in_force(row, time, self._stops.last(time), self._mask_limit)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
         """Whether points are in the newest mask of a band of theirs that has not timed out."""
-        inside = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool)
+        inside, stop = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool), self._stops.last(time)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)
-            inside |= self._by_cell["member"][row] & self._active(self._by_cell, row, time)
+            inside |= self._by_cell["member"][row] & self._by_cell.in_force(row, time, stop, self._mask_limit)
         return inside
 
 

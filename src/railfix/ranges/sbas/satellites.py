@@ -81,9 +81,8 @@ def _factors(
 ) -> tuple[Integers, Integers, Floats, Masks]:
     """Indicator of type 7, the largest of its message, latency; the worst where type 7 is missing."""
     table = tables.fast_degradation
-    row = table.newest(number, time)
-    received, worst = table.received(row), len(_ACCELERATION) - 1
-    active = (row >= 0) & (received > stop) & (seconds(time - received) <= limits.timeout_s("fast_degradation"))
+    row, worst = table.newest(number, time), len(_ACCELERATION) - 1
+    active = table.in_force(row, time, stop, limits.timeout_s("fast_degradation"))
     return (
         np.where(active, table["indicator"][row], worst),
         np.where(active, table["shortest"][row], worst),
@@ -197,8 +196,7 @@ def covariance_in_force(
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):
         return row, np.zeros(row.shape, dtype=bool)
-    received = table.received(row)
-    active = (row >= 0) & (seconds(time[:, None] - received) <= limit) & (received > stop)
+    active = table.in_force(row, time[:, None], stop, limit)
     last = np.searchsorted(sent_at, time, side="right") - 1
     newest = sent_at[np.maximum(last, 0)]
     sent = (last >= 0) & (seconds(time - newest) <= limit) & (newest > stop[:, 0])
@@ -222,8 +220,7 @@ def degradation_row(
 ) -> tuple[Integers, Masks]:
     """Newest message of type 10 at epochs, and where it is in force."""
     row = tables.degradation.newest(0, time)
-    received = tables.degradation.received(row)
-    return row, (row >= 0) & (received > stop) & (seconds(time - received) <= limits.timeout_s("degradation"))
+    return row, tables.degradation.in_force(row, time, stop, limits.timeout_s("degradation"))
 
 
 def growth(

@@ -87,6 +87,11 @@ class Series:
         """Reception of rows; long ago for -1."""
         return np.where(row >= 0, self.time[row], LONG_AGO)
 
+    def in_force(self, row: Integers, time: Datetimes, stop: Datetimes, limit_s: float) -> Masks:
+        """Whether rows, -1 for none, came after a stop of the GEO and are not older than a limit at instants."""
+        received = self.received(row)
+        return np.asarray((row >= 0) & (received > stop) & (seconds(time - received) <= limit_s))
+
 
 class Stops:
     """When type 0 stopped the GEO."""
@@ -122,21 +127,19 @@ class MaskTable:
     def resolve(self, iodp: Integers, slot: Integers, time: Datetimes) -> Integers:
         """Mask number of slots of messages, 0 where the mask leaves the slot out, -1 without an active mask."""
         mask = self.by_issue.newest(iodp, time)
-        return np.where(self._active(self.by_issue, mask, time), self.by_issue["number"][mask, slot], -1)
+        return np.where(self._in_force(self.by_issue, mask, time), self.by_issue["number"][mask, slot], -1)
 
     def active(self, iodp: Integers, time: Datetimes) -> Masks:
         """Whether a mask of an issue is known and not timed out."""
-        return self._active(self.by_issue, self.by_issue.newest(iodp, time), time)
+        return self._in_force(self.by_issue, self.by_issue.newest(iodp, time), time)
 
-    def _active(self, table: Series, row: Integers, time: Datetimes) -> Masks:
-        received = table.received(row)
-        in_time = seconds(time - received) <= self._limit
-        return np.asarray((row >= 0) & in_time & (received > self._stops.last(time)))
+    def _in_force(self, table: Series, row: Integers, time: Datetimes) -> Masks:
+        return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
         """Whether there is an active mask (T,), and whether the newest names the satellites (T, K)."""
         row = self._by_time.newest(0, time)
-        known = self._active(self._by_time, row, time)
+        known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]
 
     def current(self, slot: Integers, time: Datetimes) -> Integers:

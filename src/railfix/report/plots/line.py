@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -69,9 +70,9 @@ def plan(
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
-    name, labels = "plan", ("east [m]", "north [m]")
+    chart = partial(Chart, name="plan", title=title, x_label="east [m]", y_label="north [m]", equal=True)
     if not has.any():
-        return Chart(name=name, title=title, caption="", x_label=labels[0], y_label=labels[1], layers=(), equal=True)
+        return chart(caption="", layers=())
     frame = LocalFrame.around(ecef[has])
     here, there = frame.plane(ecef), frame.plane(conventional)
     low, high = here[has].min(axis=0), here[has].max(axis=0)
@@ -101,15 +102,10 @@ def plan(
     thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
     far = f" {outside:,} conventional positions lie outside." if outside else ""
-    return Chart(
-        name=name,
-        title=title,
+    return chart(
         caption=f"Positions on the map, coloured by {coloured}; conventional positions in grey.{far} Origin at "
         f"latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}.{thinned}",
-        x_label=labels[0],
-        y_label=labels[1],
         layers=tuple(layers),
-        equal=True,
     )
 
 
@@ -144,9 +140,21 @@ class LocalFrame:
         axes = enu_axes(latitude, longitude)
         return cls(origin_ecef_m=origin, axes=axes, latitude_deg=latitude, longitude_deg=longitude, height_m=height)
 
+    @classmethod
+    def at(cls, latitude_deg: float, longitude_deg: float) -> LocalFrame:
+        """Frame at a place on the ellipsoid."""
+        origin, axes = ecef_from_geodetic(latitude_deg, longitude_deg, 0.0), enu_axes(latitude_deg, longitude_deg)
+        return cls(
+            origin_ecef_m=origin, axes=axes, latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=0.0
+        )
+
     def plane(self, ecef_m: Floats) -> Floats:
         """East and north of points, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
+
+    def plane_of(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
+        """East and north of points of the height of the origin, shape (P, 2) [m]."""
+        return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
 
 def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
@@ -154,7 +162,7 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
     parts: list[Floats] = []
     gap = np.full((1, 2), np.nan)
     for line in lines:
-        plane = frame.plane(ecef_from_geodetic(line[:, 1], line[:, 0], np.full(len(line), frame.height_m)))
+        plane = frame.plane_of(line[:, 1], line[:, 0])
         inside = np.asarray(((plane > low) & (plane < high)).all(axis=1))
         # neighbours outside stay, so that lines reach the edge
         kept = inside | np.append(inside[1:], False) | np.append(False, inside[:-1])

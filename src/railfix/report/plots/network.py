@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
-from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.core.arrays import Indices
 from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.draw import draw_figure, save_figure
 from railfix.report.plots.line import LocalFrame
@@ -50,31 +49,32 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
     latitude, longitude = (
         np.concatenate([getattr(t, name) for t in network.tracks]) for name in ("latitude_deg", "longitude_deg")
     )
-    at = (float(np.median(latitude)), float(np.median(longitude)))
+    frame = LocalFrame.at(float(np.median(latitude)), float(np.median(longitude)))
     nth = max(1, len(latitude) // _DRAWN)
     rows, breaks = _thin(network, nth)
-    layers: list[Layer] = [_line("tracks", BLUE, _local(at, latitude[rows], longitude[rows]), breaks)]
+    east, north = np.insert(frame.plane_of(latitude[rows], longitude[rows]), breaks, np.nan, axis=0).T
+    layers: list[Layer] = [Curve(label="tracks", colour=BLUE, x=east, y=north, width=1.2)]
     ends, _ = end_points(network)
-    axes = enu_axes(*at)[:2]
     stems = _switches(network)
     if len(stems):
-        east, north = ((ends[stems[:, 0], stems[:, 1]] - ecef_from_geodetic(*at, 0.0)) @ axes.T).T
+        east, north = frame.plane(ends[stems[:, 0], stems[:, 1]]).T
         layers.append(Points(label="switches", colour=GREEN, x=east, y=north, shape="square", size=4.0))
     for kind, colour in _KINDS.items():
         found = [f for f in quality.findings if f.kind == kind] if quality is not None else []
         if found:
-            place = _local(at, np.array([f.latitude_deg for f in found]), np.array([f.longitude_deg for f in found]))
-            layers.append(Points(label=kind, colour=colour, x=place[0], y=place[1], shape="cross", size=7.0))
+            degrees = np.array([(f.latitude_deg, f.longitude_deg) for f in found])
+            east, north = frame.plane_of(*degrees.T).T
+            layers.append(Points(label=kind, colour=colour, x=east, y=north, shape="cross", size=7.0))
     if run is not None:
-        layers += _positions(at, *run)
-    view = None if run is None else _view(at, run[0])
+        layers += _positions(frame, *run)
+    view = None if run is None else _view(frame, run[0])
     if run is not None and view is not None:
-        layers.append(_names_beside(network, at, run[1], view))
+        layers.append(_names_beside(network, frame, run[1], view))
     elif len(network.tracks) <= _NAMED:
         middle = (network.first_point[:-1] + network.first_point[1:]) // 2
-        east, north = _local(at, latitude[middle], longitude[middle])
+        east, north = frame.plane_of(latitude[middle], longitude[middle]).T
         layers.append(Marks(label="names", colour=BLACK, x=east, y=north, words=network.names, place="on"))
-    caption = f"Plan about {at[0]:.5f}, {at[1]:.5f}."
+    caption = f"Plan about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}."
     if nth > 1:
         caption += f" Every {nth}th point of a track and its ends are drawn."
     return Chart(
@@ -83,20 +83,20 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
     )  # fmt: skip
 
 
-def _view(at: tuple[float, float], log: PlanLog) -> tuple[tuple[float, float], tuple[float, float]] | None:
+def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Ranges east and north of the positions with a margin; None without positions."""
     known = np.isfinite(log.latitude_deg)
     if not known.any():
         return None
-    place = np.stack(_local(at, log.latitude_deg[known], log.longitude_deg[known]))
-    low, high = place.min(axis=1), place.max(axis=1)
+    place = frame.plane_of(log.latitude_deg[known], log.longitude_deg[known])
+    low, high = place.min(axis=0), place.max(axis=0)
     margin = max(_MARGIN * float((high - low).max()), _LEAST_VIEW_M)
     ranges = [(float(a - margin), float(b + margin)) for a, b in zip(low, high, strict=True)]
     return ranges[0], ranges[1]
 
 
 def _names_beside(
-    network: Network, at: tuple[float, float], matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
+    network: Network, frame: LocalFrame, matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
 ) -> Marks:
     """Names of the tracks that a run has passed, beside the middle of its positions there, on alternating sides."""
     passed = dict.fromkeys(matched.track[matched.track >= 0].tolist())
@@ -104,20 +104,12 @@ def _names_beside(
     rows = np.array([own[len(own) // 2] for own in places], dtype=np.intp)
     track = matched.track[rows]
     points, ahead, _ = network.course_on(track, matched.chainage_m[rows])
-    axes = enu_axes(*at)[:2]
-    (x, y), (dx, dy) = ((values @ axes.T).T for values in (points - ecef_from_geodetic(*at, 0.0), ahead))
+    (x, y), (dx, dy) = frame.plane(points).T, (ahead @ frame.axes[:2].T).T
     span = max(high - low for low, high in view)
     # words are wider than high: farther from a line that runs north
     away = np.where(np.arange(len(rows)) % 2, -1.0, 1.0) * span * (_BESIDE * np.abs(dx) + 2.0 * _BESIDE * np.abs(dy))
     words = tuple(network.names[t] for t in track)
     return Marks(label="names", colour=BLACK, x=x + away * dy, y=y - away * dx, words=words, place="on")
-
-
-def _local(at: tuple[float, float], latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
-    """East and north of a place on the ellipsoid [m]."""
-    plan = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg))) - ecef_from_geodetic(*at, 0.0)
-    east, north = (plan @ enu_axes(*at)[:2].T).T
-    return east, north
 
 
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
@@ -129,20 +121,15 @@ def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
     return kept, np.flatnonzero(np.diff(track[kept])) + 1
 
 
-def _line(label: str, colour: str, place: tuple[Floats, Floats], breaks: Indices) -> Curve:
-    east, north = (np.insert(values, breaks, np.nan) for values in place)
-    return Curve(label=label, colour=colour, x=east, y=north, width=1.2)
-
-
 def _switches(network: Network) -> Indices:
     """Track and end of each stem of a switch, shape (n, 2)."""
     stems = sorted(end for end, others in network.passages.items() if len(others) > 1)
     return np.array(stems, dtype=np.intp).reshape(-1, 2)
 
 
-def _positions(at: tuple[float, float], log: PlanLog, matched: Matched) -> list[Layer]:
+def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]:
     """Positions in classes of the probability of their track, and those on none."""
-    east, north = _local(at, log.latitude_deg, log.longitude_deg)
+    east, north = frame.plane_of(log.latitude_deg, log.longitude_deg).T
     on, layers, above = matched.track >= 0, [], np.inf
     for low, colour in _CLASSES:
         rows = on & (matched.probability >= low) & (matched.probability < above)
@@ -197,10 +184,9 @@ def _draw_plan(axes: Axes, quality: TrackQuality) -> None:
             axes.plot(
                 east[at], north[at], "x", color=_COLOURS[severity], markersize=7, label=f"{severity}s ({len(at)})"
             )
+    title = f"{track.name}: {len(track)} points, {track.chainage_m[-1]:,.0f} m"
+    axes.set(xlabel="east of the first point [m]", ylabel="north [m]", title=title)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("east of the first point [m]")
-    axes.set_ylabel("north [m]")
-    axes.set_title(f"{track.name}: {len(track)} points, {track.chainage_m[-1]:,.0f} m")
     axes.legend(loc="best", fontsize=8)
     axes.grid(visible=True, alpha=0.3)
 
@@ -295,9 +281,7 @@ def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, r
             above.plot(decision.seconds, shares[:, k], marker=".", label=name)
             below.semilogy(decision.seconds, np.maximum(1.0 - shares[:, k], 1e-12), marker=".", label=name)
     below.axhline(risk, color="black", linestyle="--", label="risk allowed")
-    above.set_ylabel("probability")
-    below.set_ylabel("probability of another track")
-    below.set_xlabel("time at rest [s]")
-    above.set_title(f"track: {decision.track}")
+    above.set(ylabel="probability", title=f"track: {decision.track}")
+    below.set(ylabel="probability of another track", xlabel="time at rest [s]")
     below.legend(loc="best", fontsize=7)
     save_figure(figure, path)
