@@ -10,10 +10,12 @@ import pytest
 
 from plain_kernels import plain
 from railfix.kernels.tracking import layout
+from railfix.kernels.tracking.prediction import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.filter import Recursion
 from railfix.tracking.handover import Handover
+from railfix.tracking.state import CLOCKS, OFFSETS, StateIndex
 from tracking_cases import Ride, bent_line, part, reflected, ride, without_epochs
 
 
@@ -273,3 +275,17 @@ def test_factors_in_whole_vectors_are_those_of_numpy(size: int) -> None:
     np.testing.assert_allclose(inverse[0, :size, :size], np.linalg.inv(matrix), rtol=1e-9, atol=1e-12)
     back = np.triu(factor[:size, :size]).T @ (pivots[0, :size, None] * solved[:, :5])
     np.testing.assert_allclose(back, right, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.requirement("E5")
+def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
+    """Clocks without a satellite and sensors that are not on board: their variances grow as those in use would."""
+    case, limits = ride(60), TrackingLimits()
+    _, before = track(part(case.epochs, slice(0, 30)), case.line)
+    _, after = track(part(case.epochs, slice(30, 60)), case.line, before)
+    growth = np.diagonal(after.covariance[0] - before.covariance[0])
+    walks = {
+        StateIndex.WHEEL: WHEEL_WALK, StateIndex.RADAR: RADAR_WALK, StateIndex.FORCE_OFFSET: FORCE_WALK_MPS2,
+    } | {OFFSETS + CLOCKS.index(letter): limits.offset_walk_m for letter in "CRI"}  # fmt: skip
+    for unknown, walk in walks.items():
+        assert growth[unknown] == pytest.approx(30.0 * walk**2, rel=1e-6)
