@@ -10,7 +10,7 @@ import pytest
 
 from plain_kernels import plain
 from railfix.kernels.tracking import layout
-from railfix.kernels.tracking.prediction import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
+from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.filter import Recursion
