@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from plain_kernels import plain
+from railfix.core.arrays import changed
 from railfix.kernels.tracking import layout
 from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
@@ -289,3 +290,20 @@ def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
     } | {OFFSETS + CLOCKS.index(letter): limits.offset_walk_m for letter in "CRI"}  # fmt: skip
     for unknown, walk in walks.items():
         assert growth[unknown] == pytest.approx(30.0 * walk**2, rel=1e-6)
+
+
+@pytest.mark.requirement("C6")
+def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
+    """Lengths along a map that was found to be wrong add as much variance to each of them as to the filter."""
+    case = ride(60)
+    _, state = track(part(case.epochs, slice(0, 50)), case.line, levels=True)
+    nothing = without_epochs(part(case.epochs, slice(50, 60)), np.ones(10, dtype=bool))
+    own, banks = [], []
+    for log_variance in (0.0, 5.0):
+        _, after = track(nothing, case.line, changed(state, map_log_variance=log_variance), levels=True)
+        assert after.bank is not None
+        assert len(after.bank.without) > 10
+        own.append(after.covariance[0, StateIndex.ARC, StateIndex.ARC])
+        banks.append(after.bank.covariance[:, StateIndex.ARC, StateIndex.ARC])
+    assert own[1] - own[0] > 0.5
+    np.testing.assert_allclose(banks[1] - banks[0], own[1] - own[0], rtol=0.02)
