@@ -197,6 +197,35 @@ def test_an_epoch_without_a_position_is_compared_with_nothing_whatever_the_chunk
 
 
 @pytest.mark.requirement("B8")
+@pytest.mark.parametrize("edges", [(0, 40), (0, 25, 40), (0, 24, 26, 40)])
+def test_nothing_is_compared_across_a_break(edges: tuple[int, ...]) -> None:
+    breaks = np.arange(40) == 25
+    inputs, state, found = scene(clock=200.0)._replace(break_before=breaks), MotionSignState(), []
+    for a, b in itertools.pairwise(edges):
+        part = (v if n in ("channel", "group") else v[a:b] for n, v in inputs._asdict().items())
+        signs, state = motion_signs(MotionInputs(*part), state, LIMITS)
+        found.append(signs.clock_jump_m)
+    jump = np.concatenate(found)
+    assert np.isnan(jump).tolist() == [k in (0, 25) for k in range(40)]
+    assert np.nanmax(np.abs(jump)) < 5.0
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize("cut", [40, 95])
+def test_a_satellite_that_was_away_for_long_is_compared_after_its_known_time(cut: int) -> None:
+    """Eight satellites, seven of them away for 70 s and 5 dB weaker then: no fall until they are known again."""
+    time, channel = times(130), np.array([f"G{k:02d}1C" for k in range(8)])
+    cn0 = np.full((130, 8), 45.0)
+    cn0[20:91, 1:], cn0[91:, :] = np.nan, 40.0
+    state, parts = PowerState(), []
+    for rows in (slice(0, cut), slice(cut, None)):
+        signs, state = power_signs(time[rows], channel, cn0[rows], np.full(len(time[rows]), np.nan), state, LIMITS)
+        parts.append(signs.fall_db)
+    known = round(LIMITS.known_after_s)
+    assert np.isfinite(np.concatenate(parts)).tolist() == [known <= k < 20 or k >= 91 + known for k in range(130)]
+
+
+@pytest.mark.requirement("B8")
 def test_the_clock_is_compared_channel_by_channel_when_their_order_changes() -> None:
     """The median of twelve, of which a chunk has ten in another order; two were not there at its last epoch."""
     inputs = scene(clock=200.0)
