@@ -192,7 +192,7 @@ def test_everything_that_positions_depend_on_is_in_the_hash(tmp_path: Path) -> N
     assert {name for name in first if first[name] != second[name]} == {"track 0", "settings", "antennas"}
 
 
-@pytest.mark.requirement("H2")
+@pytest.mark.requirement("A8")
 def test_a_receiver_that_comes_back_leaves_nothing_from_before() -> None:
     """Epochs that waited for their pair, and samples of sensors from before, are not used with the older tags."""
     files = demo_files()
