@@ -191,6 +191,9 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
         np.testing.assert_allclose(handed.memory.mean[row], (work.mean[h] + gain @ value)[:n], rtol=1e-6, atol=1e-6)
         after = (prior - gain @ design @ prior)[:n, :n]
         np.testing.assert_allclose(handed.memory.covariance[row], after, rtol=1e-5, atol=1e-6)
+        fitted = gain @ value, prior - gain @ design @ prior
+        np.testing.assert_allclose(work.residual[h, :30], value - design @ fitted[0], atol=1e-5)
+        np.testing.assert_allclose(work.fitted[h, :30], np.diagonal(design @ fitted[1] @ design.T), rtol=1e-4)
         density.append(-0.5 * (value @ np.linalg.solve(innovation, value) + np.linalg.slogdet(innovation)[1]))
     evidence = work.evidence[:2] + work.code_evidence[:2]
     assert abs(density[0] - density[1]) > 0.3
@@ -276,6 +279,13 @@ def test_factors_in_whole_vectors_are_those_of_numpy(size: int) -> None:
     np.testing.assert_allclose(inverse[0, :size, :size], np.linalg.inv(matrix), rtol=1e-9, atol=1e-12)
     back = np.triu(factor[:size, :size]).T @ (pivots[0, :size, None] * solved[:, :5])
     np.testing.assert_allclose(back, right, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 8])
+def test_the_median_of_a_part_of_a_row_is_that_of_numpy(size: int) -> None:
+    values = np.random.default_rng(size).normal(size=(3, 12))
+    found = plain("tracking.algebra").median(values, 1, 2, size, np.empty(12))
+    assert found == pytest.approx(np.median(values[1, 2 : 2 + size]), abs=1e-15)
 
 
 @pytest.mark.requirement("E5")
