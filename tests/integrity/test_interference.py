@@ -176,6 +176,79 @@ def test_statistics_of_motion_are_the_same_whatever_the_chunks() -> None:
 
 
 @pytest.mark.requirement("B8")
+def test_an_epoch_without_a_position_is_compared_with_nothing_whatever_the_chunks() -> None:
+    """Live epochs one by one, two of them with two satellites: those after are compared with the last good one."""
+    inputs = scene(jump=80.0)
+    used = inputs.used.copy()
+    used[[24, 31], 2:] = False
+    inputs = inputs._replace(used=used)
+    whole, _ = motion_signs(inputs, MotionSignState(), LIMITS)
+    assert np.isnan(whole.position_jump_m[[24, 31]]).all()
+    assert whole.position_jump_m[25] > 60.0
+    state, parts = MotionSignState(), []
+    for k in range(len(inputs.time)):
+        one = inputs._asdict().items()
+        part = MotionInputs(*(v if n in ("channel", "group") else v[k : k + 1] for n, v in one))
+        signs, state = motion_signs(part, state, LIMITS)
+        parts.append(signs)
+    for item in fields(whole):
+        cut = np.concatenate([getattr(part, item.name) for part in parts])
+        np.testing.assert_allclose(cut, getattr(whole, item.name), rtol=1e-9, atol=1e-6, err_msg=item.name)
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize("edges", [(0, 40), (0, 25, 40), (0, 24, 26, 40)])
+def test_nothing_is_compared_across_a_break(edges: tuple[int, ...]) -> None:
+    breaks = np.arange(40) == 25
+    inputs, state, found = scene(clock=200.0)._replace(break_before=breaks), MotionSignState(), []
+    for a, b in itertools.pairwise(edges):
+        part = (v if n in ("channel", "group") else v[a:b] for n, v in inputs._asdict().items())
+        signs, state = motion_signs(MotionInputs(*part), state, LIMITS)
+        found.append(signs.clock_jump_m)
+    jump = np.concatenate(found)
+    assert np.isnan(jump).tolist() == [k in (0, 25) for k in range(40)]
+    assert np.nanmax(np.abs(jump)) < 5.0
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize("cut", [40, 95])
+def test_a_satellite_that_was_away_for_long_is_compared_after_its_known_time(cut: int) -> None:
+    """Eight satellites, seven of them away for 70 s and 5 dB weaker then: no fall until they are known again."""
+    time, channel = times(130), np.array([f"G{k:02d}1C" for k in range(8)])
+    cn0 = np.full((130, 8), 45.0)
+    cn0[20:91, 1:], cn0[91:, :] = np.nan, 40.0
+    state, parts = PowerState(), []
+    for rows in (slice(0, cut), slice(cut, None)):
+        signs, state = power_signs(time[rows], channel, cn0[rows], np.full(len(time[rows]), np.nan), state, LIMITS)
+        parts.append(signs.fall_db)
+    known = round(LIMITS.known_after_s)
+    assert np.isfinite(np.concatenate(parts)).tolist() == [known <= k < 20 or k >= 91 + known for k in range(130)]
+
+
+@pytest.mark.requirement("B8")
+def test_the_clock_is_compared_channel_by_channel_when_their_order_changes() -> None:
+    """The median of twelve, of which a chunk has ten in another order; two were not there at its last epoch."""
+    inputs = scene(clock=200.0)
+    code = inputs.code_m.copy()
+    code[24, [2, 9]] = np.nan
+    inputs = inputs._replace(code_m=code)
+    order = np.array([9, 1, 7, 2, 4, 0, 11, 5, 3, 6])
+    turned = MotionInputs(*(
+        v[order] if n in ("channel", "group") else v[25:, order] if v.shape[1:2] == (12,) else v[25:]
+        for n, v in inputs._asdict().items()
+    ))  # fmt: skip
+    _, state = motion_signs(inputs._replace(**{
+        n: v[:25] for n, v in inputs._asdict().items() if n not in ("channel", "group")
+    }), MotionSignState(), LIMITS)  # fmt: skip
+    found, _ = motion_signs(turned, state, LIMITS)
+    seconds = np.where(np.isin(order, [2, 9]), 2, 1)
+    before = (inputs.code_m[25 - seconds, order], inputs.rate_mps[25 - seconds, order])
+    change = inputs.code_m[25, order] - before[0] - (inputs.rate_mps[25, order] + before[1]) / 2.0 * seconds
+    assert found.clock_jump_m[0] == pytest.approx(np.median(change), abs=1e-6)
+    assert abs(found.clock_jump_m[0]) > 190.0
+
+
+@pytest.mark.requirement("B8")
 def test_parted_constellations_are_those_of_two_fits_by_numpy() -> None:
     inputs = scene(parted=60.0)
     found, _ = motion_signs(inputs, MotionSignState(), LIMITS)

@@ -11,6 +11,7 @@ import pytest
 from scipy.stats import norm
 
 import integrity_tables
+import raim_oracle as oracle
 from integrity_recordings import ranges_of
 from plain_kernels import plain
 from railfix import kernels
@@ -202,3 +203,44 @@ def test_bounds_are_the_same_compiled(
         )
         assert 0.1 * len(one) < np.count_nonzero((one > 1e-12) & (one < 1e-2))
         np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-15)
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.parametrize("systems", ["GGGGGGG", "GGGGEEE"])
+def test_forms_are_those_of_least_squares_without_the_channels(systems: str) -> None:
+    """None, each channel, each pair and each side left out: generalised least squares with the map error as noise."""
+    arc, scale, sigma_m, n = np.array([731.0, 1420.0]), np.array([1.0, 2.5]), (0.7, 4.0), len(systems)
+    ranges = oracle.made(arc, systems, seed=6, noise=2.0)
+    model = constrained_model(ranges, oracle.LINE, arc)
+    likely, of_side = np.linspace(1e-5, 7e-5, n), 3e-6
+    sides = np.zeros((2, 3, n), dtype=bool)
+    sides[:, 0, [0, 2, 3]] = sides[:, 1, [1, 4]] = sides[:, 2, 5] = True
+    prior, form, lowest, depth, widest = kernels.off_tangent.forms_of_hypotheses(
+        model.arrays, scale, likely, sides, of_side, sigma_m
+    )
+    left_out = [(), *(pair[: 1 + (pair[1] >= 0)] for i in range(n) for pair in ((i, j) for j in range(-1, i)))]
+    left_out += [(0, 2, 3), (1, 4), (5,)]
+    expected = [2.0, *(float(np.prod(likely[list(out)])) for out in left_out[1:-3]), of_side, of_side, 0.0]
+    np.testing.assert_allclose(prior, [expected] * 2, rtol=1e-12)
+    clocks = np.array([[letter == other for other in dict.fromkeys(systems)] for letter in systems], dtype=float)
+    for t, place in enumerate(oracle.LINE.at_arc(arc)):
+        axes = oracle.LINE.axes_of(oracle.LINE.segment_at(arc[t : t + 1])[0])[0]
+        distance, sight = range_with_rotation(ranges.sat_ecef_m[t], place)
+        y, rows = ranges.code_m[t] - distance, -sight @ axes.T
+        errors = rows * [sigma_m[0], sigma_m[0], sigma_m[1]]
+        noise = scale[t] ** 2 * np.diag(1.0 / ranges.weight[t]) + errors @ errors.T
+        for k, out in enumerate(left_out[:-1]):
+            left = np.setdiff1d(np.arange(n), out)
+            inverse, own = np.linalg.inv(noise[np.ix_(left, left)]), clocks[left]
+            own = own[:, own.any(axis=0)]
+            inverse -= inverse @ own @ np.linalg.inv(own.T @ inverse @ own) @ own.T @ inverse
+            slope, matrix = rows[left].T @ inverse @ y[left], rows[left].T @ inverse @ rows[left]
+            found = np.concatenate([[y[left] @ inverse @ y[left]], slope, matrix[np.triu_indices(3)]])
+            np.testing.assert_allclose(form[t, k], found, rtol=1e-6, atol=1e-9, err_msg=str(out))
+            if np.linalg.matrix_rank(matrix, rtol=1e-9) < 3:
+                assert np.isnan(lowest[t, k])
+                continue
+            at = np.linalg.solve(matrix, slope)
+            assert lowest[t, k] == pytest.approx(np.linalg.norm(at), rel=1e-5)
+            assert depth[t, k] == pytest.approx(at @ slope, rel=1e-5)
+            assert widest[t, k] == pytest.approx(np.trace(np.linalg.inv(matrix)), rel=1e-5)

@@ -14,7 +14,7 @@ import raim_oracle as oracle
 from protection_oracle import Event, hypotheses, kind_of, products
 from railfix.core.errors import SettingsError
 from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
-from railfix.integrity.protection.risk import allocate, set_sums
+from railfix.integrity.protection.risk import FEW, allocate, set_sums
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -195,3 +195,34 @@ def test_more_hypotheses_are_asked_for_only_where_the_rest_is_too_likely() -> No
     shared = orders(constellation_prior={"E": 1e-5})
     assert shared[(0,), True] == 0, "a constellation and a wrong map"
     assert shared[(0, 1), False] == 0, "a constellation and a side"
+
+
+@pytest.mark.parametrize("length", [1, FEW, 24])
+def test_the_risk_of_an_epoch_is_divided_alike_alone_and_among_others(length: int) -> None:
+    """Epochs that differ in the satellites in use, in those excluded, or in the sides alone."""
+    systems, count = "GGGGEEEEC", 24
+    random = np.random.default_rng(4)
+    arc = np.full(count, 700.0)
+    ranges = oracle.made(arc, systems, seed=3)
+    weight = ranges.weight.copy()
+    weight[random.random(count) < 0.3, 1] = 0.0
+    _, model = oracle.solved(replace(ranges, weight=weight), arc)
+    out = random.integers(0, 3, count)
+    sides = np.zeros((count, 2, len(systems)), dtype=bool)
+    sides[:, 0, [0, 2]] = True
+    sides[random.random(count) < 0.5, 0, 4] = True
+    sides[random.random(count) < 0.5, 1, 5:8] = True
+    risk = RiskBudget(local_prior=3e-3, side_prior=1e-4)
+    names = "beyond fault_free one two more reserved k_false_alarm".split()
+    alone = []
+    for t in range(count):
+        # a budget of its own, so that nothing is remembered
+        got = allocate(model.take(np.array([t])), list(systems), RiskBudget(local_prior=3e-3, side_prior=1e-4),
+                       out[[t]], sides[[t]], wrong_map=True)  # fmt: skip
+        alone.append([getattr(got, name)[0] for name in names])
+    assert len({tuple(row) for row in alone}) > 8
+    for first in range(0, count, length):
+        rows = np.arange(first, min(first + length, count))
+        got = allocate(model.take(rows), list(systems), risk, out[rows], sides[rows], wrong_map=True)
+        together = np.stack([getattr(got, name) for name in names], axis=1)
+        np.testing.assert_allclose(together, [alone[t] for t in rows], rtol=1e-9)

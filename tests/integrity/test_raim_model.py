@@ -150,6 +150,11 @@ def test_ties_of_some_epochs_go_with_them():
     model = constrained_model(tied, oracle.LINE, got.arc_m)
     assert model.freedom.tolist() == [4, 4, 4, 3, 3, 3]
     assert np.array_equal(model.take(np.array([4, 1])).wsse, model.wsse[[4, 1]])
+    for t in range(6):
+        own = tied.take(np.array([t]))
+        alone = constrained_model(own, oracle.LINE, got.arc_m[t : t + 1])
+        for name in ("clock_covariance_m2", "covariance_m2", "misfit", "residual", "redundancy"):
+            np.testing.assert_allclose(getattr(model, name)[t], getattr(alone, name)[0], atol=1e-12, err_msg=name)
 
 
 def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():

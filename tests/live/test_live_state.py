@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -18,8 +19,11 @@ import railfix
 from railfix.cli import app
 from railfix.core.errors import OutputError
 from railfix.io.train_message import from_json
-from railfix.live.engine import EngineState
+from railfix.live.engine import EngineState, LiveEngine
+from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
+from railfix.live.stream import Sensed, single_epochs
+from railfix.motion.samples import RadarSpeeds, SensorSamples
 from railfix.pipeline.results import State
 from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of
@@ -186,3 +190,41 @@ def test_everything_that_positions_depend_on_is_in_the_hash(tmp_path: Path) -> N
     file.write_text("2")
     second = belongs_to({"track 0": file}, {"settings": railfix.Config(min_satellites=4)}, ("front", "rear"))
     assert {name for name in first if first[name] != second[name]} == {"track 0", "settings", "antennas"}
+
+
+@pytest.mark.requirement("A8")
+def test_a_receiver_that_comes_back_leaves_nothing_from_before() -> None:
+    """Epochs that waited for their pair, and samples of sensors from before, are not used with the older tags."""
+    files = demo_files()
+    track, vehicle = railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"])
+    paths = {name: railfix.antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
+    logs = {name: single_epochs(railfix.read_observations(files[name])[:20]) for name in paths}
+    settings = LiveSettings(restart_epochs=3, pair_wait_s=5.0, behind_s=60.0, no_input="skip")
+    navigation = railfix.read_navigation(files["nav"])
+    engine = LiveEngine(
+        railfix.EpochProcessor(railfix.Config(filter="off"), paths, navigation=navigation), settings, ("radar",)
+    )
+    process, given = engine.processor.process, []
+
+    def spied(epochs: Any, *arguments: Any, sensors: SensorSamples, **options: Any) -> Any:
+        first = next(iter(epochs))
+        given.append((first, epochs[first].time[0], len(sensors.radar)))
+        return process(epochs, *arguments, sensors=sensors, **options)
+
+    engine.processor.process = spied  # type: ignore[method-assign]
+    engine.push("front", logs["front"][9], now_ns=0)
+    later = 6_000_000_000
+    begin = logs["front"][0].time[0]
+    radar = RadarSpeeds(time=begin + np.arange(5, 15) * np.timedelta64(100, "ms"), speed_mps=np.zeros(10))
+    engine.add_samples(Sensed(sensor="radar", samples=SensorSamples(radar=radar), until=radar.time[-1]))
+    assert len(engine.poll(now_ns=later)) == 1
+    for epoch in logs["front"][10:13]:
+        engine.push("front", epoch, now_ns=later)
+    for k in range(14):
+        engine.push("front", logs["front"][k], now_ns=later)
+    for k in range(2, 14):
+        engine.push("rear", logs["rear"][k], now_ns=later)
+    engine.poll(now_ns=later)
+    assert engine.counts["restart"] == 1
+    expected = [(9, 5), *((k, 0) for k in range(2, 14))]
+    assert given == [("front", begin + k * np.timedelta64(100, "ms"), count) for k, count in expected]

@@ -11,13 +11,16 @@ import pytest
 from scipy.stats import chi2
 
 from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, front_alone, only, with_code
+from railfix.core.arrays import changed
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline import level_stage, solution, solve
+from railfix.pipeline.along_track import gnss_epochs
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_scale import RobustFit
@@ -299,3 +302,43 @@ def test_the_noise_of_a_3d_fit_is_that_of_its_redundant_ranges() -> None:
     inside = found.constrained.overshoot_m == 0
     assert 0.01 < lost[inside].mean() < 0.5
     np.testing.assert_array_equal((found.status == Status.OFF_MAP)[inside], lost[inside])
+
+
+def ranges_of_the_filter() -> CorrectedRanges:
+    """Corrected ranges of ten epochs before any screen."""
+    config = parse_config({"filter": "off", "screens": []})
+    processor = EpochProcessor(config, {"front": clean_trajectories()["front"]}, navigation=clean_navigation())
+    return processor.screened({"front": front()[:10]})[0].ranges["front"]
+
+
+#: Reasons that the filter weighs itself; any other keeps code, phase and Doppler out of it.
+DOUBTED = (
+    Reason.FAULT_EXCLUDED, Reason.ALONE_ON_ITS_CLOCK, Reason.DOPPLER, Reason.CN0_FLOOR, Reason.CN0_CURVE,
+    Reason.ANTENNA_PAIR,
+)  # fmt: skip
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("reason", [reason for reason in Reason if reason])
+def test_the_filter_has_what_a_screen_doubts_and_nothing_that_is_known_to_be_wrong(reason: Reason) -> None:
+    ranges = ranges_of_the_filter()
+    column = int(np.flatnonzero((ranges.reason == 0).all(axis=0))[0])
+    flagged = np.zeros_like(ranges.reason)
+    flagged[5, column] = reason
+    epochs, _ = gnss_epochs(changed(ranges, reason=flagged), np.ones(10), parse_config({}), None)
+    for values in (epochs.code_m, epochs.phase_m, epochs.rate_mps):
+        assert np.isfinite(values[[4, 6], column]).all()
+        assert np.isfinite(values[5, column]) == (reason in DOUBTED)
+
+
+@pytest.mark.requirement("E5")
+def test_phases_of_the_filter_are_without_troposphere_and_satellite_clocks() -> None:
+    ranges, scale, config = ranges_of_the_filter(), np.ones(10), parse_config({})
+    rising = 3.0 * np.arange(10.0)[:, None]
+    used = ranges.reason == 0
+    phase = gnss_epochs(ranges, scale, config, None)[0].phase_m
+    delayed = changed(ranges, troposphere_m=ranges.troposphere_m + rising)
+    later = replace(ranges.satellites, clock_m=ranges.satellites.clock_m + rising)
+    for other, sign in ((delayed, -1.0), (changed(ranges, satellites=later), 1.0)):
+        change = gnss_epochs(other, scale, config, None)[0].phase_m - phase
+        np.testing.assert_allclose(change[used], (sign * rising + 0.0 * change)[used], atol=1e-6)

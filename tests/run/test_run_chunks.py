@@ -9,6 +9,8 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import polars as pl
@@ -18,8 +20,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from railfix.core.errors import OutputError
+from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
+from railfix.motion.samples import RadarSpeeds, SensorSamples
 from railfix.pipeline.tables import rounded
+from railfix.run.driver import _screened
 from railfix.run.output import OutputFolder
 from railfix.run.sources import align_logs
 
@@ -91,6 +96,23 @@ def test_an_antenna_that_starts_late_does_not_pile_up() -> None:
     for _ in range(50):
         next(chunks)
     assert sum(read) <= 20
+
+
+def test_a_sample_of_a_sensor_goes_to_the_chunk_that_it_came_in() -> None:
+    given: list[SensorSamples] = []
+
+    def screened(chunk: Any, state: Any, *, sensors: SensorSamples, **_: Any) -> tuple[Any, Any]:
+        given.append(sensors)
+        return chunk, state
+
+    whole = log(list(range(0, 9000, 1000)))
+    radar = RadarSpeeds(time=START + np.arange(-1500, 10_000, 500).astype("timedelta64[ms]"), speed_mps=np.zeros(23))
+    chunks = ({"front": part} for part in parts(whole, 3))
+    processor = cast(Any, SimpleNamespace(screened=screened))
+    assert len(list(_screened(chunks, (SensorSamples(radar=radar), None), processor))) == 3
+    heard = [seconds(samples.radar.time - START) for samples in given]
+    np.testing.assert_array_equal(np.concatenate(heard), np.arange(-1.5, 8.1, 0.5))
+    assert [times[-1] for times in heard] == [2.0, 5.0, 8.0]
 
 
 TABLE = pl.DataFrame(
@@ -193,6 +215,8 @@ def test_a_full_disk_ends_the_writing_of_parquet(tmp_path: Path) -> None:
     code = """
 import resource, signal, sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 from test_run_chunks import OutputError, OutputFolder, rows
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))

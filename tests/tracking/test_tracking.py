@@ -48,6 +48,26 @@ def test_any_cutting_gives_the_same_numbers(cuts: list[int]) -> None:
 
 
 @pytest.mark.requirement("E5")
+@pytest.mark.parametrize("order", [[9, 8, 7, 6, 5, 4, 3, 2, 1, 0], [1, 4, 2, 9, 0, 7]])
+def test_a_chunk_with_its_channels_in_another_order_goes_on_with_the_phases_of_the_last(order: list[int]) -> None:
+    case = ride(60, noise=1.0)
+    names = [f.name for f in fields(GnssEpochs) if getattr(case.epochs, f.name) is not None]
+    late = part(case.epochs, slice(40, None))
+    columns = {name: getattr(late, name) for name in names if getattr(late, name).shape[1:2] == (10,)}
+    turned = {name: values[:, order] for name, values in columns.items()}
+    turned |= {name: getattr(late, name)[order] for name in ("satellite", "clock")}
+    _, state = track(part(case.epochs, slice(0, 40)), case.line)
+    found, _ = track(replace(late, **turned), case.line, state)
+    absent = [k for k in range(10) if k not in order]
+    code, phase, rate = (np.array(values) for values in (late.code_m, late.phase_m, late.rate_mps))
+    for values in (code, phase, rate):
+        values[:, absent] = np.nan
+    expected, _ = track(replace(late, code_m=code, phase_m=phase, rate_mps=rate), case.line, state)
+    np.testing.assert_allclose(found.arc_m, expected.arc_m, atol=1e-6)
+    np.testing.assert_allclose(found.weight, expected.weight[..., order], atol=1e-6)
+
+
+@pytest.mark.requirement("E5")
 def test_no_epoch_depends_on_a_later_one() -> None:
     case = ride(60, noise=1.0)
     code = case.epochs.code_m.copy()

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from plain_kernels import plain
+from railfix.core.arrays import changed
 from railfix.kernels.tracking import layout
+from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.filter import Recursion
 from railfix.tracking.handover import Handover
+from railfix.tracking.state import CLOCKS, OFFSETS, StateIndex
 from tracking_cases import Ride, bent_line, part, reflected, ride, without_epochs
 
 
@@ -188,6 +191,9 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
         np.testing.assert_allclose(handed.memory.mean[row], (work.mean[h] + gain @ value)[:n], rtol=1e-6, atol=1e-6)
         after = (prior - gain @ design @ prior)[:n, :n]
         np.testing.assert_allclose(handed.memory.covariance[row], after, rtol=1e-5, atol=1e-6)
+        fitted = gain @ value, prior - gain @ design @ prior
+        np.testing.assert_allclose(work.residual[h, :30], value - design @ fitted[0], atol=1e-5)
+        np.testing.assert_allclose(work.fitted[h, :30], np.diagonal(design @ fitted[1] @ design.T), rtol=1e-4)
         density.append(-0.5 * (value @ np.linalg.solve(innovation, value) + np.linalg.slogdet(innovation)[1]))
     evidence = work.evidence[:2] + work.code_evidence[:2]
     assert abs(density[0] - density[1]) > 0.3
@@ -273,3 +279,41 @@ def test_factors_in_whole_vectors_are_those_of_numpy(size: int) -> None:
     np.testing.assert_allclose(inverse[0, :size, :size], np.linalg.inv(matrix), rtol=1e-9, atol=1e-12)
     back = np.triu(factor[:size, :size]).T @ (pivots[0, :size, None] * solved[:, :5])
     np.testing.assert_allclose(back, right, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 8])
+def test_the_median_of_a_part_of_a_row_is_that_of_numpy(size: int) -> None:
+    values = np.random.default_rng(size).normal(size=(3, 12))
+    found = plain("tracking.algebra").median(values, 1, 2, size, np.empty(12))
+    assert found == pytest.approx(np.median(values[1, 2 : 2 + size]), abs=1e-15)
+
+
+@pytest.mark.requirement("E5")
+def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
+    """Clocks without a satellite and sensors that are not on board: their variances grow as those in use would."""
+    case, limits = ride(60), TrackingLimits()
+    _, before = track(part(case.epochs, slice(0, 30)), case.line)
+    _, after = track(part(case.epochs, slice(30, 60)), case.line, before)
+    growth = np.diagonal(after.covariance[0] - before.covariance[0])
+    walks = {
+        StateIndex.WHEEL: WHEEL_WALK, StateIndex.RADAR: RADAR_WALK, StateIndex.FORCE_OFFSET: FORCE_WALK_MPS2,
+    } | {OFFSETS + CLOCKS.index(letter): limits.offset_walk_m for letter in "CRI"}  # fmt: skip
+    for unknown, walk in walks.items():
+        assert growth[unknown] == pytest.approx(30.0 * walk**2, rel=1e-6)
+
+
+@pytest.mark.requirement("C6")
+def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
+    """Lengths along a map that was found to be wrong add as much variance to each of them as to the filter."""
+    case = ride(60)
+    _, state = track(part(case.epochs, slice(0, 50)), case.line, levels=True)
+    nothing = without_epochs(part(case.epochs, slice(50, 60)), np.ones(10, dtype=bool))
+    own, banks = [], []
+    for log_variance in (0.0, 5.0):
+        _, after = track(nothing, case.line, changed(state, map_log_variance=log_variance), levels=True)
+        assert after.bank is not None
+        assert len(after.bank.without) > 10
+        own.append(after.covariance[0, StateIndex.ARC, StateIndex.ARC])
+        banks.append(after.bank.covariance[:, StateIndex.ARC, StateIndex.ARC])
+    assert own[1] - own[0] > 0.5
+    np.testing.assert_allclose(banks[1] - banks[0], own[1] - own[0], rtol=0.02)

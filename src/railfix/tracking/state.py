@@ -179,11 +179,6 @@ class TrackState:
     speed_range_mps: tuple[float, float] = ANY_SPEED
 
     @property
-    def map_scale(self) -> float:
-        """Factor on the error of lengths along the map, at least 1."""
-        return float(np.exp(0.5 * self.map_log_variance))
-
-    @property
     def hypotheses(self) -> int:
         """Number of hypotheses."""
         return len(self.log_probability)
