@@ -6,7 +6,6 @@ import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import date, datetime
 from functools import wraps
 from pathlib import Path
@@ -17,6 +16,7 @@ import typer
 from pydantic import ValidationError
 
 from railfix.core.errors import SettingsError
+from railfix.core.frozen import dataclass
 from railfix.core.settings import INPUTS, Settings, option, read_toml
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
 from railfix.run.output import FileKind, Overwrite, check_output_file

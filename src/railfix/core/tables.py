@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import partial
 from html import escape
 from os import PathLike
@@ -16,6 +16,7 @@ from polars.exceptions import PanicException, PolarsError
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
+from railfix.core.frozen import dataclass
 
 
 @contextmanager

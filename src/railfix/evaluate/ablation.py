@@ -5,7 +5,6 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +13,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.evaluate.figures import Score, score
 from railfix.evaluate.place import along_track_error, interpolate_reference

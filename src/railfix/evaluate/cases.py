@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,6 +10,7 @@ from pydantic import Field
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_text
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, load_settings
 from railfix.evaluate.inputs import EvaluationOptions
 from railfix.pipeline.config import Config

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +10,7 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, places_in_groups
 from railfix.core.errors import MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import EvaluationOptions, RunFolder, Sections, floats
 from railfix.evaluate.integrity import PARTS, STATED

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
+from railfix.core.frozen import dataclass
 from railfix.evaluate.epochs import antenna_epochs, below
 from railfix.evaluate.figures import ALL, KEYS, USED, figures_by
 from railfix.evaluate.inputs import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -16,6 +15,7 @@ from pydantic import AfterValidator, Field
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import reading_table

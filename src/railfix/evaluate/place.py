@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
@@ -17,6 +16,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
+from railfix.core.frozen import dataclass
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder

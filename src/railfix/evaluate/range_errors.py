@@ -6,7 +6,7 @@ Common errors are those that a nearby reference station has measured; of the err
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +17,7 @@ from railfix import __version__
 from railfix.core.arrays import Datetimes, Floats, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import file_sha256
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings, option

@@ -9,7 +9,7 @@ Reference run curve: place over running time of one direction, for simulated run
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 from typing import Self
 
@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from railfix.core.arrays import Floats, freeze_arrays
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -23,6 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.errors import InputFileError
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, along, overlap
 

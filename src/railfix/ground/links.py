@@ -7,7 +7,7 @@ import time
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -18,6 +18,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen, read_revoked

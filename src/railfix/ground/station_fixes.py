@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from typing import Final
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, freeze_arrays
 from railfix.core.errors import MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations

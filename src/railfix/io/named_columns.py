@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +12,7 @@ import polars as pl
 from railfix.core.arrays import Floats, Integers, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
+from railfix.core.frozen import dataclass
 
 _BLOCK: Final = 4096  #: Rows that are read before they become compact.
 

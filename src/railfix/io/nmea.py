@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from typing import Final
@@ -14,6 +13,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, ending, read_text, read_text_lines
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import SECONDS_PER_DAY, from_week, timedelta, utc_to_gpst
 from railfix.gnss.observations import first_problems

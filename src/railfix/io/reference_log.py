@@ -8,7 +8,6 @@ coordinates), ``speed_mps``, ``sigma_m`` along the track, ``source`` (``rtk``, `
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending
+from railfix.core.frozen import dataclass
 from railfix.core.tables import reading_table
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns

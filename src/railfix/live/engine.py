@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
 
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate

@@ -8,11 +8,12 @@ import logging
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Final
 
 import numpy as np
 
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput

@@ -14,7 +14,6 @@ import os
 import pickle
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +22,7 @@ import numpy as np
 import railfix
 from railfix.core.errors import OutputError
 from railfix.core.files import file_sha256
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.live.engine import EngineState
 from railfix.live.stream import ReceiverState

@@ -7,12 +7,13 @@ doi:10.1137/0714050; the result is that of H. E. Rauch, F. Tung, C. T. Striebel 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
+from railfix.core.frozen import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)

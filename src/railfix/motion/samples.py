@@ -7,13 +7,14 @@ at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, freeze_rows
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import nearest_rows
 
 #: The ratio is taken over windows of this length [ns] with so many speeds, of a train faster than this [m/s].

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import copy
 from collections import deque
-from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
 from typing import Final, Literal, NamedTuple
@@ -28,6 +27,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Codes, Floats
 from railfix.core.constants import GRAVITY_MPS2
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 
 

@@ -6,7 +6,6 @@ at the middle of the interval, and that instant is returned with it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -14,6 +13,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.io.reference_log import Pulses

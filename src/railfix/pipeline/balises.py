@@ -8,13 +8,14 @@ other, also where it backs.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations

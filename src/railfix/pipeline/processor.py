@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Masks, changed
+from railfix.core.arrays import Masks
+from railfix.core.frozen import changed, dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples

@@ -7,7 +7,7 @@ reference document are made from the same `Column` objects.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import Any, Final, Generic, TypeVar
 
@@ -16,6 +16,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from railfix.core.arrays import Floats
+from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.integrity.interference import Suspicion, cause_text
 from railfix.integrity.protection import Cause, LevelStatus

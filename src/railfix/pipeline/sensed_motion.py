@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
 from railfix.core.constants import GRAVITY_MPS2
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.motion.features import (
     HALF_LENGTH_M,

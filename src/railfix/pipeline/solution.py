@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, changed
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks
 from railfix.core.constants import CLOCK_GROUP
+from railfix.core.frozen import changed, dataclass
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import LinearModel

@@ -8,7 +8,7 @@ clipped residuals over it: RAIM looks at single epochs, which an error of twice 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
 from functools import lru_cache
 from typing import Final
@@ -16,7 +16,8 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed, kernel_array
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, kernel_array
+from railfix.core.frozen import changed, dataclass
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,

@@ -12,7 +12,7 @@ The single point is the reference method of P1 section 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cached_property
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -23,6 +23,7 @@ from pydantic import Field
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.track.trajectory import Trajectory
 

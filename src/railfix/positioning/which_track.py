@@ -10,7 +10,7 @@ error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -18,6 +18,7 @@ from pydantic import Field
 from scipy.special import chdtrc, logsumexp
 
 from railfix.core.arrays import Floats, Masks, Strings
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Datetimes, Floats
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import angles_of, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final, TypeVar
 
 import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -21,6 +21,7 @@ from pydantic import Field, field_validator
 from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, read_model_file, write_toml
 from railfix.gnss.observations import ObservationHeader
 

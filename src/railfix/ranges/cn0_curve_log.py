@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +12,7 @@ from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import BrokenLines, file_sha256
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import elevation_azimuth
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation

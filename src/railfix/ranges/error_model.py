@@ -7,7 +7,7 @@ one array of numbers a column, in the order of elevation, then sector, then C/N0
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import Annotated, Final, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from pydantic import Field, field_validator
 from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option, read_model_file, write_toml
 
 __all__ = [

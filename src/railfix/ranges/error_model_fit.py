@@ -9,7 +9,6 @@ doi:10.1109/TAES.2018.2876583). Neither can be proven from samples.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,6 +16,7 @@ from pydantic import Field
 from scipy.special import betaincinv, ndtri
 
 from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import MismatchError, NoPositionError
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import Acceleration, Pulses

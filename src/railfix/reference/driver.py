@@ -8,7 +8,6 @@ import sys
 import time as clock
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +18,7 @@ from pydantic import Field
 from railfix import __version__
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import BrokenLines
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option
 from railfix.gnss.observations import concatenate
 from railfix.io.logs import read_navigation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +14,7 @@ import polars.selectors as cs
 
 from railfix.core.errors import RailfixError
 from railfix.core.files import write_whole
+from railfix.core.frozen import dataclass
 from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
 from railfix.evaluate.inputs import POSITIONS_TABLE, floats, read_table, tables_of

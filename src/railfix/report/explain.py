@@ -8,7 +8,6 @@ one free clock a constellation, linear around the position (P1 2.2(3)).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +18,7 @@ from railfix.core.arrays import Floats, Strings
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import enu_axes
 from railfix.core.tables import reading_table
 from railfix.core.timescale import gps_time

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +11,7 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
+from railfix.core.frozen import dataclass
 from railfix.core.tables import Table, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.evaluate.inputs import floats

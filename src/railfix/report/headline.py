@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.core.frozen import dataclass
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,6 +11,7 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
+from railfix.core.frozen import dataclass
 from railfix.core.tables import reading_table
 from railfix.evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.evaluate.evaluation import EvaluatedRun, short_names

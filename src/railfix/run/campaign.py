@@ -10,7 +10,6 @@ import re
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -18,6 +17,7 @@ import polars as pl
 
 from railfix.core.errors import InputFileError, MismatchError, OutputError, RailfixError, SettingsError
 from railfix.core.files import write_whole
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, load_settings
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files

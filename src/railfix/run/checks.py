@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Final, Literal
@@ -13,6 +12,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError, RailfixError
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import Navigation

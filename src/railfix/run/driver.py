@@ -7,7 +7,7 @@ import time as clock
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
+from railfix.core.frozen import dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, ending, write_whole
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation

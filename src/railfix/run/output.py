@@ -14,7 +14,6 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from queue import Full, Queue
 from threading import Thread
@@ -22,6 +21,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
 from railfix.core.errors import OutputError
+from railfix.core.frozen import dataclass
 
 if TYPE_CHECKING:
     import polars as pl

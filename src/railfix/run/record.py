@@ -6,7 +6,6 @@ import platform
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,6 +17,7 @@ import polars.selectors as cs
 from railfix import __version__
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_json_object, source_commit
+from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.core.settings import Model, validated
 from railfix.core.tables import Table, count, number, reading_table, share

@@ -7,7 +7,6 @@ sequence of tracks is the route on which positions are computed, and every other
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -16,6 +15,7 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.errors import MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import nearest_rows
 from railfix.gnss.navigation import Navigation

@@ -6,7 +6,7 @@ These do not depend on the sensors, as the speeds of the filter do: a sensor mou
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import partial
 from typing import Final
 
@@ -15,6 +15,7 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import GRAVITY_MPS2
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta
 from railfix.motion.samples import GroundUnits, InertialSamples, RadarSpeeds, RadarWatch, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -14,6 +14,7 @@ import numpy as np
 
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import BrokenLines
+from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import scan_observations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Final, Literal
@@ -20,6 +20,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import read_json_object, write_whole
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, option
 from railfix.gnss.observations import Observations, concatenate

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Final, Literal, NamedTuple
@@ -24,8 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Strings, changed, medians
+from railfix.core.arrays import Floats, Strings, medians
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.frozen import changed, dataclass
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings

@@ -10,7 +10,7 @@ signals follow the newest record transmitted, as receivers use it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices, take_rows
 from railfix.core.constants import BDT_MINUS_GPST_S, EARTH_ROTATION_RATE, GM_GPS, SPEED_OF_LIGHT
 from railfix.core.errors import MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GM, ROTATION, Orbits, kepler_state

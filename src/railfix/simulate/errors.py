@@ -7,7 +7,6 @@ variance (less than 1 %) is put back on the average.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Self
 
@@ -17,6 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
 from railfix.simulate.constellation import newest_record, record_state

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Final, Literal
 
@@ -20,6 +19,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from railfix.core.arrays import Floats, places_in_groups, take_rows
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.simulate.settings import (
     Between,

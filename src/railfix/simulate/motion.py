@@ -7,7 +7,6 @@ independently of `railfix.track.vehicle`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
@@ -18,6 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from railfix.core.arrays import Floats
 from railfix.core.constants import GRAVITY_MPS2
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.simulate.alignment import Alignment
 from railfix.simulate.errors import RandomFunction

@@ -26,12 +26,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
+from railfix.core.frozen import dataclass
 from railfix.core.settings import read_toml, validated
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion

@@ -6,7 +6,6 @@ Definitions are those of the EPSG dataset (https://epsg.org). Motions against a 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal
 
@@ -19,6 +18,7 @@ from pyproj.transformer import TransformerGroup
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
+from railfix.core.frozen import dataclass
 
 #: Three-dimensional codes of the realisations of the ITRF.
 _ITRF: Final = {

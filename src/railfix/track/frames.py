@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
@@ -25,6 +25,7 @@ from pyproj.exceptions import CRSError, ProjError
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import FilePath, read_text
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.crs import (
     HELD,

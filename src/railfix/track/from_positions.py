@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Final
@@ -13,6 +12,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.core.settings import Settings
 from railfix.core.tables import plural

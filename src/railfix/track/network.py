@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, cast
 
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks, join_rows, places_in_groups, read_only, take_rows
 from railfix.core.errors import MismatchError, SettingsError
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files
 from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage

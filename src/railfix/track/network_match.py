@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final, Unpack
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, take_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import FilePath, ending
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final
 
@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, read_text
+from railfix.core.frozen import dataclass
 from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
 from railfix.track.read import read_segments

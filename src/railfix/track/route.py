@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypedDict
@@ -12,6 +12,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.crs import older_datum_note
 from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, Provenance, Track

@@ -6,7 +6,7 @@ height of the outer rail above the inner one. The height of a point is that of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from functools import cached_property
 from typing import TypedDict, Unpack
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks, freeze_arrays, read_only
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.tables import NotebookTable, plural
 

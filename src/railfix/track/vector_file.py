@@ -12,7 +12,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from typing import Any, Final
 from xml.etree.ElementTree import ParseError, iterparse
@@ -22,6 +22,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, open_stream
+from railfix.core.frozen import dataclass
 from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights
 from railfix.track.frames import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment

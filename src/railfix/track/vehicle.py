@@ -6,7 +6,6 @@ Axes: origin midway between the bogie centres at the height of the rail tops; ``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
@@ -15,6 +14,7 @@ from pydantic import ConfigDict, Field
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import FilePath
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at, enu_axes
 from railfix.core.settings import Settings, load_settings
 from railfix.track.from_positions import ANTENNA_PATH

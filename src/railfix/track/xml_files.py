@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
@@ -17,6 +17,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, file_sha256, open_stream, read_bytes
+from railfix.core.frozen import dataclass
 from railfix.track.crs import choose_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment

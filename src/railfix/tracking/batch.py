@@ -13,7 +13,7 @@ Errors of codes last a minute: with 2 tau / dt epochs to one independent error e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any, Final
 
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.sparse.linalg import splu
 
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 from railfix.tracking.epochs import GnssEpochs

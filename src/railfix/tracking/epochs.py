@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from enum import IntEnum
 from typing import Literal
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.frozen import dataclass
 
 
 class Kind(IntEnum):

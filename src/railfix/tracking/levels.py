@@ -11,12 +11,13 @@ with the risk of L and that of V, which is a hundredth of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, changed
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks
+from railfix.core.frozen import changed, dataclass
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import SCALE_BOUND
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs

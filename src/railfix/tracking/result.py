@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
+from railfix.core.frozen import dataclass
 from railfix.kernels.tracking import constants
 from railfix.tracking.epochs import Kind
 

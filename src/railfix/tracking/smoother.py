@@ -12,11 +12,12 @@ began, nothing of what comes later reaches the epochs before.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.core.frozen import dataclass
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.search import SplitHypothesis
 from railfix.tracking.state import SATELLITES, StateIndex, TrackState

@@ -6,7 +6,7 @@ Precise positions are interpolated by a polynomial, clocks linearly.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Final
 
 import numpy as np
@@ -23,6 +23,7 @@ from railfix.core.constants import (
     PZ90_SEMI_MAJOR_AXIS,
     SPEED_OF_LIGHT,
 )
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, PreciseEphemeris
 

@@ -12,7 +12,6 @@ healthy record does not override it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Final, Literal
 
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits

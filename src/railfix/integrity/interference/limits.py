@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import IntEnum, IntFlag
 from typing import Final, Literal
 
@@ -11,6 +11,7 @@ from pydantic import Field
 
 from railfix import kernels
 from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, kernel_array
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 

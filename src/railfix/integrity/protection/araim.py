@@ -14,7 +14,6 @@ that a wrong map makes faulty together; the position along the track is then the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from itertools import combinations
 from typing import Annotated, Final, Literal, NamedTuple, Self
@@ -26,6 +25,7 @@ from scipy.special import ndtr
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, read_toml, validated
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -24,6 +23,7 @@ from scipy.special import comb
 
 from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
+from railfix.core.frozen import dataclass
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import constrained_model

@@ -9,7 +9,7 @@ number of satellites are a class.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from itertools import combinations, groupby
 from math import prod
@@ -24,6 +24,7 @@ from scipy.special import comb, ndtri
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 

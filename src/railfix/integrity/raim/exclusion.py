@@ -7,7 +7,6 @@ solving again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from typing import Final, Literal, Self
@@ -19,6 +18,7 @@ from scipy.special import chdtri
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.integrity.raim.model import Compact, LinearModel, compact, constrained_model
 from railfix.positioning.normal_equations import Ranges

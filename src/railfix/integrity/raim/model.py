@@ -9,7 +9,7 @@ with `LinearModel.freedom` degrees of freedom.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks, kernel_array
+from railfix.core.frozen import dataclass
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 

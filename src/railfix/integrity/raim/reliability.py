@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -20,6 +19,7 @@ from scipy.special import chdtri, chndtrinc, ndtri
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
+from railfix.core.frozen import dataclass
 from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.model import LinearModel, compact
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages

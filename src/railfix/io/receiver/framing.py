@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import binascii
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Final
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, join_rows, take_rows
 from railfix.core.files import FilePath, open_stream
+from railfix.core.frozen import dataclass
 
 #: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
 LONGEST_FRAME: Final = 16_384

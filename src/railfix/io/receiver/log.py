@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,6 +17,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, open_stream
+from railfix.core.frozen import dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.position_log import PositionLog

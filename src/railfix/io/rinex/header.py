@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ByteStream, FilePath
+from railfix.core.frozen import dataclass
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, columns_of
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from datetime import datetime
 from typing import Final
 
@@ -14,6 +14,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, Paths, path_names, read_text_lines
+from railfix.core.frozen import dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.header import read_version
 from railfix.io.rinex.navigation_records import (

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from railfix import kernels
 from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, places_in_groups, take_rows
+from railfix.core.frozen import dataclass
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog

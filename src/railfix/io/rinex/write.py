@@ -9,7 +9,6 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import IO, Final, Literal, cast, get_args
@@ -19,6 +18,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import OutputError
 from railfix.core.files import FilePath, hatanaka_program, stage_file
+from railfix.core.frozen import dataclass
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.observations_lines import KINDS
 

@@ -11,7 +11,7 @@ it drift by twice the change of its delay, which the window limits: at 1 mm/s on
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import IntFlag
 from typing import Final, Literal
 
@@ -20,6 +20,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations, carrier_frequency_hz

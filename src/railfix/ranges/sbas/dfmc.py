@@ -23,7 +23,6 @@ out.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
 
@@ -31,6 +30,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.constants import EARTH_ROTATION_RATE
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation

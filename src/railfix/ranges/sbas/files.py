@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from os import PathLike
 from typing import Final
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Bytes, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
 from railfix.io.receiver.framing import SbasFrames, head_of, is_receiver_log
 from railfix.io.receiver.log import scan_pieces

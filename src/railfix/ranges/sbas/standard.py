@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from enum import IntEnum
 from typing import Final, Literal
 
@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 
 #: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).

@@ -7,13 +7,14 @@ a page, so a notebook and the report show the same numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import ClassVar, Final, Literal
 
 import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats, Indices, Integers, Strings
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import floats
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.errors import InputFileError, OutputError
+from railfix.core.frozen import dataclass
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.pipeline.config import Config

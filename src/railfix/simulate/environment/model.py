@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import carrier_frequency_hz
 from railfix.simulate.environment.correlator import (

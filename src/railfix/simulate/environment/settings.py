@@ -16,7 +16,6 @@ or, instead of the sections, ``[environment.shares]`` of each kind from which th
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Final, Literal, get_args
@@ -24,6 +23,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.frozen import dataclass
 from railfix.simulate.settings import (
     AngleBetween,
     Between,

@@ -5,12 +5,13 @@ Frame of the antenna: x along the line (rising chainage), y to the right, z up; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, take_rows
+from railfix.core.frozen import dataclass
 from railfix.simulate.environment.correlator import (
     circular_reflection,
     cross_polar_gain,

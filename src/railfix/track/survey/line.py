@@ -6,7 +6,7 @@ Errors follow Student's t distribution: iteratively reweighted least squares (La
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.core.tables import plural
 from railfix.track.from_positions import ANTENNA_PATH

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
@@ -11,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.frozen import dataclass
 from railfix.track.survey.runs import SurveyLimits
 
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one line.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
@@ -11,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Masks, freeze_arrays
+from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
