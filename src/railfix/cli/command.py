@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
+from importlib.util import LazyLoader, find_spec, module_from_spec
 from itertools import pairwise
 from typing import Any, ClassVar, Final, NoReturn
 
@@ -150,10 +151,23 @@ class LazyCommands(Commands):
         return name, load_command(str(name), self.modules.get(str(name))) if name in self.summaries else command, rest
 
 
+def _put_off(package: str, *modules: str) -> None:
+    """Load modules of a package when something of them is used, not when they are imported."""
+    for module in modules:
+        name = f"{package}.{module}"
+        if name in sys.modules or (spec := find_spec(name)) is None or spec.loader is None:
+            continue
+        spec.loader = LazyLoader(spec.loader)
+        sys.modules[name] = module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+        setattr(sys.modules[package], module, sys.modules[name])
+
+
 def load_command(name: str, module_name: str | None = None) -> Any:
     """Return a command, imported from its module in `railfix.cli`: by default that of its name."""
     word = name.replace("-", "_")
     gc.disable()  # nothing of what an import makes is garbage: looking for it takes a tenth of the start
+    _put_off("numpy", "f2py", "testing")  # scipy imports all of numpy, and uses neither: 0.07 s
     try:
         module = import_module(f"railfix.cli.{module_name or word}")
     finally:

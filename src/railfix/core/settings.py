@@ -36,7 +36,7 @@ def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
 class Settings(BaseModel):
     """Base of all settings: frozen, validated on construction, unknown names rejected."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
 
     if not TYPE_CHECKING:  # checkers see the settings
 
