@@ -89,7 +89,8 @@ def test_pieces_are_the_whole(tmp_path: Path, log: type, epochs: int) -> None:
     path = write(tmp_path / "log", log())
     whole = read_observations(path, broken_lines="count")
     pieces = list(scan_observations(path, epochs=epochs, broken_lines="count"))
-    assert {len(piece) for piece in pieces[:-1]} <= {epochs}
+    assert {len(piece) for piece in pieces[1:-1]} <= {epochs}
+    assert len(pieces[0]) <= epochs
     assert 0 < len(pieces[-1]) <= epochs
     assert whole.problem_count > 3
     assert_same(concatenate(pieces), whole)
@@ -179,7 +180,7 @@ def test_streams_may_be_left_early(tmp_path: Path) -> None:
         assert len(stream.read(100)) == 100
     assert stream.closed
     first = next(scan_observations(path, epochs=5))
-    assert len(first) == 5
+    assert 1 <= len(first) <= 5
 
 
 def _epoch(k: int, *, minute: int = 33) -> list[str]:

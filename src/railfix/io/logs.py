@@ -122,7 +122,7 @@ def scan_observations(
     date: Time = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Observations of one receiver in pieces of `epochs` epochs; see `read_observations`."""
+    """Observations of one receiver in pieces of `epochs` epochs at most, the first short; see `read_observations`."""
     paths, letters = path_names(path), None if systems is None else list(systems)
     if any(mate_table(p) == "S_GNSS_SAT" for p in paths):
         return _mate_pieces(paths, letters, (_instant(start), _instant(end)), epochs)

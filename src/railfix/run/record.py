@@ -58,14 +58,14 @@ def figures_of(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, 
 
 def _along_sigma(rows: pl.LazyFrame) -> dict[str, float] | None:
     sigma = pl.col("along_sigma_m")
-    found = _one_by_one(rows, {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()})
+    found = _figures(rows, {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()})
     return None if found["max_m"] is None else found
 
 
 def _level(rows: pl.LazyFrame, antenna: AntennaTally) -> dict[str, Any]:
     finite = pl.col("protection_level_m").filter(pl.col("protection_level_m").is_finite())
     return {
-        **_one_by_one(rows, {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}),
+        **_figures(rows, {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}),
         **{word: antenna.level_status[word] for word in ("available", "unavailable", "alarm")},
         "without_budget": antenna.without_budget,
     }
@@ -77,7 +77,7 @@ def _filter_figures(rows: pl.LazyFrame) -> dict[str, Any]:
     words = {word.text: (status == word.text).sum() for word in TrackStatus}
     counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
     figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95), "finite": finite.len()}
-    bound = _one_by_one(rows, figures) if counts.pop("levels") else None
+    bound = _figures(rows, figures) if counts.pop("levels") else None
     return {"status": counts, "along_sigma_m": _along_sigma(rows), "level": bound}
 
 
@@ -85,9 +85,9 @@ def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:
     return folder.scan(f"{table}.parquet").filter(pl.col("antenna") == antenna)
 
 
-def _one_by_one(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str, Any]:
-    """Return figures of many rows; each reads its column anew, so that one copy of one column is in memory."""
-    return {name: rows.select(figure).collect().item() for name, figure in figures.items()}
+def _figures(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str, Any]:
+    """Return figures of many rows of one column."""
+    return rows.select(**figures).collect().row(0, named=True)
 
 
 @dataclass(frozen=True, kw_only=True)

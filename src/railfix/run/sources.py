@@ -254,21 +254,18 @@ class Log:
 Item = TypeVar("Item")
 #: Tags of two receivers that differ by no more than this belong to one instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000
-#: The first chunk is this part of the first pieces.
-_FIRST_PART: Final = 5
 
 
 def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
     """Yield chunks of observations that cover the same span of time for every antenna seen so far.
 
     Each antenna keeps its own epochs, none where it has none in the span. A chunk ends where the first of the current
-    parts ends; what the others have beyond waits for the next chunk. The first chunk is short: the stages after it
-    begin early. Epochs that belong together but are tagged a little apart (`SAME_INSTANT_NS`) stay in one chunk.
+    parts ends; what the others have beyond waits for the next chunk. Epochs that belong together but are tagged a
+    little apart (`SAME_INSTANT_NS`) stay in one chunk.
     """
     live = dict(logs)
     waiting: dict[str, Observations] = {}
     spacing: dict[str, int] = {}
-    parts = _FIRST_PART
 
     def read(name: str) -> None:
         part = next(live[name], None)
@@ -289,8 +286,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
         cut = {name: len(part) for name, part in waiting.items()}
         if live:
             slack = min(SAME_INSTANT_NS, *(spacing.get(name, 0) // 2 for name in live))
-            ends = [waiting[name].time[(len(waiting[name]) - 1) // parts] for name in live]
-            horizon, parts = min(ends) + np.timedelta64(slack, "ns"), 1
+            horizon = min(waiting[name].time[-1] for name in live) + np.timedelta64(slack, "ns")
             cut = {name: int(np.searchsorted(part.time, horizon, side="right")) for name, part in waiting.items()}
         yield {name: part[: cut[name]] for name, part in waiting.items()}
         # A short rest would cut every chunk that follows in two: it is joined with the next part.

@@ -194,6 +194,8 @@ class BlockReader:
 #: Default number of epochs of a piece.
 DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
+#: The first piece is this part of the others.
+_FIRST_PART: Final = 5
 _GAP_INTERVALS: Final = 1.5  #: A step between files is a gap when it is longer than this many intervals.
 
 
@@ -207,11 +209,12 @@ def scan_observations(
     end: np.datetime64 | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Yield the observations of one receiver in pieces of `epochs` epochs; other arguments as
+    """Yield the observations of one receiver in pieces of `epochs` epochs at most; other arguments as
     `railfix.read_observations`.
 
-    Each piece has the channels that occur in it; concatenated they are the log. Memory is that of a piece and one block
-    of text. `progress` is called repeatedly with the fraction of the files that has been read, 0 to 1.
+    The first piece is short (`in_pieces`). Each has the channels that occur in it; concatenated they are the log.
+    Memory is that of a piece and one block of text. `progress` is called repeatedly with the fraction of the files
+    that has been read, 0 to 1.
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
@@ -284,22 +287,26 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 
 
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
-    """Yield pieces of equal length from runs; problems belong to the piece being collected."""
+    """Yield pieces of one length from runs, the first a fifth of it, so that what takes them begins early.
+
+    Problems belong to the piece being collected.
+    """
     waiting: list[Observations] = []
-    length = 0
+    length, size = 0, -(-epochs // _FIRST_PART)
     for run in runs:
         waiting.append(run)
         length += len(run)
-        if length > epochs:
-            joined = concatenate(waiting)
-            rest = (length - 1) // epochs * epochs  # keep the last piece: faults at the end of the file belong to it
-            for k, first in enumerate(range(0, rest, epochs)):
-                piece = without_empty_channels(joined[first : first + epochs])
-                if k == 0:
-                    problems, count = joined.problems, joined.problem_count
-                    piece = replace(piece, problems=problems, problem_count=count, skipped=joined.skipped)
-                yield piece
-            waiting, length = [without_empty_channels(joined[rest:])], length - rest
+        if length <= size:
+            continue
+        joined, at = concatenate(waiting), 0
+        while length > size:  # keep the last piece: faults at the end of the file belong to it
+            piece = without_empty_channels(joined[at : at + size])
+            if at == 0:
+                problems, count = joined.problems, joined.problem_count
+                piece = replace(piece, problems=problems, problem_count=count, skipped=joined.skipped)
+            yield piece
+            at, length, size = at + size, length - size, epochs
+        waiting = [without_empty_channels(joined[at:])]
     yield without_empty_channels(concatenate(waiting))
 
 
