@@ -26,10 +26,9 @@ def _add_rows_plain(
     left: Floats,
     source: Floats,
     places: tuple[int, int, int, int, int],
-    rows: tuple[int, int, int, int],
-    width: int,
+    rows: tuple[int, int, int, int, int],
 ) -> None:
-    (at, start, scale, first, begin), (step, stride, low, high) = places, rows
+    (at, start, scale, first, begin), (step, stride, low, high, width) = places, rows
     total = origin.reshape(-1)[start : start + width].copy()
     for k in range(low, high):
         row = begin + k * stride
@@ -39,13 +38,11 @@ def _add_rows_plain(
 
 
 @intrinsic
-def _add_rows(
-    _: Any, target: Any, origin: Any, by: Any, left: Any, source: Any, places: Any, rows: Any, width: Any
-) -> Any:
+def _add_rows(_: Any, target: Any, origin: Any, by: Any, left: Any, source: Any, places: Any, rows: Any) -> Any:
     """Sums of rows in vectors of the processor: of loops numba asks at each row whether arrays overlap."""
-    del places, rows, width  # of these types
-    five, four = (types.UniTuple(types.intp, size) for size in (5, 4))  # type: ignore[no-untyped-call]
-    signature = types.void(target, origin, by, left, source, five, four, types.intp)
+    del places, rows  # of these types
+    five = types.UniTuple(types.intp, 5)  # type: ignore[no-untyped-call]
+    signature = types.void(target, origin, by, left, source, five, five)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, origin, by, left, source = (
@@ -53,8 +50,7 @@ def _add_rows(
             for kind, value in zip(signature.args[:5], arguments[:5], strict=True)
         )
         at, start, scale, first, begin = cgutils.unpack_tuple(builder, arguments[5])  # type: ignore[no-untyped-call]
-        step, stride, low, high = cgutils.unpack_tuple(builder, arguments[6])  # type: ignore[no-untyped-call]
-        width = arguments[7]
+        step, stride, low, high, width = cgutils.unpack_tuple(builder, arguments[6])  # type: ignore[no-untyped-call]
         number = width.type
 
         def vector_at(data: Any, place: Any, column: Any, k: int) -> Any:
@@ -129,7 +125,7 @@ def factorise(matrix: Floats, m: int, size: int, factor: Floats, pivots: Floats)
         first = i // LANES * LANES
         at = (m * matrix.shape[1] + i) * matrix.shape[2]
         places = i * width + first, at + first, pivots.shape[1], i, first
-        add_rows(factor, matrix, pivots, factor, factor, places, (width, width, 0, i), end - first)
+        add_rows(factor, matrix, pivots, factor, factor, places, (width, width, 0, i, end - first))
         pivots[0, i] = 1.0 / max(factor[i, i], 1e-300)
         pivots[1, i] = -pivots[0, i]
 
@@ -149,7 +145,7 @@ def solve_forward(factor: Floats, size: int, pivots: Floats, right: Floats) -> N
     width = right.shape[1]
     for i in range(size):
         places = i * width, i * width, pivots.shape[1], i, 0
-        add_rows(right, right, pivots, factor, right, places, (factor.shape[1], width, 0, i), width)
+        add_rows(right, right, pivots, factor, right, places, (factor.shape[1], width, 0, i, width))
 
 
 @borrowing
@@ -161,7 +157,7 @@ def invert_factor(factor: Floats, size: int, pivots: Floats, lower: Floats) -> N
     width, ones = lower.shape[1], lower.shape[1] ** 2
     for k in range(size):
         places = k * width, ones + k * width, pivots.shape[1], k, 0
-        add_rows(lower, lower, pivots, factor, lower, places, (factor.shape[1], width, 0, k), whole_lanes(k + 1))
+        add_rows(lower, lower, pivots, factor, lower, places, (factor.shape[1], width, 0, k, whole_lanes(k + 1)))
 
 
 @borrowing
@@ -170,7 +166,7 @@ def square(lower: Floats, size: int, pivots: Floats, result: Floats, to: int) ->
     width, end, none = lower.shape[1], whole_lanes(size), (lower.shape[0] - 1) * lower.shape[1]
     for i in range(size):
         places = (to * result.shape[1] + i) * result.shape[2], none, 0, i, 0
-        add_rows(result, lower, pivots, lower, lower, places, (width, width, i, size), end)
+        add_rows(result, lower, pivots, lower, lower, places, (width, width, i, size, end))
 
 
 @borrowing

@@ -165,8 +165,8 @@ def fit(rows: Rows, variance: Floats, work: Work, h: int, by: int, to: int) -> N
         for i in range(k + 1):
             diagonal[i] += inverse * lower[k, i] * lower[k, i]
     none = (lower.shape[0] - 1) * width
-    add_rows(change, lower, pivots, right, lower, (to * change.shape[1], none, 0, 0, 0), (1, width, 0, size), end)
-    add_rows(with_clock, lower, pivots, lower, lower, (0, none, 0, nc, 0), (width, width, nc, size), end)
+    add_rows(change, lower, pivots, right, lower, (to * change.shape[1], none, 0, 0, 0), (1, width, 0, size, end))
+    add_rows(with_clock, lower, pivots, lower, lower, (0, none, 0, nc, 0), (width, width, nc, size, end))
     for i in range(nc):
         residual[to, i] = value[h, i] - root[h, i] * change[to, i] - clock * change[to, nc]
         spread[to, i] = (
@@ -379,9 +379,9 @@ def apply_update(rows: Rows, variance: Floats, work: Work, h: int) -> None:
             (h * own.shape[1] + first) * end,
             (h * cross.shape[1] + first) * cross.shape[2],
         )
-        add_rows(joint, lower, pivots, motion, own, (r * end, none, ones, of, at), (1, end, 0, MOTION), end)
+        add_rows(joint, lower, pivots, motion, own, (r * end, none, ones, of, at), (1, end, 0, MOTION, end))
         places = i * width, nothing, ones, of, row
-        add_rows(found, found, pivots, motion, cross, places, (1, cross.shape[2], 0, MOTION), width)
+        add_rows(found, found, pivots, motion, cross, places, (1, cross.shape[2], 0, MOTION, width))
         for j in range(nc):
             system[0, j, i] = scaled[j] * joint[r, j]
         for q in range(r + 1):
@@ -426,7 +426,7 @@ def _take_off(work: Work, h: int, size: int, n: int, known: float) -> None:
         spread.shape[1],
         (found.shape[0] - 1) * found.shape[1],
     )
-    add_rows(found, found, pivots, found, found, (size * width, none, 0, n + 1, 0), (width, width, 0, size), width)
+    add_rows(found, found, pivots, found, found, (size * width, none, 0, n + 1, 0), (width, width, 0, size, width))
     known = known + found[size, n + 1]
     clock = found[size, n + 2] / known
     for c in range(n + 1):
@@ -438,6 +438,6 @@ def _take_off(work: Work, h: int, size: int, n: int, known: float) -> None:
     pivots[1, size] = 1.0 / known
     for c in range(n):
         places = (h * n + c) * row, (h * of + c) * of, pivots.shape[1], c, 0
-        add_rows(new_covariance, spread, pivots, found, found, places, (width, width, 0, size + 1), whole_lanes(c + 1))
+        add_rows(new_covariance, spread, pivots, found, found, places, (width, width, 0, size + 1, whole_lanes(c + 1)))
         for e in range(c):
             new_covariance[h, e, c] = new_covariance[h, c, e]
