@@ -128,6 +128,9 @@ def test_a_position_belongs_to_the_nearest_epoch() -> None:
     milli = np.timedelta64(1, "ms")
     found = np.array([time[2] - 300 * milli, time[2] + 100 * milli, time[0] + 500 * milli, np.datetime64("NaT")])
     assert rows_at_epochs(time, found).tolist() == [-1, -1, 1, -1]
+    # no nearer than 0.4 of the interval is none, and one epoch has no interval
+    assert rows_at_epochs(time, time[:2] + 400 * milli).tolist() == [-1] * 4
+    assert rows_at_epochs(time[:1], found[:1]).tolist() == [-1]
 
 
 def _changed(cases: Path, folder: Path, change: Callable[[Path], object]) -> Path:

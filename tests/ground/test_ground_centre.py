@@ -188,6 +188,13 @@ def _centre(path: str, pipe: Connection) -> None:
             pipe.send(sequence)
 
 
+def test_the_last_of_several_records_of_a_train_is_kept(tmp_path: Path) -> None:
+    with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
+        store.save(TrainRecord(train=3, sequence=1), TrainRecord(train=1, sequence=5))
+        store.save(TrainRecord(train=1, sequence=6), TrainRecord(train=1, sequence=7))
+        assert [(train, record.sequence) for train, record in store.records().items()] == [(1, 7), (3, 1)]
+
+
 @pytest.mark.parametrize("kills", [8, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_killed_centre_loses_no_acknowledged_report(tmp_path: Path, kills: int) -> None:

@@ -11,6 +11,7 @@ import pytest
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import fields, sign_magnitude, signed, unsigned
 from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.measurements import frame_time
 from test_receiver_logs import ubx_frame
 
 pytestmark = pytest.mark.requirement("A8")
@@ -288,6 +289,13 @@ def test_glonass_strings_are_of_one_frame(began_s: int, records: int, clock: str
         date = ubx_frame(0x0107, struct.pack("<IHBB3xB80x", round(now * 1000), 2019, 11, 26, 3))
         parts += [string, empty_epoch(now) if clock == "RXM-RAWX" else date]
     assert epochs_of_records(parts) == ["2019-11-26T21:45:00.000000000"] * records
+
+
+def test_a_glonass_frame_just_after_a_leap_second() -> None:
+    """At 00:00:10 GPS time of 1 January 2017 it is 23:59:53 UTC: the 18th second comes between."""
+    now = np.datetime64("2017-01-01T00:00:10", "ns")
+    began = {"hour": 2.0 * 3600.0, "minute": 59.0 * 60.0, "half_minute": 30.0}  # Moscow, three hours ahead
+    assert frame_time(began, now) == np.datetime64("2016-12-31T23:59:47", "ns")
 
 
 @pytest.mark.parametrize(

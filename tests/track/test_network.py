@@ -50,6 +50,16 @@ def test_near_agrees_with_every_segment_of_every_track() -> None:
         assert len(got) >= min(len(expected), 8)
 
 
+def test_near_takes_more_tracks_than_samples_at_first() -> None:
+    """Fifty tracks side by side; the last positions, taken in a part of their own, lie away from all."""
+    tracks = tuple(segment(f"T{k}", *to_degrees(np.array([0.0, 400.0]), np.full(2, 0.5 * k))) for k in range(50))
+    north = np.r_[np.full(256, 10.0), np.full(10, 400.0)]
+    found = Network(tracks=tracks, links=()).near(*to_degrees(np.full(266, 200.0), north), most=40)
+    assert found.track.shape == (266, 40)
+    assert (found.track[:256] >= 0).all()
+    assert (found.track[256:] == -1).all()
+
+
 def test_near_finds_the_farther_tracks_of_a_densely_drawn_yard() -> None:
     """Twelve tracks with a point each metre: hundreds of segments lie nearer than the outer track."""
     x = np.arange(0.0, 400.0)

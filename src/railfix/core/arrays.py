@@ -81,7 +81,10 @@ def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
 
 
 def join_rows(parts: Sequence[Rows]) -> Rows:
-    """Return a dataclass with the rows of several one after the other, and the other fields of the first."""
+    """Return a dataclass with the rows of several one after the other, and the other fields of the first.
+
+    All have the arrays that the first has.
+    """
     tables = [_row_arrays(part) for part in parts]
     return replace(parts[0], **{name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -49,10 +50,12 @@ _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 
 
 def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
-    """Find the row of a log nearest to each epoch, within 0.4 of the median interval; -1 without one, shape (T,)."""
+    """Find the row of a log nearest to each epoch, closer than 0.4 of the median interval; -1 for none, shape (T,)."""
     rows = np.full(len(time), -1, dtype=np.intp)
     known = np.flatnonzero(~np.isnat(found))
-    near_ns = int(_NEAR * np.median(np.diff(time).astype(np.int64)))
+    if len(time) < 2:
+        return rows
+    near_ns = math.ceil(_NEAR * np.median(np.diff(time).astype(np.int64))) - 1
     index = nearest_rows(time, found[known], within_ns=near_ns)
     near = np.flatnonzero(index >= 0)
     away = np.abs(found[known[near]] - time[index[near]])

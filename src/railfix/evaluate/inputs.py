@@ -200,7 +200,7 @@ def read_table(
     if not len(rows):
         raise InputFileError(file, "has no rows; there is nothing to evaluate")
     rows = rows if rows["time_gpst"].is_sorted() else rows.sort("time_gpst", maintain_order=True)
-    if rows.select("antenna", "time_gpst").is_duplicated().any():
+    if rows.select("antenna", "time_gpst").drop_nulls().is_duplicated().any():
         raise InputFileError(file, "has an antenna twice at one time; expected one row per epoch and antenna")
     return file, rows
 

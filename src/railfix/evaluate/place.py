@@ -58,9 +58,9 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
     left = right - 1
     step = seconds(reference_time[right] - reference_time[left])
     share = seconds(time - reference_time[left]) / step
-    exact = (share == 0.0) | (share == 1.0)
+    at = np.where(time == reference_time[left], left, right)
+    exact = time == reference_time[at]
     inside = (share > 0.0) & (share < 1.0) & (step <= largest_gap_s)
-    at = np.where(share == 1.0, right, left)
     return Bracket(
         left=np.where(exact, at, left),
         right=np.where(exact, at, right),

@@ -146,7 +146,7 @@ class Store:
     def records(self) -> dict[int, TrainRecord]:
         """Return the records of all trains: unknown until they are heard, with their last places."""
         with self._connection.begin():
-            rows = self._connection.execute(sql.select(TRAINS)).all()
+            rows = self._connection.execute(sql.select(TRAINS).order_by(TRAINS.c.train)).all()
         return {
             row.train: TrainRecord(
                 train=row.train,
@@ -178,8 +178,8 @@ class Store:
         return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
 
     def _put(self, key: sql.Column[Any], rows: list[dict[str, Any]]) -> None:
-        """Put rows in the place of those with the same key."""
-        if rows:
+        """Put rows in the place of those with the same key, the last of several with one."""
+        if rows := list({row[key.name]: row for row in rows}.values()):
             self._connection.execute(
                 key.table.delete().where(key == sql.bindparam("of")), [{"of": row[key.name]} for row in rows]
             )

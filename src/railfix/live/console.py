@@ -7,6 +7,7 @@ the satellites, the track against the positions.
 from __future__ import annotations
 
 import asyncio
+import copy
 import logging
 import logging.handlers
 import re
@@ -75,6 +76,9 @@ class _Behind(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Hand over one line or record."""
+        if self._line is None:  # arguments may change before they are written
+            record = copy.copy(record)
+            record.msg, record.args = record.getMessage(), None
         self._outlet.send(record if self._line is None else self._line.format(record))
 
 

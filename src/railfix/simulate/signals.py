@@ -149,7 +149,7 @@ class Simulation:
             approximate_ecef_m=np.round(place, -2 if antenna in ANTENNAS else 4),
             interval_s=self.scenario.interval_s,
             leap_seconds=self.navigation.leap_seconds,
-            signals=signals_by_system(*(np.array(part) for part in zip(*self.channels, strict=True))),
+            signals=signals_by_system(*np.array(self.channels, dtype=np.str_).reshape(-1, 2).T),
         )
 
     def pieces(self, antenna: str, *, chunk_epochs: int = CHUNK_EPOCHS) -> Iterator[Piece]:

@@ -183,7 +183,7 @@ def alignment_at(
 
 def plan_starts(plan: Sequence[PlanElement]) -> Floats:
     """Length in plan at the start of each element, shape (elements,) [m]."""
-    return np.cumsum([0.0, *(element.length_m for element in plan[:-1])])
+    return np.cumsum([0.0, *(element.length_m for element in plan)])[:-1]
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:

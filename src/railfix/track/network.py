@@ -203,10 +203,10 @@ class Network:
         reach = float((steps[segment] / pieces).max(initial=0.0)) / 2.0
         return cKDTree(samples, balanced_tree=False), of, track, reach
 
-    def _samples_near(self, points_m: Floats, within_m: float) -> tuple[Floats, Indices]:
-        """Distance and number of every sample near each point, shape (n, k); infinite where there are fewer."""
+    def _samples_near(self, points_m: Floats, within_m: float, least: int) -> tuple[Floats, Indices]:
+        """Distance and number of every sample near each point, `least` at least; infinite where there are fewer."""
         tree, _, _, reach = self._index
-        count, short = _SAMPLES, np.arange(len(points_m))
+        count, short = max(_SAMPLES, least), np.arange(len(points_m))
         distance, sample = np.full((len(points_m), count), np.inf), np.zeros((len(points_m), count), dtype=np.intp)
         while len(short):
             more = ((0, 0), (0, count - distance.shape[1]))
@@ -229,7 +229,7 @@ class Network:
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         _, segment, of_track, _ = self._index
         usable = ~np.isnan(points[:, 0])
-        distance, sample = self._samples_near(np.where(usable[:, None], points, 0.0), within_m)
+        distance, sample = self._samples_near(np.where(usable[:, None], points, 0.0), within_m, most)
         present = np.isfinite(distance)
         of, track = segment[sample], np.where(present, of_track[sample], -1)
         start, step = self.points_m[of], self.points_m[of + 1] - self.points_m[of]

@@ -8,6 +8,7 @@ The 72, 1200 and 528 symbols of B-CNAV1 are its three subframes, the bits of eac
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -140,8 +141,8 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
         "MeasEpoch without time": int(np.count_nonzero(~dated & ~scrambled)),
         "scrambled MeasEpoch": int(np.count_nonzero(scrambled)),
     }
-    pairs = [pair for _, found in whole for pair in found]
-    place, master = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+    pairs = chain.from_iterable(chain.from_iterable(found for _, found in whole))
+    place, master = np.fromiter(pairs, dtype=np.intp).reshape(-1, 2).T
     epoch = np.repeat(np.arange(len(whole)), np.array([len(found) for _, found in whole], dtype=np.intp))
     rows = head[np.array([row for row, _ in whole], dtype=np.intp)]
     main = frames.data[place + (place == master)] >> 5 == 0
