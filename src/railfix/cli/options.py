@@ -15,8 +15,8 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import typer
 from pydantic import ValidationError
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import SettingsError
-from railfix.core.frozen import dataclass
 from railfix.core.settings import INPUTS, Settings, option, read_toml
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
 from railfix.run.output import FileKind, Overwrite, check_output_file

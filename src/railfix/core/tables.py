@@ -14,9 +14,8 @@ import numpy as np
 import polars as pl
 from polars.exceptions import PanicException, PolarsError
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, dataclass
 from railfix.core.errors import InputFileError
-from railfix.core.frozen import dataclass
 
 
 @contextmanager

@@ -11,9 +11,8 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.evaluate.figures import Score, score
 from railfix.evaluate.place import along_track_error, interpolate_reference

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from pydantic import Field
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_text
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, load_settings
 from railfix.evaluate.inputs import EvaluationOptions
 from railfix.pipeline.config import Config

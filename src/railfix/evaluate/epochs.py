@@ -8,9 +8,8 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, places_in_groups
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass, places_in_groups
 from railfix.core.errors import MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import EvaluationOptions, RunFolder, Sections, floats
 from railfix.evaluate.integrity import PARTS, STATED

@@ -11,9 +11,9 @@ from typing import Any, Final
 import polars as pl
 import polars.selectors as cs
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
-from railfix.core.frozen import dataclass
 from railfix.evaluate.epochs import antenna_epochs, below
 from railfix.evaluate.figures import ALL, KEYS, USED, figures_by
 from railfix.evaluate.inputs import (

@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Integers, Masks, dataclass
 from railfix.core.reasons import Status
 from railfix.evaluate.inputs import EvaluationOptions, floats
 

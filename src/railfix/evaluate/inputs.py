@@ -13,9 +13,8 @@ import polars.selectors as cs
 from polars.exceptions import PolarsError
 from pydantic import AfterValidator, Field
 
-from railfix.core.arrays import Floats, Strings
+from railfix.core.arrays import Floats, Strings, dataclass
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import reading_table

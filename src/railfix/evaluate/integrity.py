@@ -12,8 +12,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Masks, Strings, dataclass
 from railfix.evaluate.figures import ALL, KEYS, PASSED
 from railfix.evaluate.inputs import WINDOWS_S, EvaluationOptions, floats
 from railfix.integrity.stanford import Region, Stanford, stanford

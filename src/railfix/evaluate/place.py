@@ -14,9 +14,8 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, dataclass
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
-from railfix.core.frozen import dataclass
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder

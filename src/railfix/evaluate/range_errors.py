@@ -14,10 +14,9 @@ import numpy as np
 from pydantic import Field
 
 from railfix import __version__
-from railfix.core.arrays import Datetimes, Floats, Strings, join_rows
+from railfix.core.arrays import Datetimes, Floats, Strings, dataclass, join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import file_sha256
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings, option

@@ -12,8 +12,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Strings, freeze_arrays, freeze_rows
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import (
+    Datetimes,
+    Floats,
+    FrozenArrays,
+    Integers,
+    Strings,
+    dataclass,
+    freeze_arrays,
+    freeze_rows,
+)
 from railfix.core.tables import NotebookTable, plural, time_span_text
 
 

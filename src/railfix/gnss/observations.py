@@ -16,9 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, changed, dataclass, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
-from railfix.core.frozen import changed, dataclass
 from railfix.core.tables import NotebookTable, plural, time_span_text
 from railfix.core.timescale import gps_time
 

@@ -16,8 +16,7 @@ from typing import Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from railfix.core.arrays import Floats, freeze_arrays
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, dataclass, freeze_arrays
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage
 

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 from pydantic import Field
 
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import dataclass
 from railfix.core.settings import Settings
 
 _HEAD: Final = struct.Struct("!BIQq")

@@ -22,8 +22,8 @@ from typing import Any, Final
 import numpy as np
 from pydantic import Field
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, along, overlap
 

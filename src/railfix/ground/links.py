@@ -16,9 +16,8 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen, read_revoked

@@ -11,9 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass, freeze_arrays
 from railfix.core.errors import MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations

@@ -20,9 +20,8 @@ import numpy as np
 import polars as pl
 from pydantic import Field, model_validator
 
-from railfix.core.arrays import Codes, Floats, Integers, Masks, freeze_arrays
+from railfix.core.arrays import Codes, Floats, Integers, Masks, dataclass, freeze_arrays
 from railfix.core.errors import SettingsError
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option
 from railfix.ground.station_fixes import StationFixes
 

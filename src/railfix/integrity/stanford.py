@@ -20,8 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks, dataclass
 
 _BINS: Final = 100  #: Bins of an axis, up to twice the alarm limit.
 _GAP: Final = 1.5  #: Epochs whose distance is over this many usual intervals stand across a gap.

@@ -9,10 +9,9 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Integers, Strings
+from railfix.core.arrays import Floats, Integers, Strings, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
-from railfix.core.frozen import dataclass
 
 _BLOCK: Final = 4096  #: Rows that are read before they become compact.
 

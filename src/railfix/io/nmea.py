@@ -10,10 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes
+from railfix.core.arrays import Datetimes, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, ending, read_text, read_text_lines
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import SECONDS_PER_DAY, from_week, timedelta, utc_to_gpst
 from railfix.gnss.observations import first_problems

@@ -9,10 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers
+from railfix.core.arrays import Datetimes, Floats, Integers, dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending, read_text
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import misspelt
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, timedelta, utc_to_gpst

@@ -15,10 +15,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, dataclass, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending
-from railfix.core.frozen import dataclass
 from railfix.core.tables import reading_table
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns

@@ -14,7 +14,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import dataclass
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate

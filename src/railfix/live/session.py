@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import dataclass
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput

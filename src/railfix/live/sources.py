@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TypeVar, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import open_stream
-from railfix.core.frozen import dataclass
 from railfix.live.settings import LiveSettings
 
 Item = TypeVar("Item")

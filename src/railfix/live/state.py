@@ -20,9 +20,9 @@ from typing import Any, Final
 import numpy as np
 
 import railfix
+from railfix.core.arrays import dataclass
 from railfix.core.errors import OutputError
 from railfix.core.files import file_sha256
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.live.engine import EngineState
 from railfix.live.stream import ReceiverState

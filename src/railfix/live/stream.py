@@ -16,9 +16,8 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Indices
+from railfix.core.arrays import Bytes, Indices, dataclass
 from railfix.core.errors import InputFileError
-from railfix.core.frozen import dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx

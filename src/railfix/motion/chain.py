@@ -12,8 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, dataclass
 
 
 @dataclass(frozen=True, kw_only=True)

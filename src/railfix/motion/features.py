@@ -11,8 +11,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Floats
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, dataclass
 from railfix.track.trajectory import Trajectory
 
 #: Quantities of a feature.

@@ -12,9 +12,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, freeze_rows
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, freeze_rows
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import nearest_rows
 
 #: The ratio is taken over windows of this length [ns] with so many speeds, of a train faster than this [m/s].

@@ -25,9 +25,8 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Codes, Floats
+from railfix.core.arrays import Codes, Floats, dataclass
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 
 

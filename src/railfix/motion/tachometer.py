@@ -11,9 +11,8 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, dataclass
 from railfix.core.errors import MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.io.reference_log import Pulses

@@ -9,9 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, changed
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import changed
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds

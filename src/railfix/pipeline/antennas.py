@@ -14,8 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Datetimes, Floats, Masks, read_only
-from railfix.core.frozen import changed
+from railfix.core.arrays import Datetimes, Floats, Masks, changed, read_only
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.pipeline.config import Config

@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises

@@ -7,9 +7,8 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import SettingsError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations

@@ -7,9 +7,8 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.positioning.carrier import (

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, changed, dataclass, read_only
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
-from railfix.core.frozen import changed, dataclass
 from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations, carrier_frequency_hz

@@ -9,8 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, kernel_array
-from railfix.core.frozen import changed, dataclass
+from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed, dataclass, kernel_array
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states

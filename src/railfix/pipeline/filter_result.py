@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Masks, dataclass
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, read_only
+from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, changed, dataclass, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import changed, dataclass
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.interference import (

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Floats, Masks
+from railfix.core.arrays import Codes, Floats, Masks, changed
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
-from railfix.core.frozen import changed
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.integrity.protection import (

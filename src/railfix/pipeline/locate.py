@@ -8,9 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, dataclass
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Masks
-from railfix.core.frozen import changed, dataclass
+from railfix.core.arrays import Masks, changed, dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples

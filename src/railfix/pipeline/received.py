@@ -7,9 +7,8 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Strings
+from railfix.core.arrays import Floats, Strings, dataclass
 from railfix.core.errors import SettingsError
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.orbits.prepared_records import VALIDITY_S, validity_s

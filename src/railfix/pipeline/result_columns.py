@@ -15,8 +15,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Floats
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.reasons import Status
 from railfix.integrity.interference import Suspicion, cause_text
 from railfix.integrity.protection import Cause, LevelStatus

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings
-from railfix.core.frozen import changed, dataclass
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings, changed, dataclass
 from railfix.core.reasons import Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.gnss.orbits import SatelliteStates

@@ -8,9 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, dataclass
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.motion.features import (
     HALF_LENGTH_M,

@@ -9,8 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Masks
-from railfix.core.frozen import changed, dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks, changed, dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.features import HALF_LENGTH_M, SCALE_SIGMA

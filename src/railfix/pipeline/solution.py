@@ -9,9 +9,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, changed, dataclass
 from railfix.core.constants import CLOCK_GROUP
-from railfix.core.frozen import changed, dataclass
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import LinearModel

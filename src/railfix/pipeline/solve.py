@@ -16,8 +16,7 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, kernel_array
-from railfix.core.frozen import changed, dataclass
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed, dataclass, kernel_array
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Strings, dataclass
 from railfix.core.reasons import Reason, reason_text
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m

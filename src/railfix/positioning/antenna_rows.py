@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, dataclass
 from railfix.gnss.observations import Observations, stack_parts
 from railfix.positioning.section_search import SearchIndex
 from railfix.track.trajectory import between_points

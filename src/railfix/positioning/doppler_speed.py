@@ -18,9 +18,8 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass, freeze_arrays
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.settings import Settings
 from railfix.gnss.navigation import Navigation, glonass_channels

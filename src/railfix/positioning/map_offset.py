@@ -16,8 +16,7 @@ from pydantic import Field
 from scipy.special import chdtri, chndtrinc
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks, dataclass, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import RangeArrays, Ranges, SinglePoint

@@ -24,8 +24,7 @@ from pydantic import Field
 from scipy.special import ndtri, stdtrit
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, kernel_array
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint

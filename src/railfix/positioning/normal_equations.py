@@ -21,9 +21,8 @@ import numpy as np
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, kernel_array
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, dataclass, kernel_array
 from railfix.core.constants import CLOCK_GROUP
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.track.trajectory import Trajectory
 

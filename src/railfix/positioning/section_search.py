@@ -19,9 +19,8 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.arrays import Floats, Indices, Integers, dataclass
 from railfix.core.constants import FAN_OUT, ROTATION_GRADIENT
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations
 from railfix.track.trajectory import Trajectory

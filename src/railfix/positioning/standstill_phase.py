@@ -15,8 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import logsumexp
 
-from railfix.core.arrays import Floats, Integers
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Integers, dataclass
 
 _WITHIN: Final = 40.0  #: Vectors whose square exceeds the least by more are not looked for: exp(-20) of its likelihood.
 _ROUNDING: Final = 1e-9  #: Exchange of two unknowns must shrink the conditional variance by more than rounding.

@@ -19,8 +19,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.windows import correlated_sums

@@ -17,8 +17,7 @@ import numpy as np
 from pydantic import Field
 from scipy.special import chdtrc, logsumexp
 
-from railfix.core.arrays import Floats, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Masks, Strings, dataclass
 from railfix.core.settings import Settings, option
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 

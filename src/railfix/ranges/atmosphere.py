@@ -8,9 +8,8 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Datetimes, Floats
+from railfix.core.arrays import Bits, Datetimes, Floats, dataclass
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import angles_of, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 

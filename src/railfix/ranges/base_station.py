@@ -9,8 +9,7 @@ from typing import Final, TypeVar
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings, dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 

@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator
 
-from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Floats, Integers, Masks, Strings, dataclass, read_only
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, read_model_file, write_toml
 from railfix.gnss.observations import ObservationHeader
 

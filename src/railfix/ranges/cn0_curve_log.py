@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 
 from railfix import __version__
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import BrokenLines, file_sha256
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import elevation_azimuth
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation

@@ -13,9 +13,8 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, dataclass
 from railfix.core.constants import CLOCK_GROUP, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.gnss.navigation import Navigation, glonass_channels

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 
-from railfix.core.arrays import Floats, Integers
+from railfix.core.arrays import Floats, Integers, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option, read_model_file, write_toml
 
 __all__ = [

@@ -15,8 +15,7 @@ import numpy as np
 from pydantic import Field
 from scipy.special import betaincinv, ndtri
 
-from railfix.core.arrays import Floats, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Integers, Masks, dataclass
 from railfix.core.settings import Settings, option
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 

@@ -15,10 +15,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.arrays import Datetimes, Floats, Indices, dataclass
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import MismatchError, NoPositionError
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import Acceleration, Pulses

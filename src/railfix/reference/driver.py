@@ -16,9 +16,9 @@ import polars as pl
 from pydantic import Field
 
 from railfix import __version__
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import BrokenLines
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, option
 from railfix.gnss.observations import concatenate
 from railfix.io.logs import read_navigation

@@ -11,8 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, cheapest_path
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, cheapest_path, dataclass
 from railfix.core.geodesy import sigma_along
 from railfix.core.settings import Settings, option
 from railfix.core.timescale import nearest_rows, seconds

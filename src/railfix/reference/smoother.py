@@ -12,8 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, places_in_groups
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, dataclass, places_in_groups
 from railfix.core.timescale import nearest_rows, seconds, timedelta
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps

@@ -12,9 +12,9 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import RailfixError
 from railfix.core.files import write_whole
-from railfix.core.frozen import dataclass
 from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
 from railfix.evaluate.inputs import POSITIONS_TABLE, floats, read_table, tables_of

@@ -19,10 +19,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from railfix import __version__
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_json_object, write_whole
-from railfix.core.frozen import dataclass
 from railfix.core.tables import Table, number, plural, share
 from railfix.core.timescale import seconds
 from railfix.report.plots.chart import Cells, Chart, Layer, Points, SkyEpochs

@@ -14,11 +14,10 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Strings
+from railfix.core.arrays import Floats, Strings, dataclass
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import enu_axes
 from railfix.core.tables import reading_table
 from railfix.core.timescale import gps_time

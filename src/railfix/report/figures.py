@@ -9,9 +9,8 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, dataclass
 from railfix.core.errors import InputFileError
-from railfix.core.frozen import dataclass
 from railfix.core.tables import Table, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.evaluate.inputs import floats

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED

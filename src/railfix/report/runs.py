@@ -10,8 +10,8 @@ from typing import Any, Final
 import polars as pl
 import polars.selectors as cs
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
-from railfix.core.frozen import dataclass
 from railfix.core.tables import reading_table
 from railfix.evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.evaluate.evaluation import EvaluatedRun, short_names

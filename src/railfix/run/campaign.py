@@ -15,9 +15,9 @@ from typing import Any, Final, Protocol
 
 import polars as pl
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, MismatchError, OutputError, RailfixError, SettingsError
 from railfix.core.files import write_whole
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, load_settings
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files

@@ -10,9 +10,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError, RailfixError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import Navigation

@@ -14,8 +14,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from railfix import __version__
-from railfix.core.arrays import Floats
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation

@@ -10,10 +10,9 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Integers
+from railfix.core.arrays import Datetimes, Floats, Integers, dataclass
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, ending, write_whole
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation

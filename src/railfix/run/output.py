@@ -20,8 +20,8 @@ from threading import Thread
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import OutputError
-from railfix.core.frozen import dataclass
 
 if TYPE_CHECKING:
     import polars as pl

@@ -15,9 +15,9 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix import __version__
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_json_object, source_commit
-from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.core.settings import Model, validated
 from railfix.core.tables import Table, count, number, reading_table, share

@@ -13,9 +13,8 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass
 from railfix.core.errors import MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import nearest_rows
 from railfix.gnss.navigation import Navigation

@@ -13,9 +13,8 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, dataclass
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta
 from railfix.motion.samples import GroundUnits, InertialSamples, RadarSpeeds, RadarWatch, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds

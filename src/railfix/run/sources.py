@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import BrokenLines
-from railfix.core.frozen import dataclass
 from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import scan_observations

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, dataclass
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus

@@ -17,10 +17,9 @@ import networkx as nx
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import read_json_object, write_whole
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, option
 from railfix.gnss.observations import Observations, concatenate

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Strings, medians
+from railfix.core.arrays import Floats, Strings, changed, dataclass, medians
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import changed, dataclass
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings

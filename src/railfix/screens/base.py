@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix import kernels
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, kernel_array
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, dataclass, kernel_array
 from railfix.core.constants import CLOCK_GROUP
-from railfix.core.frozen import dataclass
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
 from railfix.core.timescale import nearest_rows

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Strings, dataclass
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve

@@ -21,9 +21,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Strings, freeze_arrays, medians, read_only
+from railfix.core.arrays import Datetimes, Floats, Strings, changed, dataclass, freeze_arrays, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import changed, dataclass
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds

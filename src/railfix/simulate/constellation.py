@@ -15,10 +15,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, take_rows
+from railfix.core.arrays import Datetimes, Floats, Indices, dataclass, take_rows
 from railfix.core.constants import BDT_MINUS_GPST_S, EARTH_ROTATION_RATE, GM_GPS, SPEED_OF_LIGHT
 from railfix.core.errors import MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GM, ROTATION, Orbits, kepler_state

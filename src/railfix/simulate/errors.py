@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.constants import EARTH_ROTATION_RATE
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
 from railfix.simulate.constellation import newest_record, record_state

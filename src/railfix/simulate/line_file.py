@@ -16,10 +16,9 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from railfix.core.arrays import Floats, places_in_groups, take_rows
+from railfix.core.arrays import Floats, dataclass, places_in_groups, take_rows
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.simulate.settings import (
     Between,

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.simulate.alignment import Alignment
 from railfix.simulate.errors import RandomFunction

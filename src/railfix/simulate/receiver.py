@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Masks
+from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, dataclass
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.gnss.navigation import KeplerRecords
 from railfix.gnss.observations import ObservationHeader
 from railfix.simulate.constellation import newest_record

@@ -29,9 +29,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
-from railfix.core.frozen import dataclass
 from railfix.core.settings import read_toml, validated
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion

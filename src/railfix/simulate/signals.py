@@ -9,9 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks, dataclass
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation

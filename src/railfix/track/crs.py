@@ -15,10 +15,9 @@ from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
-from railfix.core.frozen import dataclass
 
 #: Three-dimensional codes of the realisations of the ITRF.
 _ITRF: Final = {

@@ -14,9 +14,8 @@ from typing import Final
 import numpy as np
 from pyproj import CRS, Transformer
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.errors import InputFileError
-from railfix.core.frozen import dataclass
 from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, unit_of_grid
 from railfix.track.frames import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment

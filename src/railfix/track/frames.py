@@ -22,10 +22,9 @@ from pyproj.crs import CompoundCRS
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import CRSError, ProjError
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import FilePath, read_text
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.crs import (
     HELD,

@@ -10,9 +10,8 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, dataclass
 from railfix.core.errors import InputFileError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at
 from railfix.core.settings import Settings
 from railfix.core.tables import plural

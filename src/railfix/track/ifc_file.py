@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, read_text
-from railfix.core.frozen import dataclass
 from railfix.track.crs import LARGEST_SCALE, choose_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, plan_starts, segment_of_design
 from railfix.track.route import MapReading, Segment

@@ -15,9 +15,18 @@ from typing import TYPE_CHECKING, Final, cast
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, join_rows, places_in_groups, read_only, take_rows
+from railfix.core.arrays import (
+    Floats,
+    Indices,
+    Integers,
+    Masks,
+    dataclass,
+    join_rows,
+    places_in_groups,
+    read_only,
+    take_rows,
+)
 from railfix.core.errors import MismatchError, SettingsError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files
 from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage

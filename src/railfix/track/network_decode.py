@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, dataclass, read_only
 from railfix.track.network import Candidates, Network
 
 #: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0:

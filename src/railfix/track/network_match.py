@@ -9,10 +9,9 @@ from typing import Any, Final, Unpack
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, take_rows
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, dataclass, take_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import FilePath, ending
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions

@@ -11,10 +11,9 @@ import networkx as nx
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, read_text
-from railfix.core.frozen import dataclass
 from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
 from railfix.track.read import read_segments

@@ -11,8 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog

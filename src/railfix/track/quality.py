@@ -11,8 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.settings import Settings
 from railfix.core.tables import plural
 from railfix.track.track import HEIGHTS_M, Geometry, Track, geometry_of, kilometrage_breaks, mean_gradients

@@ -10,9 +10,8 @@ from typing import TypedDict
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.crs import older_datum_note
 from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, Provenance, Track

@@ -13,8 +13,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, freeze_arrays, read_only
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass, freeze_arrays, read_only
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.tables import NotebookTable, plural
 

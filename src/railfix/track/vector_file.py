@@ -19,10 +19,9 @@ from xml.etree.ElementTree import ParseError, iterparse
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, open_stream
-from railfix.core.frozen import dataclass
 from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights
 from railfix.track.frames import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment

@@ -11,10 +11,9 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import FilePath
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import axes_at, enu_axes
 from railfix.core.settings import Settings, load_settings
 from railfix.track.from_positions import ANTENNA_PATH

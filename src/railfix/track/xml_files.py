@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, file_sha256, open_stream, read_bytes
-from railfix.core.frozen import dataclass
 from railfix.track.crs import choose_crs
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, segment_of_design
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment

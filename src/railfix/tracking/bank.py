@@ -11,7 +11,7 @@ from typing import Final
 
 from scipy.special import ndtri
 
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import dataclass
 from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits

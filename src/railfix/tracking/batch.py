@@ -20,9 +20,8 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.arrays import Datetimes, Floats, Indices, dataclass
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 from railfix.tracking.epochs import GnssEpochs

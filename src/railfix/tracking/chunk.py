@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass
 from railfix.core.timescale import seconds
 from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits

@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass
 
 
 class Kind(IntEnum):

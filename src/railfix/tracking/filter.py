@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats
-from railfix.core.frozen import changed
+from railfix.core.arrays import Datetimes, Floats, changed
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import layout
 from railfix.tracking import bank

@@ -16,8 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks
-from railfix.core.frozen import changed, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, changed, dataclass
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import SCALE_BOUND
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs

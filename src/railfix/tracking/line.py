@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Floats
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, dataclass
 from railfix.track.trajectory import Trajectory, joins_m
 
 

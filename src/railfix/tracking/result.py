@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, dataclass
 from railfix.kernels.tracking import constants
 from railfix.tracking.epochs import Kind
 

@@ -6,8 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, dataclass
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import (

@@ -16,8 +16,7 @@ from dataclasses import field
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Masks, Strings, dataclass
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.search import SplitHypothesis
 from railfix.tracking.state import SATELLITES, StateIndex, TrackState

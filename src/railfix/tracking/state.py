@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Masks, Strings, dataclass
 from railfix.tracking.epochs import Previous
 
 #: Letters of the receiver clocks of codes, in the order of their offsets in the state.

@@ -11,9 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.motion.chain import singer_steps
 from railfix.tracking.limits import TrackingLimits

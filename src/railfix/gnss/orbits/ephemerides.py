@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, dataclass
 from railfix.core.constants import (
     EARTH_ROTATION_RATE,
     EARTH_ROTATION_RATE_BEIDOU,
@@ -23,7 +23,6 @@ from railfix.core.constants import (
     PZ90_SEMI_MAJOR_AXIS,
     SPEED_OF_LIGHT,
 )
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, PreciseEphemeris
 

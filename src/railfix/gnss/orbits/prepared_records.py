@@ -18,9 +18,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits

@@ -8,9 +8,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation, PreciseEphemeris
 from railfix.gnss.orbits.ephemerides import kepler_state, precise_clock_s, precise_state

@@ -11,8 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, held
 

@@ -22,10 +22,9 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.special import ndtr
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings, read_toml, validated
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 

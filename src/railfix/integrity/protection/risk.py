@@ -22,9 +22,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 from scipy.special import comb, ndtri
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 

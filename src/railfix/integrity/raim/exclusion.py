@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 from scipy.special import chdtri
 
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, dataclass
 from railfix.core.constants import LEAST_REDUNDANCY
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.integrity.raim.model import Compact, LinearModel, compact, constrained_model
 from railfix.positioning.normal_equations import Ranges

@@ -16,8 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, kernel_array
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass, kernel_array
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri, chndtrinc, ndtri
 
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Indices, Masks, dataclass
 from railfix.core.constants import LEAST_REDUNDANCY
-from railfix.core.frozen import dataclass
 from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.model import LinearModel, compact
 

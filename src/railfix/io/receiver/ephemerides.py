@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, dataclass
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages

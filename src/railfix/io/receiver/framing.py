@@ -14,9 +14,19 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, join_rows, take_rows
+from railfix.core.arrays import (
+    Bytes,
+    Datetimes,
+    Floats,
+    Indices,
+    Integers,
+    Masks,
+    Strings,
+    dataclass,
+    join_rows,
+    take_rows,
+)
 from railfix.core.files import FilePath, open_stream
-from railfix.core.frozen import dataclass
 
 #: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
 LONGEST_FRAME: Final = 16_384

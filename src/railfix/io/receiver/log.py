@@ -14,10 +14,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Integers
+from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, open_stream
-from railfix.core.frozen import dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.position_log import PositionLog

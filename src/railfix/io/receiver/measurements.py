@@ -10,8 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, join_rows
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, join_rows
 from railfix.core.timescale import from_week, gpst_to_utc, nearest_day, nearest_week, to_week
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.receiver import nav_messages

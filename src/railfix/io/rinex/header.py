@@ -10,10 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import ByteStream, FilePath
-from railfix.core.frozen import dataclass
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, columns_of
 

@@ -11,10 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, Paths, path_names, read_text_lines
-from railfix.core.frozen import dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.header import read_version
 from railfix.io.rinex.navigation_records import (

@@ -8,8 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Integers, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Integers, Strings, dataclass
 from railfix.core.timescale import bdt_to_gpst, nearest_day, nearest_week, seconds, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 

@@ -15,10 +15,9 @@ from typing import Final, get_args
 
 import numpy as np
 
-from railfix.core.arrays import Integers, Masks
+from railfix.core.arrays import Integers, Masks, dataclass
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, ByteStream, FilePath, Paths, open_stream, path_names
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import bdt_to_gpst, gps_time, utc_to_gpst
 from railfix.gnss.observations import Observations, channels_with_data, concatenate
 from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes

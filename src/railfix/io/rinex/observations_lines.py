@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Bytes, Integers, Masks, take_rows
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Bytes, Integers, Masks, dataclass, take_rows
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")

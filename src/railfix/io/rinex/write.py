@@ -15,10 +15,9 @@ from typing import IO, Final, Literal, cast, get_args
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, dataclass
 from railfix.core.errors import OutputError
 from railfix.core.files import FilePath, hatanaka_program, stage_file
-from railfix.core.frozen import dataclass
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.observations_lines import KINDS
 

@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.observation_model import IntegerChannels, Linearised, OwnUnknowns, PhaseClocks, Phases

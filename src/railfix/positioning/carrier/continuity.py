@@ -14,8 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, read_only
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, read_only
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds

@@ -19,8 +19,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass
 from railfix.core.geodesy import range_with_rotation
 from railfix.positioning.normal_equations import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory

@@ -18,9 +18,8 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, medians, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations, carrier_frequency_hz

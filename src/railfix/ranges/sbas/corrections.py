@@ -9,8 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.ranges.sbas.dfmc import MASK_S, DfmcService

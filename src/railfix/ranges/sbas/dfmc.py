@@ -28,9 +28,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass
 from railfix.core.constants import EARTH_ROTATION_RATE
-from railfix.core.frozen import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation

@@ -12,10 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Integers
+from railfix.core.arrays import Bytes, Integers, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
 from railfix.io.receiver.framing import SbasFrames, head_of, is_receiver_log
 from railfix.io.receiver.log import scan_pieces

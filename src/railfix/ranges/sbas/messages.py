@@ -9,8 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, freeze_rows
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, dataclass, freeze_rows
 from railfix.io.receiver.framing import crc24q
 
 Band = Literal["L1", "L5"]  #: Frequency that messages are sent on, and corrections made for.

@@ -7,8 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.prepared_records import issue_records

@@ -10,8 +10,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Integers, Masks, dataclass, freeze_arrays
 from railfix.core.settings import Settings
 
 #: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).

@@ -10,8 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Integers, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Integers, Masks, dataclass
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.ranges.sbas.decode import (
     BLOCK,

@@ -13,8 +13,7 @@ from typing import ClassVar, Final, Literal
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Indices, Integers, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Integers, Strings, dataclass
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import floats
 

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Masks
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Status
 from railfix.report.plots.chart import (

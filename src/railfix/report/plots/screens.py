@@ -12,9 +12,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks, dataclass
 from railfix.core.errors import InputFileError, OutputError
-from railfix.core.frozen import dataclass
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.pipeline.config import Config

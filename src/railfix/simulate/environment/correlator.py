@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fresnel
 
-from railfix.core.arrays import Complexes, Floats, Indices
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Complexes, Floats, Indices, dataclass
 from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSettings
 
 Singles = NDArray[np.float32]

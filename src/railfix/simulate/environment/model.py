@@ -8,9 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings, dataclass
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.frozen import dataclass
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import carrier_frequency_hz
 from railfix.simulate.environment.correlator import (

@@ -22,8 +22,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from railfix.core.arrays import Datetimes, Floats, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Datetimes, Floats, Strings, dataclass
 from railfix.simulate.settings import (
     AngleBetween,
     Between,

@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Strings
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Strings, dataclass
 from railfix.simulate.environment.settings import Kind, RoofSettings, RowSettings, SectionSettings, TreeSettings
 from railfix.simulate.settings import Between
 

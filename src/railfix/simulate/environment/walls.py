@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, take_rows
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, dataclass, take_rows
 from railfix.simulate.environment.correlator import (
     circular_reflection,
     cross_polar_gain,

@@ -13,8 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from railfix.core.arrays import Floats, Indices, Integers
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Integers, dataclass
 from railfix.core.geodesy import axes_at
 from railfix.core.tables import plural
 from railfix.track.from_positions import ANTENNA_PATH

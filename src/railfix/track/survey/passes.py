@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, Indices, Integers
-from railfix.core.frozen import dataclass
+from railfix.core.arrays import Floats, Indices, Integers, dataclass
 from railfix.track.survey.runs import SurveyLimits
 
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one line.

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from railfix.core import frozen
+from railfix.core import arrays
 
 
 def made_by(dataclass: Callable[..., Any]) -> tuple[type[Any], type[Any]]:
@@ -39,7 +39,7 @@ def made_by(dataclass: Callable[..., Any]) -> tuple[type[Any], type[Any]]:
     return Place, Mast
 
 
-OURS, THEIRS = made_by(frozen.dataclass), made_by(dataclasses.dataclass)
+OURS, THEIRS = made_by(arrays.dataclass), made_by(dataclasses.dataclass)
 
 
 @pytest.mark.parametrize("which", [0, 1])
@@ -65,7 +65,7 @@ def test_equal_values_are_equal_and_unequal_classes_are_not() -> None:
     with pytest.raises(TypeError, match="unhashable"):
         hash(place(chainage_m=1.0))  # a list among its values
 
-    @frozen.dataclass(frozen=True)
+    @arrays.dataclass(frozen=True)
     class Pair:
         """Two numbers."""
 
@@ -96,7 +96,7 @@ def test_fields_cannot_be_assigned_or_deleted() -> None:
 
 
 def test_methods_of_its_own_are_kept() -> None:
-    @frozen.dataclass(frozen=True)
+    @arrays.dataclass(frozen=True)
     class Own:
         """A number that equals all."""
 
@@ -112,7 +112,7 @@ def test_methods_of_its_own_are_kept() -> None:
     assert repr(Own(1)) == "own"
 
 
-@frozen.dataclass(frozen=True, kw_only=True)
+@arrays.dataclass(frozen=True, kw_only=True)
 class Carried:
     """What another process receives."""
 
@@ -123,11 +123,11 @@ class Carried:
 def test_copies_are_equal() -> None:
     one = Carried(value=1, more=(2, 3))
     assert pickle.loads(pickle.dumps(one)) == one
-    assert dataclasses.replace(one, value=2) == frozen.changed(one, value=2) == Carried(value=2, more=(2, 3))
+    assert dataclasses.replace(one, value=2) == arrays.changed(one, value=2) == Carried(value=2, more=(2, 3))
 
 
 def test_others_are_those_of_the_standard_library() -> None:
-    @frozen.dataclass(kw_only=True)
+    @arrays.dataclass(kw_only=True)
     class Counted:
         """A number that changes."""
 
