@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -168,3 +168,21 @@ def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
     assert exact.covariance_m2[0, 0, 0] == pytest.approx(1.0 / information, rel=1e-9)
     alike = np.repeat(axes[:, :1], 3, axis=1)
     assert np.isnan(model_on_line(ranges, place, alike, 1e12, 1e12).covariance_m2).all()
+
+
+def test_epochs_of_another_model_are_put_in_whole():
+    """Ranges without one satellite of each system at some epochs: every field is that of the epoch's own ranges."""
+    arc = np.linspace(100.0, 1900.0, 8)
+    ranges = oracle.made(arc, "GGGGEEEE", seed=5, tie_sigma_m=(0.0, 1.0))
+    weight = ranges.weight.copy()
+    weight[[2, 5], 1] = weight[[2, 5], 6] = 0.0
+    fewer, rows = replace(ranges, weight=weight), np.array([2, 5])
+    whole = constrained_model(fewer, oracle.LINE, arc)
+    before = constrained_model(ranges, oracle.LINE, arc)
+    patched = before.patched(rows, constrained_model(fewer.take(rows), oracle.LINE, arc[rows]))
+    for item in fields(whole):
+        found, expected = getattr(patched, item.name), getattr(whole, item.name)
+        if isinstance(expected, np.ndarray):
+            assert np.array_equal(found, expected), item.name
+    assert patched.residual == pytest.approx(whole.residual, abs=1e-12)
+    assert not np.array_equal(before.freedom, whole.freedom)
