@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import raim_oracle as oracle
 import synthetic
+from railfix import kernels
 from railfix.integrity.raim import constrained_model
 from railfix.integrity.raim.model import compact, model_on_line
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, constrained_position, single_point
@@ -113,6 +114,8 @@ def test_unused_channels_leave_no_trace():
     assert (model.residual[:, [2, 5, 7]] == 0).all()
     assert (model.redundancy[:, [2, 5, 7]] == 0).all()
     assert np.isnan(model.sigma_m[:, [2, 5, 7]]).all()
+    _, _, rows, _ = kernels.ranges.reduced_equations(part.arrays, oracle.LINE.at_arc(arc))
+    assert (rows[:, :, [2, 5, 7]] == 0).all()
     parts = compact(model)
     assert parts.projector.shape == (10, 6, 6)
     assert parts.channel[0].tolist() == [0, 1, 3, 4, 6, 8]
