@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import raim_oracle as oracle
 import synthetic
+from railfix import kernels
 from railfix.integrity.raim import constrained_model
 from railfix.integrity.raim.model import compact, model_on_line
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, constrained_position, single_point
@@ -113,6 +114,8 @@ def test_unused_channels_leave_no_trace():
     assert (model.residual[:, [2, 5, 7]] == 0).all()
     assert (model.redundancy[:, [2, 5, 7]] == 0).all()
     assert np.isnan(model.sigma_m[:, [2, 5, 7]]).all()
+    _, _, rows, _ = kernels.ranges.reduced_equations(part.arrays, oracle.LINE.at_arc(arc))
+    assert (rows[:, :, [2, 5, 7]] == 0).all()
     parts = compact(model)
     assert parts.projector.shape == (10, 6, 6)
     assert parts.channel[0].tolist() == [0, 1, 3, 4, 6, 8]
@@ -168,3 +171,21 @@ def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
     assert exact.covariance_m2[0, 0, 0] == pytest.approx(1.0 / information, rel=1e-9)
     alike = np.repeat(axes[:, :1], 3, axis=1)
     assert np.isnan(model_on_line(ranges, place, alike, 1e12, 1e12).covariance_m2).all()
+
+
+def test_epochs_of_another_model_are_put_in_whole():
+    """Ranges without one satellite of each system at some epochs: every field is that of the epoch's own ranges."""
+    arc = np.linspace(100.0, 1900.0, 8)
+    ranges = oracle.made(arc, "GGGGEEEE", seed=5, tie_sigma_m=(0.0, 1.0))
+    weight = ranges.weight.copy()
+    weight[[2, 5], 1] = weight[[2, 5], 6] = 0.0
+    fewer, rows = replace(ranges, weight=weight), np.array([2, 5])
+    whole = constrained_model(fewer, oracle.LINE, arc)
+    before = constrained_model(ranges, oracle.LINE, arc)
+    patched = before.patched(rows, constrained_model(fewer.take(rows), oracle.LINE, arc[rows]))
+    for item in fields(whole):
+        found, expected = getattr(patched, item.name), getattr(whole, item.name)
+        if isinstance(expected, np.ndarray):
+            assert np.array_equal(found, expected), item.name
+    assert patched.residual == pytest.approx(whole.residual, abs=1e-12)
+    assert not np.array_equal(before.freedom, whole.freedom)

@@ -342,3 +342,32 @@ def test_phases_of_the_filter_are_without_troposphere_and_satellite_clocks() -> 
     for other, sign in ((delayed, -1.0), (changed(ranges, satellites=later), 1.0)):
         change = gnss_epochs(other, scale, config, None)[0].phase_m - phase
         np.testing.assert_allclose(change[used], (sign * rising + 0.0 * change)[used], atol=1e-6)
+
+
+@pytest.mark.requirement("B4")
+def test_exclusions_in_the_middle_of_a_chunk_are_those_of_their_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise scale, place and level of the epochs with a fault, as in a chunk that begins with them."""
+    change, original, scales = with_fault(80.0), solve.exclude, []
+    change[:20] = 0.0
+
+    def spied(model: Any, *, limits: Any, scale: np.ndarray) -> Any:
+        scales.append(scale)
+        return original(model, limits=limits, scale=scale)
+
+    monkeypatch.setattr(solve, "exclude", spied)
+    observations, config = with_code(front(), change), parse_config({"filter": "off", **BASE})
+    processor = EpochProcessor(config, {"front": clean_trajectories()["front"]}, navigation=clean_navigation())
+    whole = processor.process({"front": observations})[0].antennas["front"]
+    assert (whole.raim.outcome == Outcome.PASSED).tolist() == [True] * 20 + [False] * 20
+    _, state = processor.process({"front": observations[:20]})
+    part = processor.process({"front": observations[20:]}, state)[0].antennas["front"]
+    of_whole, of_part = (scale for scale in scales if len(scale) == 20)  # others are second attempts
+    assert len(set(of_whole.tolist())) > 10
+    np.testing.assert_allclose(of_whole, of_part, rtol=1e-12)
+    assert whole.protection is not None
+    assert part.protection is not None
+    for found, expected in (
+        (whole.along_sigma_m, part.along_sigma_m), (whole.chainage_m, part.chainage_m),
+        (whole.protection.level.level_m, part.protection.level.level_m),
+    ):  # fmt: skip
+        np.testing.assert_allclose(found[20:], expected, rtol=1e-9)

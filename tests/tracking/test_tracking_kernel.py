@@ -10,6 +10,7 @@ import pytest
 
 from plain_kernels import plain
 from railfix.core.arrays import changed
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.kernels.tracking import layout
 from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
@@ -17,6 +18,7 @@ from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.filter import Recursion
 from railfix.tracking.handover import Handover
 from railfix.tracking.state import CLOCKS, OFFSETS, StateIndex
+from railfix.tracking.velocity import compute_velocity
 from tracking_cases import Ride, bent_line, part, reflected, ride, without_epochs
 
 
@@ -317,3 +319,30 @@ def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
         banks.append(after.bank.covariance[:, StateIndex.ARC, StateIndex.ARC])
     assert own[1] - own[0] > 0.5
     np.testing.assert_allclose(banks[1] - banks[0], own[1] - own[0], rtol=0.02)
+
+
+@pytest.mark.requirement("E5")
+def test_velocities_by_phases_or_dopplers_are_those_of_each_epoch_alone() -> None:
+    """Eight places of the Earth; phases at every second epoch, Dopplers at all."""
+    random, count = np.random.default_rng(6), 8
+    latitude, longitude = np.full(count, 35.0), np.linspace(-150.0, 150.0, count)
+    near, axes = ecef_from_geodetic(latitude, longitude, 40.0), enu_axes(latitude, longitude)
+    local = random.normal(size=(count, 9, 3))
+    local[..., 2] = np.abs(local[..., 2]) + 0.3
+    local /= np.linalg.norm(local, axis=2, keepdims=True)
+    sat = near[:, None] + 2.3e7 * local @ axes
+    motion = 12.0 * axes[:, 0] + 5.0 * axes[:, 1]
+    ranges = [range_with_rotation(sat, (near + ahead * motion)[:, None])[0] for ahead in (-0.5, 0.0, 1e-3)]
+    measured = np.stack([ranges[1], ranges[1] - ranges[0] + 3.0, (ranges[2] - ranges[1]) / 1e-3 + 6.0])
+    has = np.ones(measured.shape, dtype=bool)
+    has[1, 1::2] = False
+    variance = np.full(measured.shape, 1e-4)
+    given = [near, sat, np.zeros(sat.shape), sat, measured, has, variance, np.full(count, 0.5)]
+    whole = compute_velocity(*given)  # type: ignore[arg-type]
+    np.testing.assert_allclose(whole.velocity_mps, motion, atol=0.02)
+    np.testing.assert_array_equal(whole.age_s, [0.25, 0.0] * 4)
+    for t in range(count):
+        rows = [slice(t, t + 1) if len(a) == count else np.s_[:, t : t + 1] for a in given]
+        alone = compute_velocity(*(a[row] for a, row in zip(given, rows, strict=True)))  # type: ignore[arg-type]
+        np.testing.assert_allclose(alone.velocity_mps[0], whole.velocity_mps[t], atol=1e-9)
+        np.testing.assert_allclose(alone.covariance[0], whole.covariance[t], rtol=1e-9)
