@@ -371,3 +371,18 @@ def test_exclusions_in_the_middle_of_a_chunk_are_those_of_their_epochs(monkeypat
         (whole.protection.level.level_m, part.protection.level.level_m),
     ):  # fmt: skip
         np.testing.assert_allclose(found[20:], expected, rtol=1e-9)
+
+
+@pytest.mark.requirement("A4")
+def test_far_from_the_line_the_anchor_is_the_position_and_its_place_the_nearest() -> None:
+    """A map of another region, 300 km away: the arc length is that of the nearest point of the line."""
+    trajectory = clean_trajectories()["front"]
+    middle = trajectory.ecef_m[len(trajectory.ecef_m) // 2]
+    along = trajectory.ecef_m - middle
+    far = replace(trajectory, ecef_m=middle + 3e5 * np.array([0.0, 0.6, 0.8]) + along)
+    processor = EpochProcessor(parse_config(BASE), {"front": far}, navigation=clean_navigation())
+    ranges = processor.screened({"front": front()})[0].corrected
+    nearest, _ = far.nearest(ranges.anchor_ecef_m)
+    assert (np.linalg.norm(ranges.anchor_ecef_m - far.at_arc(nearest), axis=1) > 2e5).all()
+    np.testing.assert_allclose(ranges.anchor_arc_m, nearest, atol=1e-6)
+    assert (nearest > 100.0).all()
