@@ -31,7 +31,6 @@ from railfix.pipeline.tables import (
     train_table,
     with_smoothed,
 )
-from railfix.run.batch_check import BatchCheck
 from railfix.run.output import OutputFolder
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sources import OpenedLine
@@ -39,6 +38,8 @@ from railfix.tracking import Line
 
 if TYPE_CHECKING:
     import polars as pl
+
+    from railfix.run.batch_check import BatchCheck
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
@@ -342,6 +343,14 @@ class ResultRows:
             self.folder.append_parquet(f"{name}.parquet", table)
             if name != "observations":
                 self.folder.append_csv(f"{name}.csv", rounded(table))
+
+    def compare_batches(self) -> list[str]:
+        """Compare the filter with the batches after the last chunk; return a note an antenna."""
+        if not self.batches:
+            return []
+        from railfix.run.batch_check import add_batch
+
+        return add_batch(self.batches, self.folder)
 
 
 #: Notes on balises that a run gives.
