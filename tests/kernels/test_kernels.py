@@ -437,3 +437,11 @@ def test_what_the_compiler_has_found_for_types_is_not_looked_for_again(monkeypat
     assert BaseFunction.get_call_type is count
     additions = [args for function, args in asked if function is operator.add]
     assert len(additions) == len(set(additions)) > 0
+
+
+def test_plain_kernels_do_not_warn_of_integers_that_wrap_around() -> None:
+    """Places of line ends and digits are found by whole words, in which a borrow or a carry beyond the end is meant."""
+    text = np.frombuffer(b"> 2024 03 05\nG05  20000000.123\n" * 20, dtype=np.uint8)
+    with np.errstate(all="raise"):
+        found = plain("reading").line_ends(text)
+    np.testing.assert_array_equal(found, np.flatnonzero(text == 10))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from inspect import unwrap
 from typing import Any
 
 import numpy as np
@@ -141,7 +142,7 @@ def test_the_update_of_each_sub_filter_keeps_its_digits(monkeypatch: pytest.Monk
     case = ride(40, noise=1.0, seed=5)
     phase = np.where(np.arange(case.epochs.phase_m.shape[1]) == 0, case.epochs.phase_m, np.nan)
     advance = plain("tracking.recursion").advance
-    names: dict[str, Any] = advance.__globals__["advance_subfilters"].__globals__
+    names: dict[str, Any] = unwrap(advance).__globals__["advance_subfilters"].__globals__
     update, errors = names["_update"], list[float]()
 
     def updated(inputs: Any, t: int, rows: Any, best: int, work: Any, h: int) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 import numba
+import numpy as np
 from llvmlite import binding, ir
 from numba.core import cgutils, environment, event, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
@@ -162,7 +163,8 @@ def borrowing_kernel(function: Function) -> Function:
 
 def _kernel(function: Function, options: dict[str, Any]) -> Function:
     if numba.config.DISABLE_JIT or _is_left(function):  # type: ignore[attr-defined]
-        return function
+        # Machine code does not warn: integers that wrap around, divisions by zero and NaN are meant.
+        return np.errstate(all="ignore")(function)
     try:
         code = _CodeOnDisk(function)
     except RuntimeError as error:
