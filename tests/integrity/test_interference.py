@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import fields
 
 import numpy as np
@@ -23,7 +24,7 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion import MotionInputs
+from railfix.integrity.interference.motion import MotionInputs, MotionSigns
 
 LIMITS = InterferenceLimits()
 START = np.datetime64("2024-03-05T03:10:00", "ns")
@@ -160,19 +161,23 @@ def test_a_clock_that_steps_by_milliseconds_does_not_count() -> None:
     assert np.nanmax(np.abs(found.clock_jump_m)) < 5.0
 
 
-@pytest.mark.requirement("B8")
-def test_statistics_of_motion_are_the_same_whatever_the_chunks() -> None:
-    inputs = scene(jump=80.0, clock=200.0, parted=60.0)
-    whole, _ = motion_signs(inputs, MotionSignState(), LIMITS)
+def check_chunks(inputs: MotionInputs, edges: Iterable[int], whole: MotionSigns) -> None:
+    """Signs of chunks that end at these epochs equal those of the whole."""
     state, parts = MotionSignState(), []
-    of_channels = {"channel", "group"}
-    for a, b in itertools.pairwise(EDGES):
-        part = MotionInputs(*(v if n in of_channels else v[a:b] for n, v in inputs._asdict().items()))
+    for a, b in itertools.pairwise(edges):
+        part = MotionInputs(*(v if n in ("channel", "group") else v[a:b] for n, v in inputs._asdict().items()))
         signs, state = motion_signs(part, state, LIMITS)
         parts.append(signs)
     for item in fields(whole):
         cut = np.concatenate([getattr(part, item.name) for part in parts])
         np.testing.assert_allclose(cut, getattr(whole, item.name), rtol=1e-9, atol=1e-6, err_msg=item.name)
+
+
+@pytest.mark.requirement("B8")
+def test_statistics_of_motion_are_the_same_whatever_the_chunks() -> None:
+    inputs = scene(jump=80.0, clock=200.0, parted=60.0)
+    whole, _ = motion_signs(inputs, MotionSignState(), LIMITS)
+    check_chunks(inputs, EDGES, whole)
 
 
 @pytest.mark.requirement("B8")
@@ -185,15 +190,7 @@ def test_an_epoch_without_a_position_is_compared_with_nothing_whatever_the_chunk
     whole, _ = motion_signs(inputs, MotionSignState(), LIMITS)
     assert np.isnan(whole.position_jump_m[[24, 31]]).all()
     assert whole.position_jump_m[25] > 60.0
-    state, parts = MotionSignState(), []
-    for k in range(len(inputs.time)):
-        one = inputs._asdict().items()
-        part = MotionInputs(*(v if n in ("channel", "group") else v[k : k + 1] for n, v in one))
-        signs, state = motion_signs(part, state, LIMITS)
-        parts.append(signs)
-    for item in fields(whole):
-        cut = np.concatenate([getattr(part, item.name) for part in parts])
-        np.testing.assert_allclose(cut, getattr(whole, item.name), rtol=1e-9, atol=1e-6, err_msg=item.name)
+    check_chunks(inputs, range(len(inputs.time) + 1), whole)
 
 
 @pytest.mark.requirement("B8")
