@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 import tracking_cases
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -73,7 +73,7 @@ def chain(rounds: int) -> None:
     epochs = sum(len(log) for log in logs.values())
     for which in ("off", "track"):
         config = Config(filter=which)
-        run = lambda config=config: processor_of(config, navigation, paths).process(logs)  # noqa: E731
+        run = lambda config=config: make_processor(config, navigation, paths).process(logs)  # noqa: E731
         run()
         spent = median_us(run, epochs, rounds)
         print(f"demonstration, filter {which:10s}     {spent:8.1f} us an antenna-epoch", flush=True)

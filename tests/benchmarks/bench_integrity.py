@@ -40,7 +40,7 @@ from railfix.ranges.error_model import ErrorModel, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fit_bins
 from railfix.ranges.sbas import SbasCorrections, read_sbas
 from railfix.run.driver import RunOptions
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -111,7 +111,7 @@ def once(processor: EpochProcessor, log: Log) -> float:
 
 def rounds_of(log: Log, choices: list[Choice], rounds: int) -> None:
     """All choices in turn, a first round of each not counted."""
-    processors = [processor_of(parse_config(c.settings), log.navigation, {"front": log.trajectory}) for c in choices]
+    processors = [make_processor(parse_config(c.settings), log.navigation, {"front": log.trajectory}) for c in choices]
     for number in range(rounds + 1):
         for choice, processor in zip(choices, processors, strict=True):
             spent = once(processor, log)
@@ -121,7 +121,7 @@ def rounds_of(log: Log, choices: list[Choice], rounds: int) -> None:
 
 def table(title: str, log: Log, choices: list[Choice]) -> None:
     """Times, and what each choice adds to the first one."""
-    used = processor_of(parse_config({"filter": "off"}), log.navigation, {"front": log.trajectory}).process(
+    used = make_processor(parse_config({"filter": "off"}), log.navigation, {"front": log.trajectory}).process(
         {"front": log.observations[:3000]}
     )[0]
     print(f"\n{title}: {len(log.observations)} epochs, {np.median(used.antennas['front'].n_used):.0f} satellites used")
@@ -139,7 +139,7 @@ def table(title: str, log: Log, choices: list[Choice]) -> None:
 def parts_of_sbas(log: Log, rounds: int) -> None:
     """The engine's own functions on what the run gives them, chunk by chunk: least of the rounds."""
     config = parse_config({"filter": "off", "protection": "off", "sbas": [str(MESSAGES)]})
-    found = processor_of(config, log.navigation, {"front": log.trajectory}).process({"front": log.observations})[0]
+    found = make_processor(config, log.navigation, {"front": log.trajectory}).process({"front": log.observations})[0]
     result, engine = found.antennas["front"], SbasCorrections.from_log(read_sbas(MESSAGES))
     satellite, size = result.satellite[result.columns], RunOptions().chunk_epochs
     place = log.trajectory.ecef_m[0]
@@ -174,7 +174,7 @@ def parts_of_sbas(log: Log, rounds: int) -> None:
 
 def profiled(log: Log, settings: dict[str, Any]) -> None:
     """Where the time of one choice goes."""
-    processor = processor_of(parse_config(settings), log.navigation, {"front": log.trajectory})
+    processor = make_processor(parse_config(settings), log.navigation, {"front": log.trajectory})
     once(processor, log)
     profile = cProfile.Profile()
     profile.runcall(once, processor, log)

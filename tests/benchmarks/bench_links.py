@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from railfix.ground.demo import LinkDisturbance, RelaySettings
-from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, bearers_of
+from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, create_bearers
 from railfix.ground.quic import write_keys
 
 #: Namespaces, and addresses of both bearers in each.
@@ -183,7 +183,7 @@ async def send(transport: str, folder: Path, rate: float, seconds: float) -> lis
         links = TrainLinks(
             1,
             folder,
-            bearers_of({b: (HOSTS["c"][b], PORTS[b]) for b in BEARERS}, HOSTS["t"]),
+            create_bearers({b: (HOSTS["c"][b], PORTS[b]) for b in BEARERS}, HOSTS["t"]),
             mode=transport.split(", ")[1],
         )  # type: ignore[arg-type]
         await links.start()

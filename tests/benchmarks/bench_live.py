@@ -30,7 +30,7 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -63,7 +63,7 @@ def prepared(
     track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
     observations = {name: read_observations(files[name])[:epochs] for name in ("front", "rear")}
     trajectories = {name: antenna_trajectory(track, vehicle, name) for name in observations}
-    return processor_of(config or Config(filter="off"), read_navigation(files["nav"]), trajectories), observations
+    return make_processor(config or Config(filter="off"), read_navigation(files["nav"]), trajectories), observations
 
 
 def milliseconds(

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import paths
 import belief_campaign
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 
 
 def main() -> int:
@@ -31,7 +31,9 @@ def main() -> int:
         case = known[name]()
         rates = []
         for _ in range(args.rounds + 1):
-            processor = processor_of(parse_config({"filter": args.filter}), case.navigation, {"front": case.trajectory})
+            processor = make_processor(
+                parse_config({"filter": args.filter}), case.navigation, {"front": case.trajectory}
+            )
             wall, processor_s = time.perf_counter(), time.process_time()
             processor.process({"front": case.observations})
             rates.append((time.perf_counter() - wall, time.process_time() - processor_s))

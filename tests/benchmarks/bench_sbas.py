@@ -21,12 +21,12 @@ ARRIVALS = 100
 
 def arrivals(log: SbasMessages) -> tuple[list[float], int]:
     """Milliseconds of the last messages of a log, and how many are kept at its end."""
-    state = SbasState(prn=137).received(log.take(np.arange(len(log) - ARRIVALS)))
+    state = SbasState(prn=137).add_messages(log.take(np.arange(len(log) - ARRIVALS)))
     took_ms = []
     for row in range(len(log) - ARRIVALS, len(log)):
         message = log.take(np.array([row]))
         began = time.perf_counter()
-        state = state.received(message).kept_from(message.time[0])
+        state = state.add_messages(message).drop_before(message.time[0])
         _ = state.corrections
         took_ms.append(1e3 * (time.perf_counter() - began))
     return took_ms, len(state.messages)
@@ -35,7 +35,7 @@ def arrivals(log: SbasMessages) -> tuple[list[float], int]:
 def main() -> None:
     """Print median and largest."""
     hour = read_sbas(HOUR)
-    took_ms, kept = arrivals(replace(hour, time=hour.time - np.timedelta64(3600, "s")).joined(hour))
+    took_ms, kept = arrivals(replace(hour, time=hour.time - np.timedelta64(3600, "s")).merge(hour))
     print(f"median {np.median(took_ms):.1f} ms, largest {max(took_ms):.1f} ms, {kept} messages kept")
 
 

@@ -34,7 +34,7 @@ STAGES: Final = (
     ("anchor", "railfix.pipeline.corrected_ranges", "_anchor"),
     ("angles", "railfix.pipeline.corrected_ranges", "SeenFrom.of"),
     ("atmosphere", "railfix.pipeline.corrected_ranges", "model_delays"),
-    ("screens of one antenna", "railfix.pipeline.processor", "EpochProcessor._screened"),
+    ("screens of one antenna", "railfix.pipeline.processor", "EpochProcessor._screen_antennas"),
     ("screens of the antenna pair", "railfix.pipeline.processor", "judge_pairs"),
     ("screens of the antenna pair", "railfix.pipeline.processor", "position_verdicts"),
     ("screens of the antenna pair", "railfix.pipeline.processor", "EpochProcessor._pair"),

@@ -111,7 +111,7 @@ def test_a_defect_shows_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object) -> None:
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("railfix.cli.run.settings_of", broken)
+    monkeypatch.setattr("railfix.cli.run.resolve_settings", broken)
     arguments = ["run", "--front", "a", "--nav", "b", "--track", "c", "--out", "d"]
     result = RUNNER.invoke(app, arguments)
     assert result.exit_code == 1
@@ -122,7 +122,7 @@ def test_an_error_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> None:
         raise errors.SettingsError("a sentence\nover lines")
 
-    monkeypatch.setattr("railfix.cli.run.settings_of", refused)
+    monkeypatch.setattr("railfix.cli.run.resolve_settings", refused)
     result = RUNNER.invoke(app, ["run", "--front", "a", "--nav", "b", "--track", "c", "--out", "d"])
     assert result.exit_code == 4
     assert result.stderr == "railfix: error: a sentence over lines\n"

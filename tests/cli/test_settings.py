@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from broken_bench import Bench, bench_in
 from railfix.cli import app
-from railfix.cli.options import Choices, settings_of
+from railfix.cli.options import Choices, resolve_settings
 from railfix.core.errors import SettingsError
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, load_config, parse_config
 
@@ -59,18 +59,18 @@ def test_other_keys_stand_over_the_preset(tmp_path: Path) -> None:
 def test_the_command_line_stands_over_the_file(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text('preset = "p1"\nscreens = ["elevation", "doppler", "raim"]\n[elevation]\nmask_deg = 12.0\n')
-    config, asked = settings_of(Choices(config=path))
+    config, asked = resolve_settings(Choices(config=path))
     assert (config.preset, config.screens) == ("p1", ("elevation", "doppler", "raim"))
-    config, asked = settings_of(
+    config, asked = resolve_settings(
         Choices(config=path, preset="default", setting=("elevation.mask_deg=17",), without=("doppler",))
     )
     assert (config.preset, config.raim.mode, config.elevation.mask_deg) == ("default", "chi_square", 17.0)
     assert config.screens == ("elevation", "raim")
     assert asked["screens"] == ["elevation", "raim"]
-    assert settings_of(Choices(config=path, screens="cn0"))[0].screens == ("cn0",)
-    assert settings_of(Choices(config=path, screens="none"))[0].screens == ()
+    assert resolve_settings(Choices(config=path, screens="cn0"))[0].screens == ("cn0",)
+    assert resolve_settings(Choices(config=path, screens="none"))[0].screens == ()
     both = Choices(config=path, screens="cn0, raim,elevation", without=("raim", "cn0"))
-    assert settings_of(both)[0].screens == ("elevation",)
+    assert resolve_settings(both)[0].screens == ("elevation",)
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_wrong_settings_in_python_are_named_as_on_the_command_line(values: dict[
 )
 def test_what_is_misspelt_is_named_with_what_is_known(choices: Choices, words: list[str]) -> None:
     with pytest.raises(SettingsError) as error:
-        settings_of(choices)
+        resolve_settings(choices)
     assert [word for word in words if word not in str(error.value)] == []
 
 

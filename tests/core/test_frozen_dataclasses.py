@@ -123,7 +123,7 @@ class Carried:
 def test_copies_are_equal() -> None:
     one = Carried(value=1, more=(2, 3))
     assert pickle.loads(pickle.dumps(one)) == one
-    assert dataclasses.replace(one, value=2) == arrays.changed(one, value=2) == Carried(value=2, more=(2, 3))
+    assert dataclasses.replace(one, value=2) == arrays.copy_with(one, value=2) == Carried(value=2, more=(2, 3))
 
 
 def test_others_are_those_of_the_standard_library() -> None:

@@ -17,7 +17,7 @@ import synthetic
 from conftest import ROOT
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.settings import validated
+from railfix.core.settings import validate
 from railfix.core.timescale import timedelta
 from railfix.evaluate import (
     BEYOND_COLUMNS,
@@ -34,7 +34,7 @@ from railfix.evaluate import (
 )
 from railfix.evaluate.epochs import distance_travelled, with_missing
 from railfix.evaluate.figures import block_limits
-from railfix.evaluate.inputs import read_sections, tables_of
+from railfix.evaluate.inputs import list_position_tables, read_sections
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.io.reference_log import AntennaReference
 from railfix.run import run_files
@@ -106,7 +106,7 @@ def test_another_table_of_the_same_run_stands_beside_the_positions(tmp_path: Pat
         **{f"{axis}_m": pl.Series(places[:, i]) for i, axis in enumerate("xyz")},
     )
     train.write_csv(run / "train.csv")
-    assert tables_of(run) == ["positions", "train"]
+    assert list_position_tables(run) == ["positions", "train"]
     truth = reference(time, place)
     both = [RunAndReference(run=run, reference=truth, table=name) for name in ("positions", "train")]
     found = evaluate_runs(both)
@@ -825,4 +825,4 @@ def test_levels_whose_kind_is_not_told(tmp_path: Path):
         with pytest.raises(InputFileError, match="alarm_limit_m"):
             evaluate_run(run, truth)
     with pytest.raises(SettingsError, match="alarm_limits_m"):
-        validated(EvaluationOptions, {"alarm_limits_m": (10.0, float("inf"))}, source="test")
+        validate(EvaluationOptions, {"alarm_limits_m": (10.0, float("inf"))}, source="test")

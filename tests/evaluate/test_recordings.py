@@ -18,7 +18,7 @@ import recordings_score
 from railfix.evaluate import Score, along_track_error, interpolate_reference
 from railfix.io import read_observations
 from railfix.io.position_log import read_positions
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 
 
 def hold(found: Score, *, rate: float, p50_m: float, p95_m: float, wrong_place: float) -> None:
@@ -74,7 +74,7 @@ def test_ranges_do_not_bend_with_the_order_of_the_log(recordings: Path):
     observations = recordings_score.read_observations(folder / "20210517.light-urban.tste.ublox.f9p.obs")
     navigation = recordings_score.read_navigation([folder / "hksc137c.nav"])
     trajectory = recordings_score.trajectory_of(*recordings_score.recordings_truth.urbannav_truth(folder))
-    processor = processor_of(recordings_score.SETTINGS, navigation, {"front": trajectory})
+    processor = make_processor(recordings_score.SETTINGS, navigation, {"front": trajectory})
     half, _ = processor.process({"front": observations[:300]})
     assert half.antennas["front"].arc_m == pytest.approx(whole.arc_m[:300], abs=1e-6, nan_ok=True)
 
@@ -214,7 +214,7 @@ def test_short_faults_on_a_curved_course_are_excluded(recordings: Path, size_m: 
     trajectory = recordings_score.trajectory_of(*recordings_score.recordings_truth.japan_truth(recordings))
     navigation = recordings_score.read_navigation([folder / "SEPT2650.21P"])
     config = recordings_score.parse_config({"filter": "off", "screens": ["elevation", "raim"]})
-    processor = processor_of(config, navigation, {"front": trajectory})
+    processor = make_processor(config, navigation, {"front": trajectory})
     clean = processor.process({"front": observations})[0].antennas["front"]
     epochs = np.arange(60, 360, 20)
     right = wrong = tried = 0

@@ -60,7 +60,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> dict[str, RunFolder]:
         return ["positions", "train"] if "filter" in found[path.name].positions.columns else ["positions"]
 
     monkeypatch.setattr(intervals, "read_run", read)
-    monkeypatch.setattr(intervals, "tables_of", tables)
+    monkeypatch.setattr(intervals, "list_position_tables", tables)
     return found
 
 

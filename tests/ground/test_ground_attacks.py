@@ -16,7 +16,7 @@ from attacked_line import run_sequence
 from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
 from railfix.ground import stops, supervision
-from railfix.ground.control import ControlCentre, orders_of
+from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.interlocking import (
     Interlocking,
     InterlockingLimits,
@@ -239,7 +239,7 @@ def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
     with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
         now = [10.0]
         control = centre(store, judged=False, clock=lambda: now[0])
-        orders = orders_of(control)
+        orders = list_orders(control)
         assert orders["stop"]({"train": 9}) == "there is no train 9"
         assert orders["stop"]({"train": 1}) is None
         assert control.snapshot()["trains"][0]["stop"] == "stopped by hand; not sent"

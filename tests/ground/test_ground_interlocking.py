@@ -30,7 +30,7 @@ from railfix.ground.interlocking import (
     stop_orders,
     to_documents,
 )
-from railfix.ground.layout import Layout, LoopStation, layout_of, overlap
+from railfix.ground.layout import Layout, LoopStation, derive_layout, overlap
 from railfix.ground.stops import close_section, open_section, release_train, stop_trains
 from railfix.ground.supervision import Supervision, compute_contradiction, report_received
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
@@ -332,7 +332,7 @@ def test_bytes_of_an_authority() -> None:
 def test_layout_of_a_network_map() -> None:
     """Three units of 2 km: 440 m of single line, two tracks of 1120 m 3.6 m apart, 440 m; the second is on the left."""
     network = made_network(9.0)
-    found = layout_of(network)
+    found = derive_layout(network)
     assert [s.name for s in found.stations] == ["02", "12", "22"]
     for k, station in enumerate(found.stations):
         # along the track aside, 0.24 m longer in each station
@@ -340,7 +340,7 @@ def test_layout_of_a_network_map() -> None:
         assert station.end_m == pytest.approx(2000.0 * k + 1560.0 + 0.24 * (k + 1), abs=0.1)
         # points of the map are 20 m apart: 2.67 m aside at 40 m, 3.6 m at 60 m, so 3.5 m at 57.8 m; steps of 2 m
         assert 57.8 <= station.points_m <= 57.8 + 2.0 + 1.0
-    right = layout_of(network, drive="right")
+    right = derive_layout(network, drive="right")
     assert [s.name for s in right.stations] == ["01", "11", "21"]
     # the files' order and directions do not matter
     turned = replace(
@@ -350,23 +350,23 @@ def test_layout_of_a_network_map() -> None:
             replace(link, first_end=1 - link.first_end, second_end=1 - link.second_end) for link in network.links
         ),
     )
-    assert [s.points_m for s in layout_of(turned).stations] == [s.points_m for s in found.stations]
-    assert layout_of(turned).stations[0].name in ("02", "21")
+    assert [s.points_m for s in derive_layout(turned).stations] == [s.points_m for s in found.stations]
+    assert derive_layout(turned).stations[0].name in ("02", "21")
 
 
 def test_networks_that_are_no_single_line_are_refused() -> None:
     network = made_network(9.0)
     with pytest.raises(MismatchError, match="passing loops; the interlocking needs two"):
-        layout_of(made_network(3.0))
+        derive_layout(made_network(3.0))
     with pytest.raises(MismatchError, match="4 open ends"):
-        layout_of(made_network(6.0, line_km=2.0))
+        derive_layout(made_network(6.0, line_km=2.0))
     without_one = replace(network, links=tuple(link for link in network.links if 2 not in (link.first, link.second)))
     with pytest.raises(MismatchError, match="open ends"):
-        layout_of(without_one)
+        derive_layout(without_one)
 
 
 def test_a_route_over_the_layout_of_a_network() -> None:
-    run = traffic(1, trains=3, layout=layout_of(made_network(9.0)))
+    run = traffic(1, trains=3, layout=derive_layout(made_network(9.0)))
     for _ in range(600):
         run.step()
     assert run.violations == Counter()

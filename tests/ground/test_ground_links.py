@@ -26,8 +26,8 @@ from railfix.ground.links import (
     LinkLimits,
     LinkMeter,
     TrainLinks,
-    bearers_of,
     coverage,
+    create_bearers,
     round_trips,
 )
 from railfix.ground.quic import LinkProtocol, configuration, connection, write_keys
@@ -263,7 +263,7 @@ def test_two_lossy_bearers_carry_each_message_once(keys: Path) -> None:
             relays[name].disturbance = AttackedLink(settings)
             await relays[name].open(HOSTS[name])
         train = TrainLinks(
-            7, keys, bearers_of({n: r.address for n, r in relays.items()}, LOCAL), received=orders.append
+            7, keys, create_bearers({n: r.address for n, r in relays.items()}, LOCAL), received=orders.append
         )
         await train.start()
         await _until(lambda: len(train.protocols) == 2, 8.0)
@@ -327,7 +327,7 @@ def test_each_threat_on_the_wire(tmp_path: Path) -> None:
                 relay.disturbance = AttackedLink(settings.replaced(seed=settings.seed + 10 * k))
                 relay.disturbance.settings = AttackSettings()  # until it is connected
             local = {"A": f"127.0.1.{40 + number}", "B": f"127.0.2.{40 + number}"}
-            given = bearers_of({n: relays[number, n].address for n in BEARERS}, local)
+            given = create_bearers({n: relays[number, n].address for n in BEARERS}, local)
             trains[number] = TrainLinks(number, tmp_path, given)
             await trains[number].start()
         await _until(lambda: all(len(train.protocols) == 2 for train in trains.values()), 10.0)
@@ -403,7 +403,7 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
         name = "train-8" if kind == "other train" else "train-7"
         (folder / "train-7.pem").write_bytes((source / f"{name}.pem").read_bytes())
         (folder / "train-7.key").write_bytes((source / f"{name}.key").read_bytes())
-        train = TrainLinks(7, folder, bearers_of(centre.addresses, LOCAL))
+        train = TrainLinks(7, folder, create_bearers(centre.addresses, LOCAL))
         if kind == "no certificate":
             import railfix.ground.links as links
 
@@ -441,7 +441,7 @@ def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
         got: Counter[int] = Counter()
         centre = CentreLinks(keys, HOSTS, received=lambda train, _: got.update([train]))
         await centre.start()
-        trains = {n: TrainLinks(n, keys, bearers_of(centre.addresses, LOCAL)) for n in (7, 8)}
+        trains = {n: TrainLinks(n, keys, create_bearers(centre.addresses, LOCAL)) for n in (7, 8)}
         for train in trains.values():
             await train.start()
 
@@ -488,7 +488,7 @@ def test_the_next_report_arrives_at_once_when_both_links_were_gone(keys: Path, o
         for name in BEARERS:
             await relays[name].open(HOSTS[name])
         limits = LinkLimits(answer_s=0.1)
-        train = TrainLinks(7, keys, bearers_of({n: r.address for n, r in relays.items()}, LOCAL), limits=limits)
+        train = TrainLinks(7, keys, create_bearers({n: r.address for n, r in relays.items()}, LOCAL), limits=limits)
         await train.start()
         await _until(lambda: len(train.protocols) == 2, 5.0)
         train.send(b"0")
@@ -524,7 +524,7 @@ def test_spare_mode_switches_and_returns(keys: Path) -> None:
             await relays[name].open(HOSTS[name])
         limits = LinkLimits(answer_s=0.1, misses=3, good=5, good_s=0.3)
         train = TrainLinks(
-            7, keys, bearers_of({n: r.address for n, r in relays.items()}, LOCAL), mode="spare", limits=limits
+            7, keys, create_bearers({n: r.address for n, r in relays.items()}, LOCAL), mode="spare", limits=limits
         )
         await train.start()
         await _until(lambda: len(train.protocols) == 2, 5.0)
@@ -558,7 +558,7 @@ def test_a_frame_and_its_answer_are_a_packet_each(keys: Path, monkeypatch: pytes
         got: list[bytes] = []
         centre = CentreLinks(keys, HOSTS, received=lambda train, _: centre.send(train, b"x"))
         await centre.start()
-        train = TrainLinks(7, keys, bearers_of(centre.addresses, LOCAL), received=got.append)
+        train = TrainLinks(7, keys, create_bearers(centre.addresses, LOCAL), received=got.append)
         await train.start()
         assert await _until(lambda: len(train.protocols) == 2, 5.0) < 5.0
         await asyncio.sleep(0.3)

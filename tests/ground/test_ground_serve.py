@@ -24,9 +24,9 @@ from typer.testing import CliRunner
 
 from railfix.cli.ground import app
 from railfix.ground.centre import ReferenceCurve
-from railfix.ground.control import ControlCentre, orders_of
+from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.interlocking import HEAD, Interlocking, TrainInterval, from_documents
-from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, bearers_of, first_sequence
+from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, create_bearers, first_sequence
 from railfix.ground.quic import write_keys
 from railfix.ground.serve import STEP_S, SimulatedPoints, _work, run_centre
 from railfix.ground.store import Store
@@ -110,7 +110,9 @@ def test_a_killed_centre_keeps_what_its_trains_know(folder: Path, tmp_path: Path
             newest.append(authority)
 
         limits = LinkLimits(idle_s=2.0)
-        links = TrainLinks(1, folder / "keys", bearers_of(addresses(folder), LOCAL), received=received, limits=limits)
+        links = TrainLinks(
+            1, folder / "keys", create_bearers(addresses(folder), LOCAL), received=received, limits=limits
+        )
         await links.start()
         process = await asyncio.to_thread(started, tmp_path)
         running.append(process)
@@ -185,7 +187,7 @@ def test_positions_go_to_the_centre_and_authorities_come_back(folder: Path, tmp_
         await begun.wait()
         train = asyncio.create_task(
             run_train(
-                1, folder / "keys", bearers_of(addresses(folder), LOCAL), lines=positions(),
+                1, folder / "keys", create_bearers(addresses(folder), LOCAL), lines=positions(),
                 limits=OnBoardLimits(fresh_s=4.0), write=lambda line: lines.append(json.loads(line)),
             )
         )  # fmt: skip
@@ -223,7 +225,7 @@ def test_a_train_whose_positions_end_waits_for_its_last_answer(folder: Path, tmp
         )
         await begun.wait()
         counts = await run_train(
-            1, folder / "keys", bearers_of(addresses(folder), LOCAL), lines=positions(),
+            1, folder / "keys", create_bearers(addresses(folder), LOCAL), lines=positions(),
             limits=OnBoardLimits(mode="spare"), write=lambda line: lines.append(json.loads(line)),
         )  # fmt: skip
         centre.cancel()
@@ -351,7 +353,7 @@ def test_routes_and_the_release_by_hand(
     centre: tuple[ControlCentre, list[Authority], list[float]],
 ) -> None:
     control, sent, now = centre
-    orders = orders_of(control)
+    orders = list_orders(control)
 
     def seconds(count: int, verdict: TriangleVerdict | None) -> None:
         for _ in range(count):
@@ -419,7 +421,7 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
         return {**found["trains"][0], "sections": found["sections"]}
 
     second(delivered=True)
-    orders = orders_of(control)
+    orders = list_orders(control)
     assert orders["close-section"]({"section": "Q"}) == "there is no section 'Q'"
     assert orders["open-section"]({"section": "A"}) == "'A' is not closed"
     assert orders["close-section"]({"section": "A"}) is None

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from railfix.core.files import file_sha256
-from railfix.core.settings import validated, write_toml
+from railfix.core.settings import validate, write_toml
 from railfix.evaluate.cases import CASE_FILE, CaseFile
 
 
 def write_case(folder: Path, content: Mapping[str, Any]) -> None:
     """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
-    case = validated(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
+    case = validate(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
     hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
     write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what="a case of a benchmark")

@@ -11,10 +11,10 @@ from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases
 from railfix.positioning.carrier.ambiguities import (
     ArcAmbiguities,
     assemble_positions,
-    hop_of,
+    count_repeats,
     inverse_of_arcs,
+    number_hops,
     prepare_start,
-    repeats_of,
 )
 from railfix.positioning.carrier.observation_model import (
     Linearised,
@@ -63,7 +63,7 @@ def phase_run(
     ranges, phases, arc = prepare_start(ranges, phases, trajectory, arc_m_start)
     used = phases.weight > 0
     # Row-major: the first place of an arc is its first epoch.
-    walk = _walk(hop_of(time, limits), used, phases.arc_id, limits)
+    walk = _walk(number_hops(time, limits), used, phases.arc_id, limits)
     first, column, count = walk.first, walk.column, len(walk.arc_id)
     index = np.full(used.shape, count, dtype=np.intp)
     index[used] = column
@@ -76,7 +76,7 @@ def phase_run(
         lin = shift_phases(lin, base[index])
         value, covariance = _solved(lin, index, walk.links)
         among = covariance[index[:, :, None], index[:, None, :]]
-        own = own_unknowns(lin, value[index], among, trajectory, repeats=repeats_of(time, limits))
+        own = own_unknowns(lin, value[index], among, trajectory, repeats=count_repeats(time, limits))
         after = np.clip(arc + own.step_m, 0.0, trajectory.arc_m[-1])
         step = float(np.abs(after - arc)[started].max(initial=0.0))
         arc, iteration = after, iteration + 1

@@ -16,7 +16,7 @@ from railfix import kernels
 from railfix.kernels import compiling
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
-from railfix.tracking.bank import OTHERS, SENSORS, SourceKind, budget, kind_of
+from railfix.tracking.bank import OTHERS, SENSORS, SourceKind, budget, classify_source
 from railfix.tracking.filter import _parameters
 from railfix.tracking.handover import _work_space
 
@@ -83,7 +83,7 @@ def memory(
 
 def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLimits, weak_s: Any = 0.0) -> Any:
     """Running sub-filters at places, those of satellites first; the last ones, `OTHERS`, not running."""
-    given, kinds = budget(limits), [kind_of(name) for name in (*names, *OTHERS)]
+    given, kinds = budget(limits), [classify_source(name) for name in (*names, *OTHERS)]
     size = len(kinds)
     mean, covariance = np.zeros((size, 12)), np.zeros((size, 12, 12))
     mean[: len(names), layout.ARC], covariance[: len(names), layout.ARC, layout.ARC] = place_m, np.square(sigma_m)

@@ -18,7 +18,7 @@ from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import State
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.sensors import read_listed_balises, read_sensors, read_units
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
@@ -80,7 +80,7 @@ class Ride:
             write_toml(path, vehicle_table(self.simulation.scenario.vehicle))
             trajectories = {"front": antenna_trajectory(track, read_vehicle(path), "front")}
         config = parse_config({"filter": "track", "protection": "off", **settings})
-        processor = processor_of(
+        processor = make_processor(
             config,
             self.simulation.navigation,
             trajectories,

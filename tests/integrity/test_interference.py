@@ -19,7 +19,7 @@ from railfix.integrity.interference import (
     Sign,
     Suspicion,
     cause_text,
-    held,
+    hold_signs,
     motion_signs,
     power_signs,
     suspicion,
@@ -85,7 +85,7 @@ def test_what_holds_and_what_stays_are_those_of_a_loop_whatever_the_chunks() -> 
             expected[1, k, c] = now - last <= release[c]
     state, parts = HeldState(), []
     for a, b in zip([0, 1, 50, 51, 120], [1, 50, 51, 120, 200], strict=True):
-        *found, state = held(time[a:b], signs[a:b], state, hold_s=hold, release_s=release)
+        *found, state = hold_signs(time[a:b], signs[a:b], state, hold_s=hold, release_s=release)
         parts.append(found)
     for k in range(2):
         np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), expected[k])

@@ -24,7 +24,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.section_search import SearchIndex
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -144,7 +144,7 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
     path = antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front")
     log = {"front": read_observations(inputs.front)[::4]}
     result = (
-        processor_of(Config(filter="off"), read_navigation(inputs.nav), {"front": path})
+        make_processor(Config(filter="off"), read_navigation(inputs.nav), {"front": path})
         .process(log)[0]
         .antennas["front"]
     )
@@ -224,7 +224,7 @@ def test_forms_are_those_of_least_squares_without_the_channels(systems: str) -> 
     np.testing.assert_allclose(prior, [expected] * 2, rtol=1e-12)
     clocks = np.array([[letter == other for other in dict.fromkeys(systems)] for letter in systems], dtype=float)
     for t, place in enumerate(oracle.LINE.at_arc(arc)):
-        axes = oracle.LINE.axes_of(oracle.LINE.segment_at(arc[t : t + 1])[0])[0]
+        axes = oracle.LINE.get_axes(oracle.LINE.segment_at(arc[t : t + 1])[0])[0]
         distance, sight = range_with_rotation(ranges.sat_ecef_m[t], place)
         y, rows = ranges.code_m[t] - distance, -sight @ axes.T
         errors = rows * [sigma_m[0], sigma_m[0], sigma_m[1]]

@@ -164,7 +164,7 @@ def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
     """The inverse does not depend on the unit of an axis; two axes that are one are singular."""
     arc = np.array([731.0])
     ranges = oracle.made(arc, "GGGGGG", seed=3, sigma_m=np.full(6, 1e4))
-    place, axes = oracle.LINE.at_arc(arc), oracle.LINE.axes_of(oracle.LINE.segment_at(arc)[0])
+    place, axes = oracle.LINE.at_arc(arc), oracle.LINE.get_axes(oracle.LINE.segment_at(arc)[0])
     exact = model_on_line(ranges, place, axes, 1e-4, 1e-4)
     assert exact.covariance_m2[0, 1, 1] == pytest.approx(1e-8, rel=1e-6)
     information = (exact.design[0, :, 0] ** 2).sum()
@@ -182,7 +182,7 @@ def test_epochs_of_another_model_are_put_in_whole():
     fewer, rows = replace(ranges, weight=weight), np.array([2, 5])
     whole = constrained_model(fewer, oracle.LINE, arc)
     before = constrained_model(ranges, oracle.LINE, arc)
-    patched = before.patched(rows, constrained_model(fewer.take(rows), oracle.LINE, arc[rows]))
+    patched = before.patch(rows, constrained_model(fewer.take(rows), oracle.LINE, arc[rows]))
     for item in fields(whole):
         found, expected = getattr(patched, item.name), getattr(whole, item.name)
         if isinstance(expected, np.ndarray):

@@ -15,7 +15,7 @@ from pyubx2 import UBXReader
 import pipeline_cases
 from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import Indicators, StreamState, decode, indicators_at
-from railfix.io.receiver.measurements import observations_of
+from railfix.io.receiver.measurements import join_observations
 from railfix.live.stream import ReceiverState, receive_bytes
 from ubx_made import frame, rawx
 
@@ -109,7 +109,7 @@ def test_a_message_counts_from_the_next_epoch_on_in_logs_and_live() -> None:
     )  # fmt: skip
     expected = [0, 1, 2, 0]
     piece, _ = decode(data, StreamState(), at_end=True)
-    assert observations_of(piece.measurements)[0].receiver_alarm.tolist() == expected
+    assert join_observations(piece.measurements)[0].receiver_alarm.tolist() == expected
     state, found = ReceiverState(), []
     for k in range(0, len(data), 100):
         for item in receive_bytes(data[k : k + 100], state):
@@ -132,7 +132,7 @@ def test_broken_messages_are_passed_over() -> None:
 def test_a_recorded_stream_has_no_alarm_and_the_gain_of_pyubx2(recordings: Path) -> None:
     data = gzip.decompress((recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz").read_bytes())
     piece, _ = decode(data, StreamState(), at_end=True)
-    log = observations_of(piece.measurements)[0]
+    log = join_observations(piece.measurements)[0]
     gain, expected = np.nan, []
     for _, message in UBXReader(BytesIO(data), quitonerror=0):
         if message is None:

@@ -25,7 +25,7 @@ from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
 from railfix.io.receiver.framing import crc24q, find_frames
 from railfix.io.receiver.log import StreamState, decode
-from railfix.io.receiver.measurements import Tracking, observations_of
+from railfix.io.receiver.measurements import Tracking, join_observations
 from ubx_made import log_of
 
 pytestmark = pytest.mark.requirement("A8")
@@ -180,7 +180,7 @@ def in_fragments(data: bytes, cuts: list[int], state: StreamState | None = None)
     parts, records = [], []
     for first, last in zip([0, *cuts], [*cuts, None], strict=True):
         piece, state = decode(data[first:last], state, at_end=last is None)
-        observations, tracking = observations_of(piece.measurements, tracking)
+        observations, tracking = join_observations(piece.measurements, tracking)
         parts.append(observations)
         found = piece.ephemerides
         records += [
@@ -243,7 +243,7 @@ def test_damage_gives_no_false_observation(recordings: Path, block: int) -> None
     for seed in range(30 * block, 30 * block + 30):
         broken = damaged(data, seed)
         piece, state = decode(broken, StreamState(), at_end=True)
-        observations, _ = observations_of(piece.measurements)
+        observations, _ = join_observations(piece.measurements)
         assert observed(observations) <= true
         assert piece.bytes == len(broken)
         assert state.rest == b""
@@ -417,7 +417,7 @@ def test_day_of_glonass_messages(day: int) -> None:
         msm4(1074, tow_ms + k) + msm4(1084, glonass + k) + msm4(1124, tow_ms + k - 14_000) for k in (0, 200)
     )
     piece, _ = decode(stream, StreamState(time=np.datetime64("2019-01-20", "ns")), at_end=True)
-    observations, _ = observations_of(piece.measurements)
+    observations, _ = join_observations(piece.measurements)
     assert observations.satellite.tolist() == ["C05", "G05", "R05"]
     assert observations.time.astype("M8[ms]").tolist() == [
         datetime.datetime(2019, 1, 22, 8, 43, 56, 600_000), datetime.datetime(2019, 1, 22, 8, 43, 56, 800_000)

@@ -18,7 +18,7 @@ from nav_pages import bcnav1_frame, bcnav2_messages, cnav_pages, fnav_pages, sbf
 from railfix.core.timescale import from_week
 from railfix.gnss.navigation import Navigation
 from railfix.io import read_navigation
-from railfix.io.receiver.ephemerides import merge_records, navigation_of
+from railfix.io.receiver.ephemerides import assemble_navigation, merge_records
 from railfix.io.receiver.log import StreamState, decode
 from railfix.run.convert import convert_logs
 
@@ -38,7 +38,7 @@ def navigation(data: bytes, *, step: int | None = None) -> Navigation:
     for first in range(0, len(data), step):
         piece, state = decode(data[first : first + step], state, at_end=first + step >= len(data))
         parts.append(piece.ephemerides)
-    return navigation_of(merge_records(parts))
+    return assemble_navigation(merge_records(parts))
 
 
 def stream(pages: list[np.ndarray], system: str, number: int, *, protocol: str) -> bytes:

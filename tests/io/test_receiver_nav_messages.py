@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from railfix.io.receiver import nav_messages
-from railfix.io.receiver.framing import fields, sign_magnitude, signed, unsigned
+from railfix.io.receiver.framing import fields, read_signed, read_unsigned, sign_magnitude
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.measurements import frame_time
 from test_receiver_logs import ubx_frame
@@ -72,8 +72,8 @@ def compare(values: dict[str, np.ndarray], ephemeris: Any, names: dict[str, str]
 def test_integers_by_hand() -> None:
     """0b1011 is 11, as two's complement -5, as sign and magnitude -3."""
     bits = np.array([[0, 1, 0, 1, 1, 0]], dtype=np.uint8)
-    assert unsigned(bits, 1, 4).tolist() == [11]
-    assert signed(bits, 1, 4).tolist() == [-5]
+    assert read_unsigned(bits, 1, 4).tolist() == [11]
+    assert read_signed(bits, 1, 4).tolist() == [-5]
     assert sign_magnitude(bits, 1, 4).tolist() == [-3]
     assert fields(bits, {"x": (((1, 1), (3, 2)), 3, 0.5, "u")})["x"].tolist() == [3.5]
 

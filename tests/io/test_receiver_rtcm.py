@@ -11,7 +11,7 @@ import pytest
 import railfix
 from railfix.core.errors import InputFileError
 from railfix.gnss.navigation import Navigation
-from railfix.io.receiver.ephemerides import navigation_of
+from railfix.io.receiver.ephemerides import assemble_navigation
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.rtcm import EPHEMERIDES
 from test_receiver_logs import msm4, rtcm_message
@@ -56,7 +56,7 @@ def message(kind: int, seed: int, chosen: dict[str, int]) -> bytes:
 
 def read_here(*messages: bytes, time: np.datetime64 = TIME) -> Navigation:
     piece, _ = decode(b"".join(messages), StreamState(time=time), at_end=True)
-    return navigation_of(piece.ephemerides)
+    return assemble_navigation(piece.ephemerides)
 
 
 def rtklib(time: np.datetime64 = TIME) -> tuple[Any, Any]:
@@ -184,7 +184,7 @@ def test_ten_days_in_one_piece() -> None:
     piece, _ = decode(b"".join(parts), StreamState(time=TIME), at_end=True)
     assert piece.measurements.time.tolist() == (WEEK + hours * np.timedelta64(3600, "s")).astype("M8[ns]").tolist()
     assert not piece.measurements.skipped
-    toe = navigation_of(piece.ephemerides).glonass.toe
+    toe = assemble_navigation(piece.ephemerides).glonass.toe
     assert toe.tolist() == (np.array(days) + np.timedelta64(75 * 60 + 18, "s")).astype("M8[ns]").tolist()
 
 

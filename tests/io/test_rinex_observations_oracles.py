@@ -10,7 +10,7 @@ import pytest
 from railfix.core.files import read_bytes
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import read_observations, scan_observations
-from railfix.io.rinex.observations_lines import KINDS, signal_of
+from railfix.io.rinex.observations_lines import KINDS, find_signal
 
 pytestmark = [pytest.mark.requirement("A7"), pytest.mark.filterwarnings("ignore")]
 
@@ -87,7 +87,7 @@ def compare_with_georinex(path: Path) -> int:
         for j, satellite in enumerate(theirs.sv.values.tolist()):
             system = satellite[0]
             values = theirs[name].values[:, j]
-            signal = signal_of(name, system=system, version=version, declared=names)
+            signal = find_signal(name, system=system, version=version, declared=names)
             at = column.get((f"{system}{int(satellite[1:]):02d}", str(signal)))
             kind = list(KINDS).index("C" if name[0] == "P" else name[0])
             if at is None:

@@ -20,7 +20,7 @@ from railfix.core.errors import OutputError
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, concatenate
 from railfix.io import read_navigation, read_observations, write_navigation, write_observations
-from railfix.io.rinex.write import RinexVersion, _format_f14_3, packing_of
+from railfix.io.rinex.write import RinexVersion, _format_f14_3, detect_packing
 from railfix.simulate import Scenario, SkySettings, simulate_navigation
 from railfix.simulate.scenario import ReceiverSettings
 
@@ -179,7 +179,7 @@ def test_packed_files_hold_the_plain_text_and_no_date(tmp_path: Path) -> None:
 
 def test_the_name_tells_the_packing() -> None:
     names = {"front.crx.gz": "crx.gz", "a.24d": "crx", "a.24d.gz": "crx.gz", "b.rnx": "plain", "b.24o.gz": "gz"}
-    assert {name: packing_of(name) for name in names} == names
+    assert {name: detect_packing(name) for name in names} == names
 
 
 def test_columns_asked_for(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.processor import Result
 from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import constrained_position, fit, normal_equations, single_point
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -53,7 +53,7 @@ def result_of(epochs: int, **settings: Any) -> Result:
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
     logs = {"front": read_observations(inputs.front)[:epochs], "rear": read_observations(inputs.rear)[:epochs]}
     paths = {name: antenna_trajectory(track, vehicle, name) for name in logs}
-    return processor_of(Config(**settings), read_navigation(inputs.nav), paths).process(logs)[0]
+    return make_processor(Config(**settings), read_navigation(inputs.nav), paths).process(logs)[0]
 
 
 def copied(value: Any) -> Any:
@@ -71,11 +71,11 @@ def copied(value: Any) -> Any:
 KERNELS = {
     "hypotheses": ("tails_of_hypotheses",),
     "level": ("solve_level",),
-    "model": ("linearised", "residuals"),
+    "model": ("linearise_ranges", "residuals"),
     "off_tangent": ("forms_of_hypotheses", "risk_beyond", "risk_off_tangent"),
-    "ranges": ("reduced_equations", "misfits", "iterated_points", "dilutions", "iterated_along"),
-    "reading": ("decoded_fields", "placed_fields", "line_ends"),
-    "robust": ("reweighted",),
+    "ranges": ("reduced_equations", "misfits", "iterate_points", "dilutions", "iterate_along"),
+    "reading": ("decode_fields", "place_fields", "line_ends"),
+    "robust": ("reweight_ranges",),
     "screens": ("suspicions", "clock_medians", "falls_of_cn0", "clock_steps", "holds"),
     "search": ("radii_of_balls", "points_in_balls", "best_points", "clear_of_sections"),
     "windows": ("window_ages", "decayed_sums"),
@@ -108,7 +108,7 @@ def calls() -> dict[str, list[tuple[Any, ...]]]:
 
 def cut(arguments: tuple[Any, ...], name: str) -> tuple[Any, ...]:
     """A text short enough for plain Python."""
-    if name == "decoded_fields":
+    if name == "decode_fields":
         data, start, length, *rest = arguments
         return data, start[:100], length[:100], *rest
     return (arguments[0][:20_000],) if name == "line_ends" else arguments
@@ -231,8 +231,8 @@ def test_arrays_of_any_caller_are_of_one_type_for_kernels() -> None:
     place = line.ecef_m[vertex]
     places = [read_only(place), place, np.asfortranarray(place)]
     others = [replace(frozen, code_m=frozen.code_m.copy()), replace(frozen, weight=np.asfortranarray(frozen.weight))]
-    used = (kernels.ranges.misfits, kernels.ranges.reduced_equations, kernels.ranges.iterated_points)
-    used += (kernels.ranges.iterated_along, kernels.robust.reweighted)
+    used = (kernels.ranges.misfits, kernels.ranges.reduced_equations, kernels.ranges.iterate_points)
+    used += (kernels.ranges.iterate_along, kernels.robust.reweight_ranges)
     compiled = []
     for ranges, near in zip([frozen, *others], places, strict=True):
         fit(ranges, near)
@@ -431,7 +431,7 @@ def test_what_the_compiler_has_found_for_types_is_not_looked_for_again(monkeypat
         return (number + 1.5) * (number + 2.5) * (number + 3.5)
 
     monkeypatch.setattr(BaseFunction, "get_call_type", count)
-    with compiling.resolved_once():
+    with compiling.keep_resolutions():
         once = numba.njit(used_thrice)
         assert once(2.0) == 3.5 * 4.5 * 5.5
     assert BaseFunction.get_call_type is count

@@ -16,7 +16,7 @@ from railfix.io.rinex import read_navigation
 from railfix.io.train_message import MessageStatus
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import nmea_bytes, tpv_bytes
-from railfix.live.message import message_of
+from railfix.live.message import create_message
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
 from railfix.motion.samples import SensorSamples, TachometerPulses
@@ -45,7 +45,7 @@ def test_no_bound_of_a_position_that_failed_a_check_goes_out_as_coasting() -> No
             antennas={"front": replace(antenna, status=np.full(3, single, dtype=np.int8))},
             fusion={"front": replace(track, tracked=tracked)},
         )
-        message = message_of(changed, LiveSettings())
+        message = create_message(changed, LiveSettings())
         assert message.status is expected
         assert (message.over_cm is None) == (expected is MessageStatus.DOUBTFUL)
 
@@ -73,7 +73,7 @@ def with_track(result: Result, name: str, *, tracked: dict[str, Any] | None = No
 def test_the_front_end_is_ahead_of_the_place_in_the_direction_it_looks(filtered: Result, facing: int) -> None:
     one = with_track(filtered, "front")
     place = float(one.fusion["front"].chainage_m[-1])
-    message = message_of(one, LiveSettings(facing=facing, front_offset_m=7.5))
+    message = create_message(one, LiveSettings(facing=facing, front_offset_m=7.5))
     assert message.chainage_cm == pytest.approx(100.0 * (place + facing * 7.5), abs=0.51)
     assert message.facing == facing
 
@@ -82,7 +82,7 @@ def test_the_front_end_is_ahead_of_the_place_in_the_direction_it_looks(filtered:
 def test_bound_of_the_speed_and_probability_of_the_track(filtered: Result) -> None:
     """0.1 m/s: 5.33 sigmas are 53.3 cm/s, rounded up; 0.9876 is 987 thousandths."""
     values = {"speed_sigma_mps": np.full(3, 0.1), "probability": np.full(3, 0.9876)}
-    message = message_of(with_track(filtered, "front", tracked=values), LiveSettings())
+    message = create_message(with_track(filtered, "front", tracked=values), LiveSettings())
     assert (message.speed_bound_cmps, message.track_permille) == (54, 987)
 
 
@@ -93,7 +93,7 @@ def test_the_bound_holds_for_the_single_epoch_and_for_the_filter(filtered: Resul
     bounds = []
     for away_m in (0.0, 4.0, -4.0):
         moved = with_track(filtered, "front", chainage_m=single + away_m)
-        message = message_of(moved, LiveSettings())
+        message = create_message(moved, LiveSettings())
         assert message.over_cm is not None
         assert message.protection_level_cm is not None
         bounds.append(message.over_cm - message.protection_level_cm)
@@ -105,7 +105,7 @@ def test_forms_name_hemispheres_utc_and_the_antenna_of_the_message(filtered: Res
     """GPS time is 18 s ahead of UTC from 2017 on."""
     for latitude, longitude, letters in ((35.5, 139.5, ("N", "E")), (-35.5, -139.5, ("S", "W"))):
         one = with_track(filtered, "front", latitude_deg=np.full(3, latitude), longitude_deg=np.full(3, longitude))
-        message = message_of(one, LiveSettings())
+        message = create_message(one, LiveSettings())
         at = (np.datetime64("2024-03-05T00:00:10", "ns") - GPS_EPOCH) // np.timedelta64(1, "ns")
         output = LiveOutput(message=message.replaced(time_ns=int(at)), result=one)
         fields = nmea_bytes(output).decode().splitlines()[0].split(",")
@@ -125,7 +125,7 @@ def test_forms_name_hemispheres_utc_and_the_antenna_of_the_message(filtered: Res
             for other, track in filtered.fusion.items()
         }
         both = replace(filtered, fusion=fusion)
-        output = LiveOutput(message=message_of(both, LiveSettings()), result=both)
+        output = LiveOutput(message=create_message(both, LiveSettings()), result=both)
         assert json.loads(tpv_bytes(output))["lat"] == {"front": 10.0, "rear": 20.0}[name]
 
 

@@ -15,7 +15,7 @@ from railfix.cli import app
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.level_stage import risk_of
+from railfix.pipeline.level_stage import get_risk_budget
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.messages import with_parity
 from ubx_made import log_of
@@ -111,7 +111,7 @@ def test_messages_of_two_receivers_count_once(log: dict[str, Path]) -> None:
     )
     state = SbasState(prn=137)
     for k in range(len(messages)):
-        state = state.received(messages.take(np.array([k]))).received(late.take(np.array([k])))
+        state = state.add_messages(messages.take(np.array([k]))).add_messages(late.take(np.array([k])))
     assert np.array_equal(state.messages.time, messages.time)
     both = read_sbas([log["log"], log["log"]])
     assert len(both) == len(messages)
@@ -132,5 +132,5 @@ def test_without_a_message_every_satellite_is_rejected(log: dict[str, Path]) -> 
 
 def test_the_budget_beside_sbas_is_one_object_so_that_a_live_epoch_finds_its_allocation_kept() -> None:
     config = parse_config({"filter": "off", "sbas": "stream"})
-    assert risk_of(config) is risk_of(config)
-    assert set(risk_of(config).satellite_prior.values()) == {0.0}
+    assert get_risk_budget(config) is get_risk_budget(config)
+    assert set(get_risk_budget(config).satellite_prior.values()) == {0.0}

@@ -31,7 +31,7 @@ from railfix.motion.samples import SENSORS, BaliseReadings, RadarSpeeds, SensorS
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.results import State
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.run import vehicle_table
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 from railfix.tracking import Kind
@@ -99,7 +99,7 @@ def engine_of(case: Ride, folder: Path, **settings: float) -> LiveEngine:
     track = case.simulation.line.track()
     paths = {"front": antenna_trajectory(track, read_vehicle(path), "front")}
     config = parse_config({"filter": "track", "protection": "off", "sensors": PLACE})
-    processor = processor_of(
+    processor = make_processor(
         config, case.simulation.navigation, paths, track=track, units=case.units, balises=case.balises
     )
     return LiveEngine(processor, LiveSettings(period_s=0.5, no_input="skip", **settings), SENSORS)
@@ -205,7 +205,7 @@ def test_a_restart_in_a_slip_goes_on_from_the_state_file(case: Ride, tmp_path: P
     engine, outputs = begun(), []
     for k in range(len(case.observations)):
         if case.time_s[k] == 63.5:
-            saved = engine.saved()
+            saved = engine.export_state()
             assert saved is not None
             write_state(tmp_path / "state", SavedSession(engine=saved, streams={}), {})
             loaded = load_state(tmp_path / "state", {})
@@ -236,7 +236,7 @@ def test_samples_wait_for_an_antenna_without_an_epoch(case: Ride, tmp_path: Path
     track, vehicle = case.simulation.line.track(), read_vehicle(tmp_path / "v.toml")
     paths = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
     config = parse_config({"filter": "track", "protection": "off"})
-    processor = processor_of(config, case.simulation.navigation, paths, track=track)
+    processor = make_processor(config, case.simulation.navigation, paths, track=track)
     rear = next(iter(case.simulation.pieces("rear", chunk_epochs=100_000))).observations
     gap = [40, 41]
     state, parts, since = State(), [], np.datetime64("NaT", "ns")
@@ -264,7 +264,7 @@ def test_lines_cut_anywhere_are_the_table(case: Ride) -> None:
         for first, last in zip([0, *cuts], [*cuts, len(text)], strict=True):
             sensed = lines.take(text[first:last])
             assert sensed.skipped == 0
-            samples = samples.joined(sensed.samples)
+            samples = samples.merge(sensed.samples)
         expected = case.samples.tables[sensor]
         for name, values in vars(samples.tables[sensor]).items():
             np.testing.assert_array_equal(values, getattr(expected, name)[:500])
@@ -302,8 +302,8 @@ def test_a_range_to_a_unit_that_is_not_surveyed_is_counted(case: Ride, tmp_path:
     assert isinstance(sensed.samples.ranging, StationRanges)
     assert sensed.samples.ranging.station.tolist() == ["A", "C"]
     np.testing.assert_array_equal(sensed.samples.ranging.sigma_m, [np.nan, 0.2])
-    assert sensed.unsurveyed(engine.processor.units) == 1
-    assert sensed.unsurveyed(None) == 2
+    assert sensed.count_unsurveyed(engine.processor.units) == 1
+    assert sensed.count_unsurveyed(None) == 2
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from railfix.motion.samples import (
 )
 from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
-from railfix.run.sensor_checks import SensorChecks, motion_of, range_notes, sign_notes
+from railfix.run.sensor_checks import SensorChecks, compute_motion, range_notes, sign_notes
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -138,7 +138,7 @@ def on_the_circle(facing: float) -> SensorSamples:
 
 def test_motion_by_places_is_that_of_the_ride() -> None:
     t = np.arange(0.0, SECONDS, 1.0)
-    motion = motion_of(circle(t).filter(pl.Series((t < 100.0) | (t > 130.0))), round_line())
+    motion = compute_motion(circle(t).filter(pl.Series((t < 100.0) | (t > 130.0))), round_line())
     at = (motion.time - START) / np.timedelta64(1, "s")
     wave = 2.0 * np.pi * at / 80.0
     known = np.isfinite(motion.acceleration_mps2)

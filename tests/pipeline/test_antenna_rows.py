@@ -20,10 +20,10 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.pipeline.results import AntennaResult, State
-from railfix.positioning.antenna_rows import EVERY, AntennaRows, joined, rows_of, stack_observations
+from railfix.positioning.antenna_rows import EVERY, AntennaRows, join_rows, stack_observations, take_rows
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import ErrorModel
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
@@ -198,21 +198,21 @@ def test_antennas_on_maps_of_other_sigmas_are_refused() -> None:
     _, navigation, paths = _inputs()
     other = paths | {"rear": replace(paths["rear"], sigma_plan_m=2.0 * paths["rear"].sigma_plan_m)}
     with pytest.raises(ValueError, match="different sigmas of the map"):
-        processor_of(parse_config({}), navigation, other)
+        make_processor(parse_config({}), navigation, other)
 
 
 def test_joined_rows_are_taken_apart_again() -> None:
     logs = _inputs()[0]
     front, rear = logs["front"][:3], logs["rear"][:2]
-    both = joined([front, rear])
+    both = join_rows([front, rear])
     assert both.time.tolist() == [*front.time.tolist(), *rear.time.tolist()]
     for part, rows in ((front, slice(0, 3)), (rear, slice(3, 5))):
-        again = rows_of(both, rows)
+        again = take_rows(both, rows)
         assert is_dataclass(again)
         np.testing.assert_array_equal(again.code_m, part.code_m)
         np.testing.assert_array_equal(again.satellite, part.satellite)
-    assert rows_of(both, EVERY) is both
-    assert joined([both]) is both
+    assert take_rows(both, EVERY) is both
+    assert join_rows([both]) is both
 
 
 def test_rows_are_split_by_antenna() -> None:
@@ -240,7 +240,7 @@ def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(processing, "correct_ranges", noted)
     logs, navigation, paths = _inputs()
-    processor = processor_of(parse_config({"filter": "track"}), navigation, paths)
+    processor = make_processor(parse_config({"filter": "track"}), navigation, paths)
     gc.disable()
     try:
         processor.process({name: log[:40] for name, log in logs.items()})

@@ -14,7 +14,7 @@ from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations
 from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
-from railfix.live.message import message_of
+from railfix.live.message import create_message
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.processor import Result
 from railfix.tracking import TrackStatus
@@ -124,7 +124,7 @@ def test_the_filter_gives_no_bound_and_the_message_says_why() -> None:
     # the filter's own monitors have the place in doubt before, or with, the suspicion
     assert np.isin(tracked.status[spoofed][:5], (TrackStatus.DOUBTFUL, TrackStatus.SPOOFING_SUSPECTED)).all()
     assert not np.isfinite(tracked.level_m[spoofed]).any()
-    message = message_of(whole, LiveSettings())
+    message = create_message(whole, LiveSettings())
     assert message.interference == Suspicion.SPOOFING_SUSPECTED
     assert message.over_cm is None
 

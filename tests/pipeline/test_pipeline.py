@@ -34,7 +34,7 @@ from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 
 #: Epochs a chunk, and epochs of the log.
 CHUNKS = {1: 60, 7: 200, 1000: 1200}
@@ -68,7 +68,7 @@ def m8t(recordings) -> tuple[EpochProcessor, Observations]:
     trajectory = recordings_score.trajectory_of(*recordings_truth.urbannav_truth(folder))
     navigation = read_navigation([folder / "hksc137c.nav"])
     observations = read_observations(folder / "20210517.light-urban.tste.ublox.m8t.GC.obs")
-    return processor_of(recordings_score.SETTINGS, navigation, {"front": trajectory}), observations
+    return make_processor(recordings_score.SETTINGS, navigation, {"front": trajectory}), observations
 
 
 @pytest.mark.requirement("A8")

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, front_alone, only, with_code
-from railfix.core.arrays import changed
+from railfix.core.arrays import copy_with
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.gnss.observations import Observations, carrier_frequency_hz
@@ -308,7 +308,7 @@ def ranges_of_the_filter() -> CorrectedRanges:
     """Corrected ranges of ten epochs before any screen."""
     config = parse_config({"filter": "off", "screens": []})
     processor = EpochProcessor(config, {"front": clean_trajectories()["front"]}, navigation=clean_navigation())
-    return processor.screened({"front": front()[:10]})[0].ranges["front"]
+    return processor.screen({"front": front()[:10]})[0].ranges["front"]
 
 
 #: Reasons that the filter weighs itself; any other keeps code, phase and Doppler out of it.
@@ -325,7 +325,7 @@ def test_the_filter_has_what_a_screen_doubts_and_nothing_that_is_known_to_be_wro
     column = int(np.flatnonzero((ranges.reason == 0).all(axis=0))[0])
     flagged = np.zeros_like(ranges.reason)
     flagged[5, column] = reason
-    epochs, _ = gnss_epochs(changed(ranges, reason=flagged), np.ones(10), parse_config({}), None)
+    epochs, _ = gnss_epochs(copy_with(ranges, reason=flagged), np.ones(10), parse_config({}), None)
     for values in (epochs.code_m, epochs.phase_m, epochs.rate_mps):
         assert np.isfinite(values[[4, 6], column]).all()
         assert np.isfinite(values[5, column]) == (reason in DOUBTED)
@@ -337,9 +337,9 @@ def test_phases_of_the_filter_are_without_troposphere_and_satellite_clocks() -> 
     rising = 3.0 * np.arange(10.0)[:, None]
     used = ranges.reason == 0
     phase = gnss_epochs(ranges, scale, config, None)[0].phase_m
-    delayed = changed(ranges, troposphere_m=ranges.troposphere_m + rising)
+    delayed = copy_with(ranges, troposphere_m=ranges.troposphere_m + rising)
     later = replace(ranges.satellites, clock_m=ranges.satellites.clock_m + rising)
-    for other, sign in ((delayed, -1.0), (changed(ranges, satellites=later), 1.0)):
+    for other, sign in ((delayed, -1.0), (copy_with(ranges, satellites=later), 1.0)):
         change = gnss_epochs(other, scale, config, None)[0].phase_m - phase
         np.testing.assert_allclose(change[used], (sign * rising + 0.0 * change)[used], atol=1e-6)
 
@@ -381,7 +381,7 @@ def test_far_from_the_line_the_anchor_is_the_position_and_its_place_the_nearest(
     along = trajectory.ecef_m - middle
     far = replace(trajectory, ecef_m=middle + 3e5 * np.array([0.0, 0.6, 0.8]) + along)
     processor = EpochProcessor(parse_config(BASE), {"front": far}, navigation=clean_navigation())
-    ranges = processor.screened({"front": front()})[0].corrected
+    ranges = processor.screen({"front": front()})[0].corrected
     nearest, _ = far.nearest(ranges.anchor_ecef_m)
     assert (np.linalg.norm(ranges.anchor_ecef_m - far.at_arc(nearest), axis=1) > 2e5).all()
     np.testing.assert_allclose(ranges.anchor_arc_m, nearest, atol=1e-6)

@@ -170,7 +170,15 @@ def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: 
 
         return locked
 
-    stages = ("correct_ranges", "pair_antennas", "with_slips", "smoothed", "solve", "antenna_results", "along_track")
+    stages = (
+        "correct_ranges",
+        "pair_antennas",
+        "with_slips",
+        "smooth_ranges",
+        "solve",
+        "antenna_results",
+        "along_track",
+    )
     for name in stages:
         monkeypatch.setattr(processing, name, locking(getattr(processing, name)))
     found, state = make.process({n: p[:30] for n, p in parts.items()})

@@ -25,7 +25,7 @@ from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.decode import read_fields
 from railfix.ranges.sbas.dfmc import LAYOUTS, DfmcService, DfmcState
 from railfix.ranges.sbas.messages import with_parity
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate import sbas_stream as stream
 from railfix.simulate.errors import SatelliteFault
@@ -159,7 +159,7 @@ def test_corrected_codes_are_true_ranges() -> None:
     observations = concatenate(list(simulation.observations("front")))[:30]
     config = parse_config({"filter": "off", "protection": "off", "sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})
     line = Trajectory.from_track(simulation.line.track())
-    processor = processor_of(config, simulation.navigation, {"front": line})
+    processor = make_processor(config, simulation.navigation, {"front": line})
     messages = sbas_messages(simulation, SbasSettings(band="L5"))
     found = processor.process({"front": observations}, messages=messages)[0].antennas["front"]
     heard = messages.time <= observations.time[12]
@@ -217,12 +217,12 @@ def test_messages_kept_give_the_same_corrections() -> None:
     simulation = Simulation(scenario())
     messages = sbas_messages(simulation, SbasSettings(band="L5"))
     satellite, late = np.array(["G10", "G11", "E05", "J01"]), simulation.time(140, 150)
-    whole = SbasState(prn=137, band="L5").received(messages)
-    kept = whole.kept_from(np.datetime64(late[0] + np.timedelta64(400, "s")))
+    whole = SbasState(prn=137, band="L5").add_messages(messages)
+    kept = whole.drop_before(np.datetime64(late[0] + np.timedelta64(400, "s")))
     assert len(kept.messages) < len(whole.messages)
     for name in ("state", "position_m", "clock_m", "sigma_m", "growth_m"):
         one, other = (
-            getattr(state.kept_from(late[0]).corrections.satellites(late, satellite, simulation.navigation), name)
+            getattr(state.drop_before(late[0]).corrections.satellites(late, satellite, simulation.navigation), name)
             for state in (whole, SbasState(prn=137, band="L5", messages=messages))
         )
         np.testing.assert_array_equal(one, other)

@@ -34,7 +34,7 @@ from railfix.positioning.normal_equations import single_point
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.corrected import REASONS
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv
 from railfix.track.trajectory import Trajectory
@@ -53,7 +53,7 @@ class Recording:
         self.nav = folder / "cres_20080526.bin.nav"
         self.observations: Observations = read_observations(self.front)
         self.navigation: Navigation = read_navigation([self.nav])
-        without = processor_of(parse_config({"filter": "off"}), self.navigation, {"front": self.line_at(None)})
+        without = make_processor(parse_config({"filter": "off"}), self.navigation, {"front": self.line_at(None)})
         found = without.process({"front": self.observations[:200]})[0].antennas["front"]
         self.parked = np.nanmedian(found.conventional_ecef_m, axis=0)
         self.line = self.line_at(self.parked)
@@ -65,7 +65,7 @@ class Recording:
         return parse_config({"filter": "off", **SETTINGS, "sbas": [str(self.sbas)], **settings})
 
     def process(self, config: Config, observations: Observations | None = None) -> AntennaResult:
-        processor = processor_of(config, self.navigation, {"front": self.line})
+        processor = make_processor(config, self.navigation, {"front": self.line})
         return processor.process({"front": observations or self.observations})[0].antennas["front"]
 
 
@@ -128,7 +128,7 @@ def test_a_corrected_code_is_the_sum_of_its_parts(recording: Recording, correcte
 
 
 def test_any_cutting_gives_the_same(recording: Recording, corrected: AntennaResult) -> None:
-    processor = processor_of(recording.config(), recording.navigation, {"front": recording.line})
+    processor = make_processor(recording.config(), recording.navigation, {"front": recording.line})
     for size in (1, 7):
         state, parts = State(), []
         for first in range(140, 200, size):
@@ -160,12 +160,12 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     assert level_facts(config)["kind"] == "sbas"
     assert set(level_facts(config)["satellite_prior"].values()) == {0.0}
     assert level_facts(parse_config({"filter": "off"}))["kind"] == "separation"
-    processor = processor_of(config, recording.navigation, {"front": recording.line})
+    processor = make_processor(config, recording.navigation, {"front": recording.line})
     obs = recording.observations[180:200]
     index = processor.indices["front"]
     antennas, received = AntennaRows.of(index), processor.received
     corrected = correct_ranges(obs, ChannelBook(config).of(obs, received.navigation), config, received, antennas)
-    one = processor._screened(("front",), antennas, corrected, received, State())[0]["front"]
+    one = processor._screen_antennas(("front",), antennas, corrected, received, State())[0]["front"]
     ranges = one.ranges()
     point = single_point(ranges, one.anchor_ecef_m)
     place = place_on_line(ranges, index, point, config)
@@ -196,7 +196,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
 
 def test_a_geo_that_the_log_does_not_have_is_refused(recording: Recording) -> None:
     with pytest.raises(SettingsError, match="sbas_prn = 120"):
-        processor_of(recording.config(sbas_prn=120), recording.navigation, {"front": recording.line})
+        make_processor(recording.config(sbas_prn=120), recording.navigation, {"front": recording.line})
 
 
 def test_the_command_says_what_was_asked_and_what_was_used(recording: Recording, tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ def test_precise_orbits_are_not_what_sbas_corrects(recording: Recording) -> None
     # Never looked into: the refusal comes before.
     navigation = replace(recording.navigation, precise=object())
     with pytest.raises(SettingsError, match="give --sbas or --sp3"):
-        processor_of(recording.config(), navigation, {"front": recording.line})
+        make_processor(recording.config(), navigation, {"front": recording.line})
 
 
 def test_other_signals_than_l1_ca_are_not_corrected(recording: Recording) -> None:
@@ -264,7 +264,7 @@ def test_a_newer_record_that_calls_a_satellite_unhealthy_wins_over_the_issue_of_
     extra["transmitted"][-1] = recording.observations.time[0]
     extra["toe"][-1] = extra["toe"][-1] + np.timedelta64(16, "s")
     navigation = replace(recording.navigation, kepler=replace(kepler, **extra))
-    processor = processor_of(recording.config(), navigation, {"front": recording.line})
+    processor = make_processor(recording.config(), navigation, {"front": recording.line})
     found = processor.process({"front": recording.observations})[0].antennas["front"]
     column = int(np.flatnonzero(found.satellite == one)[0])
     observed = (found.reason[:, column] & Reason.NOT_OBSERVED) == 0
@@ -274,7 +274,7 @@ def test_a_newer_record_that_calls_a_satellite_unhealthy_wins_over_the_issue_of_
 @pytest.mark.requirement("C2")
 def test_positions_from_code_and_phase_have_no_level(recording: Recording) -> None:
     config = recording.config(carrier="float")
-    processor = processor_of(config, recording.navigation, {"front": recording.line})
+    processor = make_processor(config, recording.navigation, {"front": recording.line})
     assert processor.process({"front": recording.observations[150:170]})[0].antennas["front"].protection is None
     assert any("there is none for positions from code and phase together" in note for note in processor.notes)
 

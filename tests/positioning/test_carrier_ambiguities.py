@@ -15,7 +15,7 @@ import synthetic
 from phase_run import phase_run
 from railfix.core.geodesy import range_with_rotation
 from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases, PhaseState, phase_positions
-from railfix.positioning.carrier.ambiguities import FREE_AMBIGUITY_M, hop_of
+from railfix.positioning.carrier.ambiguities import FREE_AMBIGUITY_M, number_hops
 from railfix.positioning.normal_equations import ClockTies, Ranges, constrained_position
 from railfix.track.trajectory import Trajectory
 
@@ -45,7 +45,7 @@ def dense(
     """All unknowns in one matrix, QR by lstsq, Gauss-Newton: distances and ambiguities (by arc, hop)."""
     epochs, channels = ranges.code_m.shape
     used = phases.weight > 0
-    hops = hop_of(time, limits) if limits.drift_m > 0 else np.zeros(epochs, int)
+    hops = number_hops(time, limits) if limits.drift_m > 0 else np.zeros(epochs, int)
     keys = sorted({(int(phases.arc_id[t, i]), int(hops[t])) for t, i in np.argwhere(used)})
     groups, own = len(ranges.groups), int(limits.clocks == "own")
     per = 3 + groups + own

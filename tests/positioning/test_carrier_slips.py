@@ -9,7 +9,7 @@ import carrier_cases
 from railfix.core.errors import SettingsError
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import CycleSlipLimits, SlipReason, find_slips, number_arcs
-from railfix.positioning.carrier.continuity import NO_ARC, channel_of
+from railfix.positioning.carrier.continuity import NO_ARC, decode_channel
 
 MILLISECOND_M = 299_792.458
 
@@ -201,7 +201,7 @@ def test_arcs_have_names_of_their_own():
     ids, _ = number_arcs(slip, has, np.array(["G05", "R12"]), np.array(["1C", "1C"]))
     assert ids[0, 0] == ids[1, 0] != ids[2, 0] == ids[3, 0]
     assert ids[3, 1] == NO_ARC
-    assert len({*channel_of(ids[:3]).ravel().tolist()}) == 2
+    assert len({*decode_channel(ids[:3]).ravel().tolist()}) == 2
     assert (ids[:3] > 0).all()
 
 

@@ -33,7 +33,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
 from railfix.ranges.atmosphere import klobuchar_delay_m
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
@@ -168,7 +168,7 @@ def positions(log: Log, choose: Callable[[Navigation], Navigation]) -> tuple[Ant
     observations, trajectory = whole[::step], log.trajectory(whole)
     navigation = choose(read_navigation([log.navigation]))
     settings = {"systems": list(log.systems), "screens": ["elevation"], "elevation": {"mask_deg": MASK_DEG}}
-    processor = processor_of(parse_config(settings), navigation, {"front": trajectory})
+    processor = make_processor(parse_config(settings), navigation, {"front": trajectory})
     result, _ = processor.process({"front": observations})
     return result.antennas["front"], trajectory, navigation
 

@@ -28,7 +28,7 @@ from railfix.positioning.two_frequencies import (
     combine_codes,
     share_of_second,
 )
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory
 
@@ -198,7 +198,7 @@ def japan(recordings: Path) -> tuple[Observations, Navigation, Trajectory, Float
 
 def solved(log: Observations, navigation: Navigation, line: Trajectory, frequencies: str) -> AntennaResult:
     config = parse_config({"frequencies": frequencies, "filter": "off"})
-    return processor_of(config, navigation, {"front": line}).process({"front": log})[0].antennas["front"]
+    return make_processor(config, navigation, {"front": line}).process({"front": log})[0].antennas["front"]
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +206,7 @@ def open_sky(recordings: Path) -> dict[str, tuple[AntennaResult, Floats]]:
     """Open sky by one and two frequencies, with the reference positions."""
     log, navigation, line, reference = japan(recordings)
     found = {name: (solved(log, navigation, line, name), reference) for name in ("one", "two")}
-    processor = processor_of(parse_config({"frequencies": "two", "filter": "off"}), navigation, {"front": line})
+    processor = make_processor(parse_config({"frequencies": "two", "filter": "off"}), navigation, {"front": line})
     state = None
     for rows in (slice(0, 1), slice(1, 100), slice(100, 240)):
         part, state = processor.process({"front": log[rows]}, state)

@@ -66,10 +66,10 @@ def test_the_sigma_grows_with_the_distance_and_ends() -> None:
 
 
 def test_later_errors_are_joined_by_channel_and_old_ones_left_out() -> None:
-    both = errors([0.0], ["G011C", "G021C"], [[1.0, 2.0]]).joined(errors([1.0], ["E031C", "G021C"], [[4.0, 3.0]]))
+    both = errors([0.0], ["G011C", "G021C"], [[1.0, 2.0]]).merge(errors([1.0], ["E031C", "G021C"], [[4.0, 3.0]]))
     assert both.keys == [("E03", "1C"), ("G01", "1C"), ("G02", "1C")]
     np.testing.assert_array_equal(both.code_m, [[np.nan, 1, 2], [4, np.nan, 3]])
     assert both.arc.tolist() == [[-1, 7, 7], [7, -1, 7]]
-    kept = both.kept_from(START + np.timedelta64(500, "ms"))
+    kept = both.drop_before(START + np.timedelta64(500, "ms"))
     assert kept.keys == [("E03", "1C"), ("G02", "1C")]
     np.testing.assert_array_equal(kept.code_m, [[4, 3]])

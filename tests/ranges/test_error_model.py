@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm
 
 from railfix.cli.evaluate import priors_text
-from railfix.cli.options import Choices, settings_of
+from railfix.cli.options import Choices, resolve_settings
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.ranges.error_model import (
     POOLED,
@@ -350,10 +350,10 @@ def test_measured_priors_are_those_of_a_run_with_the_model(tmp_path: Path) -> No
     model, fitted = tmp_path / "line.toml", fit_bins(samples, np.ones(4000, dtype=bool), ErrorModelFit())
     write_error_model(ErrorModel(bins=ErrorBins(), before=fitted, after=fitted, covers="local", faults=rate), model)
     assert f"risk.side_prior = {rate.side_upper:.2g} as measured" in priors_text(rate)
-    config, _ = settings_of(Choices(error_model=model))
+    config, _ = resolve_settings(Choices(error_model=model))
     assert (config.risk.priors, config.risk.local_prior) == ("measured", rate.upper)
     assert (config.risk.side_prior, config.no_level_m) == (rate.side_upper, rate.no_level_m)
-    own, _ = settings_of(Choices(error_model=model, setting=("risk.local_prior=2e-5",)))
+    own, _ = resolve_settings(Choices(error_model=model, setting=("risk.local_prior=2e-5",)))
     assert (own.risk.priors, own.risk.local_prior, own.no_level_m) == ("assumed", 2e-5, ())
     short = fault_rate(samples_of(np.zeros(4000), 60.0, 0.0, 45.0))
     assert short.side_upper == 1.0

@@ -40,7 +40,7 @@ from railfix.ranges.sbas import (
     SbasCorrections,
     read_sbas,
 )
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from recordings_score import straight_line
 
 pytestmark = pytest.mark.requirement("A4")
@@ -449,7 +449,7 @@ def test_a_run_with_sbas_adds_the_sbas_variance_to_that_of_the_noise_model(recor
     observations, navigation = read_observations(f"{stem}.obs")[150:220], read_navigation([f"{stem}.nav"])
     line = straight_line(observations.header.approximate_ecef_m, 45.0)
     config = parse_config({"filter": "off", "sbas": [f"{stem}.sbs"], "sbas_prn": 137, "screens": []})
-    result = processor_of(config, navigation, {"front": line}).process({"front": observations})[0].antennas["front"]
+    result = make_processor(config, navigation, {"front": line}).process({"front": observations})[0].antennas["front"]
     columns = result.columns
     used = result.reason[:, columns] == 0
     engine = SbasCorrections.from_log(read_sbas(f"{stem}.sbs"), prn=137)

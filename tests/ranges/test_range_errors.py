@@ -27,13 +27,13 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import conditions_of
+from railfix.pipeline.corrected_ranges import collect_conditions
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.error_model import read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run import RunOptions, read_record, run_files
 from railfix.run.driver import open_inputs
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate import Scenario, Simulation, demo_files
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import from_positions
@@ -85,7 +85,7 @@ def test_a_station_speaks_between_its_epochs_and_of_its_satellites() -> None:
 def _demo(config: Config, part: slice = slice(0, 600)) -> tuple[EpochProcessor, Observations, AntennaReference]:
     inputs = demo_inputs()
     navigation, line, logs = open_inputs(inputs, RunOptions(), Config(filter="off"))
-    processor = processor_of(config, navigation, line.trajectories)
+    processor = make_processor(config, navigation, line.trajectories)
     reference = read_reference(demo_files()["truth"], ("front", "rear"))["front"]
     return processor, next(logs["front"].parts())[part], reference
 
@@ -114,7 +114,7 @@ def test_the_errors_of_a_simulated_run_have_the_noise_that_was_put_in() -> None:
     made = Simulation(Scenario(duration_s=60.0))
     (piece,) = made.pieces("front", chunk_epochs=600)
     path = Trajectory.from_track(made.line.track())
-    processor = processor_of(
+    processor = make_processor(
         parse_config({"filter": "off", "screens": ["elevation"]}), made.navigation, {"front": path}
     )
     result, _ = processor.process({"front": piece.observations})
@@ -158,7 +158,7 @@ def test_a_station_takes_the_common_errors_away(recordings: Path) -> None:
     navigation = read_navigation([folder / "SEPT2650.21P"])
     path = Trajectory.from_track(from_positions(time, ecef, spacing_m=5.0))
     config = parse_config({"filter": "off", "ionosphere": "off", "troposphere": "off"})
-    result, _ = processor_of(config, navigation, {"front": path}).process(
+    result, _ = make_processor(config, navigation, {"front": path}).process(
         {"front": read_observations(folder / "SEPT265G.21O")}
     )
     blank = np.full(len(time), np.nan)
@@ -166,7 +166,7 @@ def test_a_station_takes_the_common_errors_away(recordings: Path) -> None:
     reference = AntennaReference(
         time=time, ecef_m=ecef, chainage_m=blank, speed_mps=blank, sigma_m=blank, source=words, environment=words
     )
-    processor = processor_of(config, navigation, {"front": path})
+    processor = make_processor(config, navigation, {"front": path})
     station = base_station_from_files([folder / "3034265G.21O"], processor)
     assert station.smoothed
     antenna = result.antennas["front"]
@@ -281,10 +281,10 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
     plain = parse_config({"filter": "off", "elevation": {"mask_deg": 10.0}})
     log = read_observations(folder / "cres_20080526.bin.obs")[:200]
     line = straight_line(log.header.approximate_ecef_m, 45.0)
-    found, _ = processor_of(plain, navigation, {"front": line}).process({"front": log})
+    found, _ = make_processor(plain, navigation, {"front": line}).process({"front": log})
     place = np.nanmedian(found.antennas["front"].conventional_ecef_m, axis=0)
     line = straight_line(place, 45.0)
-    processor = processor_of(config, navigation, {"front": line})
+    processor = make_processor(config, navigation, {"front": line})
     result, _ = processor.process({"front": log})
     blank, words = np.full(len(log), np.nan), np.full(len(log), "")
     reference = AntennaReference(
@@ -297,7 +297,7 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
         environment=words,
     )
     errors = []
-    for one in (processor, processor_of(plain, navigation, {"front": line})):
+    for one in (processor, make_processor(plain, navigation, {"front": line})):
         station = base_station([log], one, place, name="itself")
         found_errors = range_errors(result.antennas["front"], line, reference, station)
         errors.append(
@@ -314,11 +314,11 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
 
 def test_a_model_says_under_which_conditions_it_holds(done_run: Path, tmp_path: Path) -> None:
     model, _ = error_model_from_runs([ModelInputs(run=done_run, reference=demo_files()["truth"])])
-    assert model.conditions == conditions_of(read_record(done_run).config)
+    assert model.conditions == collect_conditions(read_record(done_run).config)
     write_error_model(model, tmp_path / "m.toml")
-    same = processor_of(parse_config({"filter": "off", "error_model": str(tmp_path / "m.toml")}), *_nothing())
+    same = make_processor(parse_config({"filter": "off", "error_model": str(tmp_path / "m.toml")}), *_nothing())
     assert not any("other conditions" in note for note in same.notes)
-    other = processor_of(
+    other = make_processor(
         parse_config({"filter": "off", "error_model": str(tmp_path / "m.toml"), "screens": []}), *_nothing()
     )
     assert any("other conditions than this run's: screens: model elevation" in note for note in other.notes)

@@ -67,7 +67,7 @@ def test_covariances_and_degradation_are_those_of_cssrlib(log: SbasMessages) -> 
         ]  # fmt: skip
         for number, values in enumerate(ours):
             assert values is None or float(values[i]) == pytest.approx(float(theirs[number])), number
-    row = decode.rows_of(log, 28)
+    row = decode.find_rows(log, 28)
     compared = 0
     for start in (16, 121):
         sent = decode.read_fields(log.bits[row], {"slot": decode.BitField(start, 6)})["slot"]

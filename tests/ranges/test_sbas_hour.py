@@ -11,7 +11,7 @@ import sbas_hour
 from railfix.core.constants import FREQUENCY_L1
 from railfix.core.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.level_stage import risk_of
+from railfix.pipeline.level_stage import get_risk_budget
 from railfix.ranges.atmosphere import SeenFrom
 from railfix.ranges.corrected import sbas_delays
 from railfix.ranges.sbas import SatelliteState
@@ -70,7 +70,7 @@ def test_k_sigma_is_the_textbooks(above: sbas_hour.Sky, line: Trajectory, found:
     normal = design.T @ (design / variance[:, None])
     normal += np.diag([0.0, line.sigma_plan_m**-2, line.sigma_height_m**-2, 0.0])
     sigma = np.sqrt(np.linalg.inv(normal)[0, 0])
-    k = risk_of(parse_config({"sbas": ["messages"]})).sample_k
+    k = get_risk_budget(parse_config({"sbas": ["messages"]})).sample_k
     assert one.used[point, t] == used.sum()
     # The line's own tangent at a point of 100 km spacing leans into the Earth by half a degree.
     assert one.fault_free_m[point, t] == pytest.approx(k * sigma, rel=1e-3)

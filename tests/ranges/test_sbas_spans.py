@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.ranges.sbas.ionosphere import Spans, distinct_lookups, looked_up
+from railfix.ranges.sbas.ionosphere import Spans, distinct_lookups, look_up
 from railfix.ranges.sbas.tables import Series, _with_other
 
 pytestmark = pytest.mark.requirement("C1")
@@ -36,7 +36,7 @@ def test_each_combination_is_asked_once_and_answered_everywhere() -> None:
         asked.append(len(points))
         return points * 1000 + spans.number(when)[:, None]
 
-    found = looked_up(answer, spans.number(time), point, time, 2664)
+    found = look_up(answer, spans.number(time), point, time, 2664)
     np.testing.assert_array_equal(found, answer(point, time))
     assert asked[0] < 400
     first, which = distinct_lookups(spans.number(time), point, 2664)

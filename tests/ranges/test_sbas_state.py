@@ -40,9 +40,9 @@ def arriving(messages: SbasMessages, time: np.ndarray, step: int, limits: SbasLi
         chunk = time[start : start + step]
         after = chunk[-1] if start + step < len(time) else messages.time.max()
         before = time[start - 1] if start else np.datetime64("1980-01-01", "ns")
-        state = state.received(messages.take((messages.time > before) & (messages.time <= after)))
+        state = state.add_messages(messages.take((messages.time > before) & (messages.time <= after)))
         parts.append(answers(state.corrections, chunk, navigation))
-        state = state.kept_from(chunk[-1])
+        state = state.drop_before(chunk[-1])
         most = max(most, len(state.messages))
     return [np.concatenate(columns) for columns in zip(*parts, strict=True)], most
 
@@ -99,7 +99,7 @@ def test_forgetting_changes_nothing_over_a_day_of_messages() -> None:
 def test_before_any_message_nothing_is_corrected() -> None:
     found = SbasState(prn=137).corrections.satellites(np.array([cases.START]), SATELLITES)
     assert (found.state == SatelliteState.NO_MASK).all()
-    other = SbasState(prn=129).received(cases.message_log([(1.0, 137, cases.mask(0, [1]))]))
+    other = SbasState(prn=129).add_messages(cases.message_log([(1.0, 137, cases.mask(0, [1]))]))
     assert len(other.messages) == 0
 
 
@@ -109,11 +109,11 @@ def test_messages_of_an_earlier_time_take_their_place() -> None:
     later = replace(
         cases.message_log([(5.0, 0, cases.fast(0, [2.0], [4]))]), sources=("another",), rejected={"line": 2}
     )
-    joined = first.joined(later)
+    joined = first.merge(later)
     assert joined.time.tolist() == sorted(joined.time.tolist())
     assert [joined.sources[number] for number in joined.source] == ["cases", "another", "cases"]
     assert (joined.rejected, len(first)) == ({"line": 2}, 2)
-    assert first.joined(SbasMessages.none()) is first
+    assert first.merge(SbasMessages.none()) is first
 
 
 def test_a_fast_correction_is_not_used_after_twenty_minutes_however_often_type_6_renews_it() -> None:
@@ -133,6 +133,6 @@ def test_notes_count_what_a_whole_log_leaves_out_and_do_not_change_with_every_me
         [(1.0, 0, cases.mask(0, [1])), (2.0, 0, cases.integrity(0, [3])), (9.0, 0, cases.integrity(0, [3]))]
     )
     asked = SbasState(prn=137).corrections.notes
-    assert SbasState(prn=137).received(log).corrections.notes == asked
+    assert SbasState(prn=137).add_messages(log).corrections.notes == asked
     first, *rest = SbasCorrections.from_log(log, prn=137).notes[-2:]
     assert (first, rest) == (asked[0], ["PRN 137: 2 UDREI of type 6 without a fast correction of their IODF, not used"])

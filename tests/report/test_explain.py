@@ -19,7 +19,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.report.explain import FILTER_STATUS, SINGLE_STATUS, explain_epoch
 from railfix.run import RunOptions, run_files
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -52,7 +52,7 @@ def test_the_position_without_a_satellite_is_that_of_solving_again(tmp_path: Pat
 
     def place(left: np.ndarray) -> float:
         part = replace(log, code_m=np.where(left, np.nan, log.code_m))
-        result, _ = processor_of(config, navigation, {"front": path}).process({"front": part})
+        result, _ = make_processor(config, navigation, {"front": path}).process({"front": part})
         return float(result.antennas["front"].arc_m[0])
 
     found = explain_epoch(tmp_path / "front", str(log.time[0])[:23])

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from railfix.cli import app
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
-from railfix.evaluate.tables import error_tables, evaluation_of, group_tables, level_tables
+from railfix.evaluate.tables import error_tables, group_tables, level_tables, select_evaluation
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
 from railfix.report.charts_page import pack_array, script_json
@@ -183,7 +183,7 @@ def test_the_terminal_and_the_page_show_the_same_tables(document: str, evaluatio
     """Every cell of the evaluation of single epochs: in the page, and what `railfix evaluate` prints."""
     words = ["evaluate", str(folder), "--reference", str(demo_truth()), "--table", "positions"]
     printed = RUNNER.invoke(app, words, env={"COLUMNS": "500"}).output
-    part = evaluation_of(evaluation, folder.name)
+    part = select_evaluation(evaluation, folder.name)
     tables = [*error_tables(part), *group_tables(part), *level_tables(part, worst=20)]
     names = ["figures-of-merit", "intervals", "stanford-separation", "above-level-separation"]
     assert set(names) <= {table.name for table in tables}

@@ -73,21 +73,21 @@ def test_exchanged_logs_are_noted_whichever_way_the_train_faces_and_runs(
 ) -> None:
     right = order_of(way, facing=facing, reference=reference)
     assert right.distance_m == pytest.approx(SPACING_M, abs=0.05)
-    assert right.measured()[0] == pytest.approx(SPACING_M, abs=4.0 * right.measured()[1])
+    assert right.measure()[0] == pytest.approx(SPACING_M, abs=4.0 * right.measure()[1])
     assert right.note is None
     exchanged = order_of(way, facing=facing, reference=reference, exchanged=True)
-    assert exchanged.measured()[0] == pytest.approx(-SPACING_M, abs=4.0 * exchanged.measured()[1])
+    assert exchanged.measure()[0] == pytest.approx(-SPACING_M, abs=4.0 * exchanged.measure()[1])
     assert exchanged.note is not None
     assert "behind those of the rear log, and the vehicle file has them 18.2 m ahead" in exchanged.note
 
 
 def test_what_is_not_certain_is_not_noted() -> None:
     still = order_of(np.full(600, 300.0), exchanged=True)
-    assert np.isnan(still.measured()[0])
+    assert np.isnan(still.measure()[0])
     assert still.note is None
     noisy = order_of(RISING, exchanged=True, sigma_m=40.0)
     assert noisy.note is None
-    assert noisy.measured()[1] > 5.0
+    assert noisy.measure()[1] > 5.0
     # time tags a leap apart put the front log far behind: not what an exchange does
     assert order_of(RISING, extra_m=-360.0).note is None
     assert order_of(RISING, extra_m=-12.0).note is None
@@ -95,12 +95,12 @@ def test_what_is_not_certain_is_not_noted() -> None:
 
 def test_the_sigma_grows_with_the_scatter_of_the_stretches() -> None:
     order = order_of(RISING)
-    _, before = order.measured()
+    _, before = order.measure()
     stretches = order._stretches
     for k, key in enumerate(sorted(stretches)):
         count, distance, variance = stretches[key]
         stretches[key] = (count, distance + (-1.0) ** k * 20.0 * count, variance)
-    assert order.measured()[1] > 5.0 * before
+    assert order.measure()[1] > 5.0 * before
 
 
 def test_there_is_no_order_of_one_antenna_or_without_a_vehicle() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.pipeline.config import Config
-from railfix.run.sensors import balises_of, read_listed_balises, read_sensors
+from railfix.run.sensors import load_balises, read_listed_balises, read_sensors
 from railfix.simulate import Simulation
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.sensor_tables import COLUMNS, sensor_tables
@@ -72,15 +72,15 @@ def test_a_list_that_is_none_is_refused(track: Track, tmp_path: Path, text: str,
 def test_readings_need_a_list_and_virtual_balises_levels(track: Track, tmp_path: Path) -> None:
     places = write(tmp_path, HEADER + "A,1\n")
     with pytest.raises(SettingsError, match="--balises is given without --balise-list; give both"):
-        balises_of(places, None, None, track, Config())
+        load_balises(places, None, None, track, Config())
     with pytest.raises(SettingsError, match="--balise-list is given without --balises; give both"):
-        balises_of(None, places, None, track, Config())
+        load_balises(None, places, None, track, Config())
     with pytest.raises(SettingsError, match="--virtual-balises needs the levels of the filter"):
-        balises_of(None, None, places, track, Config(filter="off"))
-    both = balises_of(places, places, places, track, Config(filter="track"))
+        load_balises(None, None, places, track, Config(filter="off"))
+    both = load_balises(places, places, places, track, Config(filter="track"))
     assert both is not None
     assert both.virtual.tolist() == [False, True]
-    assert both.index_of(np.array(["A", "B"])).tolist() == [0, -1]
+    assert both.find_index(np.array(["A", "B"])).tolist() == [0, -1]
 
 
 @pytest.mark.requirement("E7")

@@ -11,7 +11,7 @@ import pytest
 from railfix.evaluate import along_track_error
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate import demo_files
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -34,7 +34,7 @@ def demo():
 
 def run(carrier: str, cuts: int, epochs: int = EPOCHS):
     observations, navigation, trajectory, _ = demo()
-    processor = processor_of(parse_config({"filter": "off", "carrier": carrier}), navigation, {"front": trajectory})
+    processor = make_processor(parse_config({"filter": "off", "carrier": carrier}), navigation, {"front": trajectory})
     state, parts = None, []
     for first in range(0, epochs, cuts):
         result, state = processor.process({"front": observations[first : min(first + cuts, epochs)]}, state)

@@ -14,7 +14,7 @@ from railfix.io.logs import read_observations
 from railfix.io.mate import READ, WRITTEN, mate_table, signal_code
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, run_files
-from railfix.run.convert import inputs_of
+from railfix.run.convert import find_inputs
 from railfix.run.inputs import TrackReading
 from railfix.run.sensors import read_listed_balises, read_sensors
 from railfix.simulate import Simulation
@@ -74,7 +74,7 @@ def test_an_unknown_column_is_refused_with_one_sentence(folder: Path, tmp_path: 
 
 
 def test_sensors_and_balises_are_those_of_the_simulator(folder: Path) -> None:
-    given = inputs_of(folder)
+    given = find_inputs(folder)
     samples = read_sensors(**{name: given[name] for name in ("inertial", "radar", "balises")})
     assert len(samples.inertial) > 1000
     assert -10.2 < samples.inertial.force_mps2[:, 2].mean() < -9.4
@@ -85,10 +85,10 @@ def test_sensors_and_balises_are_those_of_the_simulator(folder: Path) -> None:
 
 def test_a_folder_without_its_tables_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="has no table S_GNSS_SAT"):
-        inputs_of(tmp_path)
+        find_inputs(tmp_path)
     (tmp_path / "S_GNSS_SAT.parquet").write_bytes((folder / "S_GNSS_SAT.parquet").read_bytes())
     with pytest.raises(InputFileError, match="has no table S_DM_TRACK_SEGMENT_POSITION or S_DM_TRACKPOINT"):
-        inputs_of(tmp_path)
+        find_inputs(tmp_path)
     with pytest.raises((SettingsError, ValueError), match="--front is missing"):
         RunInputs(nav=(tmp_path / "n",), track=(tmp_path / "t",))
 

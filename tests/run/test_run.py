@@ -24,7 +24,7 @@ from railfix.pipeline.processor import Result
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
 from railfix.pipeline.tables import TRAIN_COLUMNS, observations_table, positions_table, to_xarray, train_table
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -57,7 +57,7 @@ def result() -> Result:
         "front": antenna_trajectory(track, vehicle, "front"),
         "rear": antenna_trajectory(track, vehicle, "rear"),
     }
-    return processor_of(Config(), read_navigation(inputs.nav), trajectories).process(observations)[0]
+    return make_processor(Config(), read_navigation(inputs.nav), trajectories).process(observations)[0]
 
 
 def inputs_of(bench: Bench) -> RunInputs:

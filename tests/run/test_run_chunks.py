@@ -23,8 +23,8 @@ from railfix.core.errors import OutputError
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import RadarSpeeds, SensorSamples
-from railfix.pipeline.tables import rounded
-from railfix.run.driver import _screened
+from railfix.pipeline.tables import round_floats
+from railfix.run.driver import _screen_chunks
 from railfix.run.output import OutputFolder
 from railfix.run.sources import align_logs
 
@@ -108,8 +108,8 @@ def test_a_sample_of_a_sensor_goes_to_the_chunk_that_it_came_in() -> None:
     whole = log(list(range(0, 9000, 1000)))
     radar = RadarSpeeds(time=START + np.arange(-1500, 10_000, 500).astype("timedelta64[ms]"), speed_mps=np.zeros(23))
     chunks = ({"front": part} for part in parts(whole, 3))
-    processor = cast(Any, SimpleNamespace(screened=screened))
-    assert len(list(_screened(chunks, (SensorSamples(radar=radar), None), processor))) == 3
+    processor = cast(Any, SimpleNamespace(screen=screened))
+    assert len(list(_screen_chunks(chunks, (SensorSamples(radar=radar), None), processor))) == 3
     heard = [seconds(samples.radar.time - START) for samples in given]
     np.testing.assert_array_equal(np.concatenate(heard), np.arange(-1.5, 8.1, 0.5))
     assert [times[-1] for times in heard] == [2.0, 5.0, 8.0]
@@ -185,7 +185,7 @@ def test_a_table_is_written_again_some_rows_at_a_time(tmp_path: Path, monkeypatc
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["train.csv", "train.parquet"]
     assert pl.read_parquet(files["train.parquet"]).equals(wanted)
     assert pl.read_parquet_metadata(files["train.parquet"])["provenance"] == "x"
-    assert pl.read_csv(files["train.csv"]).equals(rounded(wanted))
+    assert pl.read_csv(files["train.csv"]).equals(round_floats(wanted))
 
 
 def test_an_error_leaves_nothing(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from railfix.core.errors import MismatchError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.evaluate import evaluate_run, interpolate_reference
 from railfix.evaluate.inputs import EvaluationOptions, read_run
-from railfix.evaluate.place import track_of
+from railfix.evaluate.place import read_run_track
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, RunSummary, TrackReading, run_files
 from railfix.run.driver import open_inputs
@@ -32,7 +32,7 @@ from railfix.track.frames import points_at
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, match
 from railfix.track.network_read import links_of_ends
-from railfix.track.network_route import route_of
+from railfix.track.network_route import find_route
 
 pytestmark = pytest.mark.requirement("A10")
 LOOP_M = (250.0, 550.0)
@@ -110,9 +110,9 @@ def test_beside_the_route_no_position_is_ok_and_nothing_bounds_it(
     """The route is the loop, 20 m beside the track on which the demo drove: the probability of the route says so."""
 
     def wrong(network: Network, _: Matched) -> tuple[list[int], list[int]]:
-        return [network.index_of(name) for name in ("line 0", "loop 0", "line 1")], []
+        return [network.find_index(name) for name in ("line 0", "loop 0", "line 1")], []
 
-    monkeypatch.setattr("railfix.run.route.route_of", wrong)
+    monkeypatch.setattr("railfix.run.route.find_route", wrong)
     inputs = _demo_on(tmp_path, aside_m=20.0)
     summary = run_files(inputs, Config(filter="track"), out=tmp_path / "results", options=ELLIPSOIDAL)
     for table, passed in (("positions", "ok"), ("train", "tracking")):
@@ -140,7 +140,7 @@ def test_a_loop_that_is_possible_leaves_no_position_ok(near: tuple[RunInputs, Ru
 def test_evaluation_reads_the_track_that_the_run_wrote(near: tuple[RunInputs, RunSummary]) -> None:
     _, summary = near
     folder = summary.files["run.json"].parent
-    assert track_of(read_run(folder)).chainage_m[-1] == pytest.approx(756.0, abs=1.0)
+    assert read_run_track(read_run(folder)).chainage_m[-1] == pytest.approx(756.0, abs=1.0)
     result = evaluate_run(folder, demo_truth(), options=EvaluationOptions(method="trajectory"))
     assert result is not None
 
@@ -238,7 +238,7 @@ def test_memory_of_the_track_is_kept_without_positions() -> None:
     matched = match(net, gap)
     assert np.isnan(matched.probability[np.isnan(latitude)]).all()
     assert set(matched.track[np.isfinite(latitude)].tolist()) == {0, 2, 3}
-    assert route_of(net, matched) == ([0, 2, 3], [])
+    assert find_route(net, matched) == ([0, 2, 3], [])
 
 
 def test_a_train_that_runs_back_over_another_track_has_a_route_and_says_so() -> None:
@@ -253,7 +253,7 @@ def test_a_train_that_runs_back_over_another_track_has_a_route_and_says_so() -> 
             for name in ("latitude_deg", "longitude_deg", "sigma_m")
         },
     )
-    route, left_out = route_of(net, match(net, both, sigma_m=0.3))
+    route, left_out = find_route(net, match(net, both, sigma_m=0.3))
     assert sorted([*route, *left_out]) == [0, 1, 2, 3]
     assert len(left_out) == 1
     assert left_out[0] in (1, 2)
@@ -274,7 +274,7 @@ def test_there_and_back_over_the_same_tracks_chainage_rises_on_the_way_there() -
                 track=np.concatenate([matched.candidates.track, matched.candidates.track[::-1]]),
             ),
         )
-        assert route_of(net, found) == ([0, 1, 3], [])
+        assert find_route(net, found) == ([0, 1, 3], [])
 
 
 @pytest.mark.parametrize("jump", [(30, 10, 5), (2, 3, 3), (60, 4, 0)])
@@ -283,14 +283,14 @@ def test_a_jump_to_a_track_beside_cuts_no_connected_route(jump: tuple[int, int, 
     net = made_network(10.0)
     log, on = made_run(net, [0, 1, 3, 4, 6], rng=np.random.default_rng(5), sigma_m=0.05)
     matched = match(net, log, sigma_m=0.3)
-    assert route_of(net, matched) == ([0, 1, 3, 4, 6], [])
+    assert find_route(net, matched) == ([0, 1, 3, 4, 6], [])
     start, beside, unmapped = jump
     track, first = matched.track.copy(), int(np.argmax(on == 1)) + start
     track[first : first + beside] = 2
     track[first + beside : first + beside + unmapped] = -1
     for turn in (slice(None), slice(None, None, -1)):
         found = replace(matched, track=track[turn])
-        route, left_out = route_of(net, found)
+        route, left_out = find_route(net, found)
         assert (route, left_out) == ([0, 1, 3, 4, 6][turn], [2])
 
 
@@ -309,7 +309,7 @@ def test_a_closed_route_driven_three_times_passes_each_track_once() -> None:
     log, on = made_run(net, [0, 1, 0, 2, 0, 1, 0], rng=np.random.default_rng(2), sigma_m=0.2)
     matched = match(net, log)
     assert (matched.track == on).mean() > 0.98
-    assert route_of(net, matched) == ([0, 1], [2])
+    assert find_route(net, matched) == ([0, 1], [2])
 
 
 def test_a_gap_in_the_map_ends_the_route_and_is_said() -> None:
@@ -319,7 +319,7 @@ def test_a_gap_in_the_map_ends_the_route_and_is_said() -> None:
         links = tuple(link for link in made.links if {link.first, link.second} not in ({cut, 1}, {1, 3}, {2, 3}))
         net = replace(made, links=links)
         log, _ = made_run(made, [0, 1, 3], rng=np.random.default_rng(5), sigma_m=0.05)
-        route, left_out = route_of(net, match(net, log, sigma_m=0.3))
+        route, left_out = find_route(net, match(net, log, sigma_m=0.3))
         assert set(route) | set(left_out) >= {0, 1, 3}
         assert not set(route) & set(left_out)
         assert 1 <= len(left_out) <= 2
@@ -334,19 +334,19 @@ def test_positions_are_matched_in_the_frame_of_the_map() -> None:
     moved, _ = points_at(ecef, "EPSG:4258", log.time[0])
     latitude, longitude, _ = geodetic_from_ecef(moved)
     received = replace(log, latitude_deg=latitude, longitude_deg=longitude)
-    back, shift = received.in_frame_of(net)
+    back, shift = received.transform_to(net)
     assert np.abs(match(net, back, sigma_m=0.5).offset_m).max() < 1e-3
     assert np.abs(match(net, received, sigma_m=0.5).offset_m) == pytest.approx(abs(shift.north_m), abs=0.05)
     timeless = replace(received, time=np.full(len(on), np.datetime64("NaT", "ns")))
     with pytest.raises(MismatchError, match=r"has no times.*--same-frame"):
-        timeless.in_frame_of(net)
-    assert timeless.in_frame_of(made)[1].method.startswith("used as it is")
+        timeless.transform_to(net)
+    assert timeless.transform_to(made)[1].method.startswith("used as it is")
     swapped = replace(log, latitude_deg=log.longitude_deg, longitude_deg=log.latitude_deg)
     with pytest.raises(MismatchError, match=r"the map lies \d+ km from where the log .* swapped in one of them"):
-        swapped.in_frame_of(made)
+        swapped.transform_to(made)
     elsewhere = replace(log, longitude_deg=log.longitude_deg + 6.0)
     with pytest.raises(MismatchError, match=r"the map lies \d\d\d km from .* its CRS right"):
-        elsewhere.in_frame_of(made)
+        elsewhere.transform_to(made)
 
 
 @pytest.mark.slow

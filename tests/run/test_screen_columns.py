@@ -16,7 +16,7 @@ from railfix.pipeline.processor import Result
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
 from railfix.pipeline.tables import observations_table, positions_table
 from railfix.ranges.cn0_curve import read_cn0_curve
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.sources import TrackReading, open_line
 from railfix.simulate.demonstration import demo_inputs
 
@@ -38,7 +38,7 @@ TIGHT: dict[str, object] = {
 def result_of(settings: dict[str, object]) -> Result:
     inputs = demo_inputs()
     line = open_line(inputs.track, inputs.vehicle, antennas=("front", "rear"), reading=TrackReading())
-    processor = processor_of(parse_config(settings), read_navigation(inputs.nav), line.trajectories)
+    processor = make_processor(parse_config(settings), read_navigation(inputs.nav), line.trajectories)
     return processor.process({name: read_observations(paths)[PART] for name, paths in inputs.logs.items()})[0]
 
 

@@ -24,7 +24,7 @@ from railfix.pipeline.tables import observations_table, positions_table, train_t
 from railfix.report.page import budget, summary
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.tally import AntennaTally
 from railfix.simulate.demonstration import demo_inputs
 from railfix.tracking import Kind
@@ -111,7 +111,7 @@ def at_path(result: Any, path: str) -> np.ndarray:
 def result() -> Result:
     """Thirty epochs of the demonstration, a number of its own in every place of the result."""
     observations, navigation, trajectory, _ = demo()
-    processor = processor_of(Config(filter="track"), navigation, {"front": trajectory})
+    processor = make_processor(Config(filter="track"), navigation, {"front": trajectory})
     whole, _ = processor.process({"front": observations[:30]})
     random = np.random.default_rng(11)
     return replace(

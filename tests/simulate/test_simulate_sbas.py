@@ -58,7 +58,7 @@ def test_corrections_undo_clocks_delays_and_orbits(simulation: Simulation, messa
     time = simulation.time()
     got = corrections.satellites(time, gps, simulation.navigation)
     assert (got.state == SatelliteState.OK).all()
-    errors = simulation.errors_of(gps.tolist())
+    errors = simulation.compute_errors(gps.tolist())
     at = np.arange(len(time)) * 1.0
     clock = errors.clock_error_m(at) - errors.group_delay_m(gps.tolist(), ["1C"] * len(gps))
     assert np.abs(clock).max() > 0.8, "there is something to correct"

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from conftest import ROOT
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.settings import validated, write_toml
+from railfix.core.settings import validate, write_toml
 from railfix.gnss.observations import concatenate
 from railfix.io.rinex import read_navigation, write_navigation, write_observations
 from railfix.simulate import (
@@ -411,7 +411,7 @@ def test_georinex_reads_the_files(tmp_path: Path) -> None:
 
 def test_tables_of_settings_tell_what_is_known() -> None:
     with pytest.raises(SettingsError, match=r"known are .*bogie_distance_m"):
-        validated(Scenario, tomllib.loads("[vehicle]\nbogie = 3"), source="here")
+        validate(Scenario, tomllib.loads("[vehicle]\nbogie = 3"), source="here")
 
 
 def test_the_files_of_the_document_are_scenarios(tmp_path: Path) -> None:

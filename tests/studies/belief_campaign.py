@@ -53,7 +53,7 @@ from railfix.io.reference_log import read_reference
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.run import truth_table, vehicle_table
 from railfix.simulate.scenario_file import list_scenarios, load_recipe
 from railfix.track import Track, antenna_trajectory, read_track, read_vehicle
@@ -227,7 +227,7 @@ def case_of_folder(folder: Path) -> Case:
 def run(case: Case, settings: dict[str, Any], *, first: int = 0) -> Judged:
     """Judge the pipeline on a case from a cold start, epochs from `first` on."""
     config = parse_config({"filter": "track", **settings})
-    processor = processor_of(config, case.navigation, {"front": case.trajectory})
+    processor = make_processor(config, case.navigation, {"front": case.trajectory})
     sensors = case.sensors
     if sensors is not None:
         time = case.observations.time
@@ -359,7 +359,7 @@ def on_line(case: Case, ecef_m: np.ndarray, *, sigma_m: float | None = None) -> 
 
 def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
     """Change of each range by a metre along the line at the reference, shape (T, M), 0 where unknown; and the speed."""
-    processor = processor_of(parse_config({"filter": "off"}), case.navigation, {"front": case.trajectory})
+    processor = make_processor(parse_config({"filter": "off"}), case.navigation, {"front": case.trajectory})
     found = processor.process({"front": case.observations})[0].antennas["front"]
     known = np.isfinite(case.reference_arc_m)
     arc = np.where(known, case.reference_arc_m, 0.0)

@@ -44,7 +44,7 @@ from railfix.positioning.carrier import (
 )
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups, constrained_position
 from railfix.ranges.atmosphere import saastamoinen_delay_m
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -145,7 +145,7 @@ def on_track(case: Case, result: AntennaResult, slips: Slips, used: np.ndarray) 
 def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
     """All forms on one log, as a pipeline would call them."""
     obs = case.observations
-    processor = processor_of(case.config, case.navigation, {"front": case.trajectory})
+    processor = make_processor(case.config, case.navigation, {"front": case.trajectory})
     result = processor.process({"front": obs})[0].antennas["front"]
     columns = result.columns
     names = obs.satellite[columns], obs.signal[columns]

@@ -16,7 +16,7 @@ from typer.core import TyperGroup
 
 import paths
 from railfix.cli import app
-from railfix.cli.options import Choices, settings_of
+from railfix.cli.options import Choices, resolve_settings
 from railfix.core.errors import SettingsError
 
 FENCE: Final = re.compile(r"^```(?:sh|console)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -108,7 +108,7 @@ def wrong_with(line: Shown) -> str | None:
         given = {name: tuple(b for a, b in pairwise(rest) if a == f"--{name}") for name in ("set", "without")}
         one = {name: b for name in ("preset", "screens", "filter") for a, b in pairwise(rest) if a == f"--{name}"}
         try:
-            settings_of(Choices.model_validate({"setting": given["set"], "without": given["without"], **one}))
+            resolve_settings(Choices.model_validate({"setting": given["set"], "without": given["without"], **one}))
         except (SettingsError, ValidationError) as error:
             return f"{line.place}: {error}"
     if not line.whole:

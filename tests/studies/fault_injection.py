@@ -37,7 +37,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
@@ -94,7 +94,7 @@ def run(recording: Recording, config: Config, bias_m: Floats | None = None) -> A
     observations = recording.observations
     if bias_m is not None:
         observations = replace(observations, code_m=observations.code_m + bias_m)
-    processor = processor_of(config, recording.navigation, {"front": recording.trajectory})
+    processor = make_processor(config, recording.navigation, {"front": recording.trajectory})
     return processor.process({"front": observations})[0].antennas["front"]
 
 

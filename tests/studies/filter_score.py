@@ -30,7 +30,7 @@ from railfix.pipeline.filter_result import Replay, SmoothedTrack, smooth
 from railfix.ranges.corrected import code_sigma_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.bank import budget, kind_of
+from railfix.tracking.bank import budget, classify_source
 
 CONFIG = parse_config({"filter": "track"})
 #: Noise of the smartLoc receiver's codes against the weights, as a variance (docs/recordings: about 8).
@@ -85,13 +85,13 @@ class Case:
 
 def rinex_case(name: str, run: Callable[..., recordings_score.Outcome], data: Path) -> Case:
     kept: list[GnssEpochs] = []
-    tracked = along_track._tracked
+    tracked = along_track._run_filter
 
     def keeping(epochs: GnssEpochs, *args: object) -> object:
         kept.append(epochs)
         return tracked(epochs, *args)  # type: ignore[arg-type]
 
-    with mock.patch.object(along_track, "_tracked", keeping):
+    with mock.patch.object(along_track, "_run_filter", keeping):
         outcome = run(data, CONFIG)
     assert outcome.result is not None
     reading = {"m8t": "urbannav", "f9p": "urbannav", "pixel": "gsdc", "japan": "japan"}[name]
@@ -298,7 +298,7 @@ def show_terms(all_cases: list[Case]) -> None:
                 continue
             apart = np.abs(state.bank.mean[:, 0] - state.mean[0, 0])
             sigma = np.sqrt(state.bank.covariance[:, 0, 0])
-            prior = np.array([given.prior[kind_of(name)] for name in state.bank.without])
+            prior = np.array([given.prior[classify_source(name)] for name in state.bank.without])
             level = found.ground_level_m
             spent = prior * (ndtr((apart - level) / sigma) + ndtr((-apart - level) / sigma))
             own = 2.0 * ndtr(-level[0] / found.sigma_m[0])

@@ -25,7 +25,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
@@ -74,7 +74,7 @@ def row(log: Observations, navigation: Path, reference: Floats, line: Trajectory
     config = parse_config(
         {"frequencies": frequencies, "filter": "track" if tracked else "off", "elevation": {"mask_deg": 15.0}}
     )
-    processor = processor_of(config, read_navigation([navigation]), {"front": line})
+    processor = make_processor(config, read_navigation([navigation]), {"front": line})
     result, _ = processor.process({"front": log})
     antenna = result.antennas["front"]
     inside = np.isfinite(reference[:, 0])
@@ -101,7 +101,7 @@ def over_directions(log: Observations, navigation: Path, reference: Floats, freq
     records, errors = read_navigation([navigation]), []
     for azimuth in _DIRECTIONS:
         line = straight_line(reference[0], azimuth)
-        result, _ = processor_of(config, records, {"front": line}).process({"front": log})
+        result, _ = make_processor(config, records, {"front": line}).process({"front": log})
         errors.append(_of_errors(straight_distance(result.antennas["front"].arc_m, reference, line)))
     return np.mean(errors, axis=0), np.array(errors)[:, 1]
 

@@ -26,7 +26,7 @@ import numpy as np
 import paths  # noqa: F401
 from railfix.ground.control import ControlCentre
 from railfix.ground.layout import Layout
-from railfix.ground.links import TrainLinks, bearers_of, first_sequence
+from railfix.ground.links import TrainLinks, create_bearers, first_sequence
 from railfix.ground.quic import write_keys
 from railfix.ground.serve import COLLECTION, STEP_S
 from railfix.ground.store import Store
@@ -36,7 +36,7 @@ from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import encode
 
 CENTRE = {"A": ("127.0.1.1", 4433), "B": ("127.0.2.1", 4433)}
-BEARERS_OF = bearers_of(CENTRE, {"A": "127.0.1.41", "B": "127.0.2.41"})
+BEARERS_OF = create_bearers(CENTRE, {"A": "127.0.1.41", "B": "127.0.2.41"})
 
 
 def line(trains: int) -> tuple[Layout, dict[int, SimulatedTrain]]:

@@ -31,7 +31,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult, State
 from railfix.ranges.error_model import ErrorBins, ErrorModel, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, fit_bins
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
@@ -99,7 +99,7 @@ class Played:
 
     def results(self, settings: dict[str, Any]) -> Iterator[dict[str, tuple[AntennaResult, Any]]]:
         """Results of the chunks, each with the simulator's own piece."""
-        processor = processor_of(parse_config(settings), self.simulation.navigation, self.trajectories)
+        processor = make_processor(parse_config(settings), self.simulation.navigation, self.trajectories)
         state = State()
         for pieces in zip(*(self.simulation.pieces(name) for name in ANTENNAS), strict=True):
             result, state = processor.process(

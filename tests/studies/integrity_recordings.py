@@ -32,13 +32,13 @@ from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
-from railfix.pipeline.level_stage import risk_of
+from railfix.pipeline.level_stage import get_risk_budget
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position, fit
 from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run.driver import open_inputs
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.record import read_record
 from railfix.track.trajectory import Trajectory
 
@@ -256,7 +256,7 @@ def judged(
 ) -> Judged:
     """Positions weighted by a model, levels, errors of positions and of ranges; judged from an epoch on."""
     config = parse_config({"filter": "off", **MASK, **({} if file is None else {"error_model": str(file)})})
-    processor = processor_of(config, one.navigation, {"front": one.trajectory})
+    processor = make_processor(config, one.navigation, {"front": one.trajectory})
     result = processor.process({"front": one.observations})[0].antennas["front"]
     if least_scale < 1.0:
         level = _with_scale(one, result, config, np.maximum(result.noise_scale, least_scale))
@@ -315,7 +315,7 @@ def _with_scale(one: Recording, result: AntennaResult, config: Config, scale: np
     return along_track_level(
         constrained_model(ranges_of(result), one.trajectory, arc, section=section),
         [name[0] for name in result.satellite[result.columns].tolist()],
-        risk=risk_of(config),
+        risk=get_risk_budget(config),
         scale=scale,
         n_excluded=result.raim.excluded.sum(axis=1),
     )

@@ -78,7 +78,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False, chan
     def observe(_: LiveOutput) -> None:
         counts["outputs"] += 1
         if counts["outputs"] % 360 == 0:
-            saved = engine.saved()
+            saved = engine.export_state()
             counts["saved"] = len(pickle.dumps(SavedSession(engine=saved, streams={})))
         if counts["outputs"] % max(1, round(3600 * rate_hz)) == 0:
             memory.append(resident_mb())
@@ -111,7 +111,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False, chan
         if isinstance(engine, TwoChannels):
             engine.close()
     numbers = [from_json(line).sequence for line in (folder / "messages.jsonl").read_text().splitlines()]
-    saved = engine.saved()
+    saved = engine.export_state()
     assert saved is not None
     assert saved.state.received is not None
     return {

@@ -23,7 +23,7 @@ from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.pipeline.solve import PointStatus
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.sensors import read_sensors
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
@@ -189,7 +189,7 @@ class Bench:
                     settings = {"filter": "off", **way.settings, **common}
                     key = (letters, way.key)
                     if key not in self.processors:
-                        self.processors[key] = processor_of(
+                        self.processors[key] = make_processor(
                             parse_config(settings), self.simulation.navigation, self.trajectories
                         )
 

@@ -20,7 +20,7 @@ from railfix.core.reasons import Status
 from railfix.core.settings import write_toml
 from railfix.gnss.observations import Observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.line_file import Element, LineSettings
@@ -137,7 +137,7 @@ def subsets(start: np.datetime64, seed: int, size: int, place: Place, places: Se
             "section": {"redundancy": 0},
         }
     )
-    processor = processor_of(config, simulation.navigation, {"front": trajectory_of(simulation)})
+    processor = make_processor(config, simulation.navigation, {"front": trajectory_of(simulation)})
     (piece,) = simulation.pieces("front", chunk_epochs=simulation.scenario.epochs)
     observations, geometry = piece.observations, piece.geometry
     still = np.flatnonzero(np.abs(geometry.speed_mps) < 1e-6)

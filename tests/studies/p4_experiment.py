@@ -24,7 +24,7 @@ from railfix.integrity.raim import Outcome, RaimLimits
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -140,7 +140,7 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
             "raim_protection": "on",
         }
     )
-    processor = processor_of(config, read_navigation([folder / station.navigation]), {"front": trajectory})
+    processor = make_processor(config, read_navigation([folder / station.navigation]), {"front": trajectory})
     result = processor.process({"front": observations})[0].antennas["front"]
     reference = np.broadcast_to(place, (len(result), 3))
     latitude, longitude, _ = geodetic_from_ecef(place)

@@ -38,7 +38,7 @@ from railfix.positioning.normal_equations import Constrained, Ranges, clock_grou
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.windows import Windows
 from railfix.ranges.corrected import code_sigma_m
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.track import Track, from_positions
 from railfix.track.trajectory import Trajectory
 
@@ -84,7 +84,7 @@ def run_rinex(
 ) -> Outcome:
     time, ecef = truth
     trajectory = trajectory_of(time, ecef)
-    processor = processor_of(config, read_navigation(navigation), {"front": trajectory})
+    processor = make_processor(config, read_navigation(navigation), {"front": trajectory})
     result, _ = processor.process({"front": read_observations(observations)})
     antenna = result.antennas["front"]
     reference = interpolate_reference(antenna.time, time, ecef)
@@ -150,7 +150,7 @@ def geonet(data: Path, station: str, azimuth_deg: float, config: Config = SETTIN
     place = observations.header.approximate_ecef_m
     trajectory = straight_line(place, azimuth_deg)
     navigation = read_navigation([folder / f"{station}0920.05n"])
-    processor = processor_of(config, navigation, {"front": trajectory})
+    processor = make_processor(config, navigation, {"front": trajectory})
     result, _ = processor.process({"front": observations})
     antenna = result.antennas["front"]
     reference = np.broadcast_to(place, (len(antenna), 3))

@@ -27,7 +27,7 @@ from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
-from railfix.pipeline.level_stage import risk_of
+from railfix.pipeline.level_stage import get_risk_budget
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
 from railfix.ranges.corrected import CodeNoise, apply_long_term, code_sigma_m
@@ -173,7 +173,7 @@ def _at_point(
 ) -> tuple[np.ndarray, ...]:
     """Satellites used, dilution, levels and parts of the variance at one point, T epochs."""
     place, arc, section = where
-    risk = risk_of(parse_config({"sbas": ["messages"]}))
+    risk = get_risk_budget(parse_config({"sbas": ["messages"]}))
     enough = used.sum(axis=1) >= 3
     ranges = ranges_at(above, place, np.sqrt((sigmas**2).sum(axis=-1)), used)
     model = constrained_model(ranges, line, np.where(enough, arc, np.nan), section=np.full(len(used), section))

@@ -34,7 +34,7 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.raim import detect
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.screens import DopplerLimits
 from recordings_score import straight_line, trajectory_of
 
@@ -219,7 +219,7 @@ def test_clock_steps_of_a_real_receiver_trip_no_screen(recordings, mode):
     )
     assert config.doppler.mode == DopplerLimits(mode=mode).mode
     trajectory = trajectory_of(*recordings_truth.urbannav_truth(folder))
-    processor = processor_of(config, read_navigation([folder / "hksc137c.nav"]), {"front": trajectory})
+    processor = make_processor(config, read_navigation([folder / "hksc137c.nav"]), {"front": trajectory})
     result = processor.process({"front": observations})[0].antennas["front"]
     doppler = result.screens["doppler"]
     judged = np.isfinite(doppler.metric)
@@ -249,7 +249,7 @@ def test_steps_of_time_tags_do_not_move_the_statistic(recordings, station):
     _, in_tags = clock_steps(observations)
     assert len(in_tags) > 0
     trajectory = straight_line(observations.header.approximate_ecef_m, 45.0)
-    processor = processor_of(WITH_RAIM, read_navigation([folder / f"{station}0920.05n"]), {"front": trajectory})
+    processor = make_processor(WITH_RAIM, read_navigation([folder / f"{station}0920.05n"]), {"front": trajectory})
     raim = processor.process({"front": observations})[0].antennas["front"].raim
     share = raim.statistic / raim.threshold
     assert np.nanmax(share[in_tags]) < 1.0

@@ -20,7 +20,7 @@ from railfix.track import read_track
 from railfix.track.network import Network
 from railfix.track.network_match import match, read_plan_positions
 from railfix.track.network_read import check_network, links_of_ends, read_network
-from railfix.track.network_route import route_of
+from railfix.track.network_route import find_route
 from railfix.track.route import MapReading
 from report_page import Page, browser, fetched, opened
 from route_matcher import matched_track
@@ -77,7 +77,7 @@ def test_routes_pass_a_switch_by_stem_and_leg_only() -> None:
     with pytest.raises(MismatchError, match="without turning back"):
         net.shortest_route([1, 2])
     with pytest.raises(SettingsError, match="no track 'x'"):
-        net.index_of("x")
+        net.find_index("x")
 
 
 def test_connections_from_ends_are_those_that_were_made() -> None:
@@ -216,7 +216,7 @@ def test_infrabel_runs_lie_on_tracks_where_the_positions_are_fixed(
     with path.open() as file:
         fixed = np.array([row["position_type"] == "NARROW_INT3" for row in csv.DictReader(file)])
     assert (np.abs(matched.offset_m[fixed]) <= 5.0).mean() > share
-    tracks, left_out = route_of(infrabel, matched)
+    tracks, left_out = find_route(infrabel, matched)
     assert 4 <= len(tracks) <= 12
     assert not left_out
 

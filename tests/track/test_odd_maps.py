@@ -68,7 +68,7 @@ def test_an_odd_map_is_right_or_says_what_is_wrong(case: odd.Odd, tmp_path: Path
         assert any(re.search(case.words, sentence) for sentence in findings), findings
     elif case.outcome == "elsewhere":
         with pytest.raises(MismatchError, match=case.words or "is it the map of that line"):
-            _log().in_frame_of(Network(tracks=tuple(read_segments(path, MapReading(**asked))), links=()))
+            _log().transform_to(Network(tracks=tuple(read_segments(path, MapReading(**asked))), links=()))
     else:
         assert _apart_m(track, _design_m() if path.suffix == ".xml" else of_line) < 0.05
         assert findings == []

@@ -129,9 +129,9 @@ def test_a_way_is_known_by_its_id_alone(tmp_path: Path) -> None:
     path = tmp_path / "area.osm"
     path.write_text(_xml())
     network = Network(tracks=tuple(read_segments(path, MapReading())), links=())
-    assert (network.index_of("way/11"), network.index_of("way/12")) == (0, 1)
+    assert (network.find_index("way/11"), network.find_index("way/12")) == (0, 1)
     with pytest.raises(SettingsError, match=r"no track 'way/1'"):
-        network.index_of("way/1")
+        network.find_index("way/1")
 
 
 def test_a_shapefile_of_classes_is_read_as_its_geojson(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_topology_of_the_register_is_a_network(tmp_path: Path, kind: str) -> Non
     network = read_network([path])
     assert set(network.names) == {"stem", "L36 track A", "right"}
     assert all(t.height_datum == NO_HEIGHTS for t in network.tracks)
-    stem, left, right = (network.index_of(name) for name in ("stem", "L36 track A", "right"))
+    stem, left, right = (network.find_index(name) for name in ("stem", "L36 track A", "right"))
     assert network.tracks[left].latitude_deg.tolist() == [50.0, 50.0001]
     assert network.shortest_route([stem, right]) == [stem, right]
     assert network.route_over([left, right]) is None  # from leg to leg no train passes

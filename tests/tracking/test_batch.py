@@ -12,7 +12,7 @@ import pytest
 from railfix.core.settings import write_toml
 from railfix.pipeline.along_track import gnss_epochs
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.run import vehicle_table
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -37,8 +37,8 @@ def trajectory(case: Ride) -> Trajectory:
 @pytest.fixture(scope="module")
 def epochs(case: Ride, trajectory: Trajectory) -> GnssEpochs:
     config = parse_config({"filter": "off", "protection": "off"})
-    processor = processor_of(config, case.simulation.navigation, {"front": trajectory})
-    solved, _ = processor.single_epochs(*processor.screened({"front": case.observations}))
+    processor = make_processor(config, case.simulation.navigation, {"front": trajectory})
+    solved, _ = processor.single_epochs(*processor.screen({"front": case.observations}))
     result = solved.results["front"]
     found, _ = gnss_epochs(solved.ranges, result.noise_scale, config, None)
     return replace(found, near_ecef_m=result.conventional_ecef_m)

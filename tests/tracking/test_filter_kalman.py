@@ -10,7 +10,7 @@ import pytest
 from kalman_oracle import GALILEO, Kalman, Oracle, S, V
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import SensorEpochs, Tracked, TrackingLimits, TrackState, smoothed, track
+from railfix.tracking import SensorEpochs, Tracked, TrackingLimits, TrackState, smooth_steps, track
 from tracking_cases import ORIGIN_M, Ride, ride
 
 #: One hypothesis, normal errors, nothing learnt of the noise and the map, every speed believed.
@@ -81,7 +81,7 @@ def test_the_smoother_is_filterpys_in_the_gaussian_limit(case: tuple[Ride, Senso
     trace: list = []
     found, _ = track(ride.epochs, ride.line, limits=NORMAL, sensors=sensors, trace=trace)
     assert_equal(found, expected)
-    both, _ = smoothed(trace, TrackState.empty(), None, NORMAL)
+    both, _ = smooth_steps(trace, TrackState.empty(), None, NORMAL)
     np.testing.assert_allclose(both.arc_m, expected.smoothed_mean[:, S], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(both.speed_mps, expected.smoothed_mean[:, V], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(both.sigma_m, np.sqrt(expected.smoothed_covariance[:, S, S]), rtol=1e-6)

@@ -14,7 +14,7 @@ from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import BIAS_FAULTY, BIAS_SHORT
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.tally import Tally
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -122,7 +122,7 @@ def test_a_faulty_satellite_of_a_recording_is_named_within_150_s(recordings: Pat
     obs = case.observations
     obs = replace(obs, code_m=obs.code_m + 20.0 * (obs.satellite == satellite))
     alone = {"lasting_errors": {"most_satellites": 0}} if by == "the filter" else {}
-    processor = processor_of(parse_config({"filter": "track", **alone}), case.navigation, {"front": case.trajectory})
+    processor = make_processor(parse_config({"filter": "track", **alone}), case.navigation, {"front": case.trajectory})
     result, _ = processor.process({"front": obs})
     tally = Tally()
     tally.add(result)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plain_kernels import plain
-from railfix.core.arrays import changed
+from railfix.core.arrays import copy_with
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.kernels.tracking import layout
 from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
@@ -313,7 +313,7 @@ def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
     nothing = without_epochs(part(case.epochs, slice(50, 60)), np.ones(10, dtype=bool))
     own, banks = [], []
     for log_variance in (0.0, 5.0):
-        _, after = track(nothing, case.line, changed(state, map_log_variance=log_variance), levels=True)
+        _, after = track(nothing, case.line, copy_with(state, map_log_variance=log_variance), levels=True)
         assert after.bank is not None
         assert len(after.bank.without) > 10
         own.append(after.covariance[0, StateIndex.ARC, StateIndex.ARC])

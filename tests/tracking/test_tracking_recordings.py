@@ -11,7 +11,7 @@ import filter_score
 import recordings_score
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 
 #: Recording: median, 95th percentile, largest error [m], 95th percentile of error over sigma.
 BOUNDS = {
@@ -61,7 +61,7 @@ def test_half_a_day_at_rest_is_not_averaged_away(recordings: Path, azimuth_deg: 
     trajectory = recordings_score.straight_line(place, azimuth_deg)
     config = Config(filter="track", elevation={"mask_deg": 10.0})
     navigation = read_navigation(next(folder.glob("*_MN.rnx.gz")))
-    result, _ = processor_of(config, navigation, {"front": trajectory}).process({"front": observations})
+    result, _ = make_processor(config, navigation, {"front": trajectory}).process({"front": observations})
     tracked, single = result.fusion["front"].tracked, result.antennas["front"]
     station, _ = trajectory.nearest(place[None])
     error = np.abs(tracked.arc_m - float(station[0]))

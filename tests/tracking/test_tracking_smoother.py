@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.tracking import BackwardInformation, Step, TrackingLimits, TrackState, smoothed, track
+from railfix.tracking import BackwardInformation, Step, TrackingLimits, TrackState, smooth_steps, track
 from railfix.tracking.state import StateIndex
 from railfix.tracking.velocity import transition
 from tracking_cases import Ride, bent_line, part, ride, without_epochs
@@ -75,7 +75,7 @@ def test_smoothed_places_are_those_of_one_dense_solution() -> None:
     _, state = track(part(case.epochs, slice(0, 4)), case.line)
     later = Ride(part(case.epochs, slice(4, 12)), case.arc_m[4:], case.speed_mps[4:], case.trajectory)
     trace, _ = _traced(later, state)
-    result, _ = smoothed(trace, state, None, LIMITS)
+    result, _ = smooth_steps(trace, state, None, LIMITS)
     arc, sigma = _dense(trace)
     np.testing.assert_allclose(result.arc_m, arc, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(result.sigma_m, sigma, rtol=0.0, atol=1e-9)
@@ -85,7 +85,7 @@ def test_smoothed_places_are_those_of_one_dense_solution() -> None:
 def test_chunks_backward_give_what_the_whole_gives() -> None:
     case = ride(60, noise=1.0, seed=3)
     trace, _ = _traced(case)
-    whole, _ = smoothed(trace, TrackState.empty(), None, LIMITS)
+    whole, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
     pieces, states, state = [], [TrackState.empty()], None
     for cut in (slice(0, 7), slice(7, 40), slice(40, 60)):
         one = Ride(part(case.epochs, cut), case.arc_m[cut], case.speed_mps[cut], case.trajectory)
@@ -95,7 +95,7 @@ def test_chunks_backward_give_what_the_whole_gives() -> None:
     later: BackwardInformation | None = None
     arcs = []
     for trace, before in zip(pieces[::-1], states[-2::-1], strict=True):
-        result, later = smoothed(trace, before, later, LIMITS)
+        result, later = smooth_steps(trace, before, later, LIMITS)
         arcs.append(result.arc_m)
     np.testing.assert_allclose(np.concatenate(arcs[::-1]), whole.arc_m, rtol=0.0, atol=1e-9)
 
@@ -110,7 +110,7 @@ def test_a_gap_is_bridged_from_both_ends_within_its_sigmas() -> None:
         blank = without_epochs(case.epochs, gap)
         trace: list[Step] = []
         found, _ = track(blank, case.line, trace=trace)
-        result, _ = smoothed(trace, TrackState.empty(), None, LIMITS)
+        result, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
         error = np.abs(result.arc_m - case.arc_m)
         ratios.append(error / result.sigma_m)
         inside.append(error[gap])
@@ -123,9 +123,9 @@ def test_a_gap_is_bridged_from_both_ends_within_its_sigmas() -> None:
 def test_nothing_goes_back_beyond_a_beginning() -> None:
     case = ride(40, noise=1.0)
     trace, _ = _traced(case)
-    whole, _ = smoothed(trace, TrackState.empty(), None, LIMITS)
-    first, _ = smoothed(trace[:20], TrackState.empty(), None, LIMITS)
+    whole, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
+    first, _ = smooth_steps(trace[:20], TrackState.empty(), None, LIMITS)
     assert not np.allclose(first.arc_m, whole.arc_m[:20], rtol=0.0, atol=1e-6)
     trace[20].parent = np.full_like(trace[20].parent, -1)
-    broken, _ = smoothed(trace, TrackState.empty(), None, LIMITS)
+    broken, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
     np.testing.assert_array_equal(broken.arc_m[:20], first.arc_m)

@@ -22,7 +22,7 @@ from railfix.cli.console import (
     show_table,
     show_verdict,
 )
-from railfix.cli.options import Choices, OutOption, Without, from_models, settings_of
+from railfix.cli.options import Choices, OutOption, Without, from_models, resolve_settings
 from railfix.core.errors import MismatchError, NoPositionError, SettingsError
 from railfix.core.tables import number, percent, plain_table
 from railfix.evaluate import Score
@@ -73,7 +73,7 @@ def campaign(
 
     Exit codes as `railfix --help` says; 5 where some runs have failed, 7 where every one has.
     """
-    with executor_of(workers, scheduler) as (executor, lost):
+    with open_executor(workers, scheduler) as (executor, lost):
         prepare_kernels()
         table = run_campaign(path, out=out, executor=executor, progress=show_progress, lost=lost)
     failed = table.filter(status="failed")
@@ -99,7 +99,7 @@ def show_progress(*, done: int, failed: int, total: int, left_s: float) -> None:
 
 
 @contextmanager
-def executor_of(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
+def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
     """Give the executor, and the errors by which it reports that a worker process is gone.
 
     SettingsError: there is no such scheduler, or `distributed` is not installed.
@@ -162,8 +162,8 @@ def benchmark(
 
     Exit codes as `railfix --help` says; 5 where some cases have failed, 7 where every one has.
     """
-    config, _ = settings_of(choices)
-    with executor_of(workers, None) as (executor, lost):
+    config, _ = resolve_settings(choices)
+    with open_executor(workers, None) as (executor, lost):
         prepare_kernels()
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
     console = TableConsole()
@@ -211,7 +211,7 @@ def ablate(
 
     Exit codes as `railfix --help` says.
     """
-    settings, asked = settings_of(choices)
+    settings, asked = resolve_settings(choices)
     inputs = inputs.replaced(config=choices.config)
     with progress_bar() as progress:
         ablation = ablate_files(

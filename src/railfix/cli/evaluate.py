@@ -28,10 +28,10 @@ from railfix.cli.options import (
     overwriting,
 )
 from railfix.core.errors import SettingsError
-from railfix.core.settings import validated
+from railfix.core.settings import validate
 from railfix.core.tables import Column, listing, number, percent, plain_table, signed
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
-from railfix.evaluate.inputs import POSITIONS_TABLE, TABLES, EvaluationInputs, tables_of
+from railfix.evaluate.inputs import POSITIONS_TABLE, TABLES, EvaluationInputs, list_position_tables
 from railfix.evaluate.range_errors import ModelInputs, StationBeside, error_model_from_runs
 from railfix.evaluate.tables import P1_COMMERCIAL, P1_TABLE_4, error_tables, group_tables, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
@@ -42,7 +42,7 @@ from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, summary
 from railfix.reference import ReferenceInputs, ReferenceOptions, ReferenceSettings, ReferenceSummary, reference_files
 from railfix.run import read_record
 from railfix.run.output import OutputFolder
-from railfix.run.processor import place_of
+from railfix.run.processor import parse_position
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
@@ -135,7 +135,7 @@ def evaluate(
     pairs = [
         replace(pair, table=name, conventional=inputs.conventional)
         for pair in _pair(runs, inputs.reference, inputs.label)
-        for name in inputs.table or tables_of(pair.run) or [POSITIONS_TABLE]
+        for name in inputs.table or list_position_tables(pair.run) or [POSITIONS_TABLE]
     ]
     written: dict[str, Path] = {}
     if out is None:
@@ -250,7 +250,7 @@ def error_model(
     if own := [file for file in beside.base if file.resolve() in [path.resolve() for path in read]]:
         raise SettingsError(f"--base {own[0]}: is a log of the run itself; give that of a reference station")
     position = beside.base_position
-    place = None if position is None else place_of(position, "--base-position")
+    place = None if position is None else parse_position(position, "--base-position")
     inputs = [
         ModelInputs(run=run, reference=file, base=beside.base, base_position_ecef_m=place, columns=beside.columns.names)
         for run, file in zip(runs, reference, strict=True)
@@ -333,8 +333,8 @@ def cn0_curve(
 
     Exit codes as `railfix --help` says; 5 where the position or the navigation files do not fit the log.
     """
-    fit = validated(CurveFit, {"bin_deg": bin_deg}, source="--bin")
-    place = None if position is None else place_of(position, "--position")
+    fit = validate(CurveFit, {"bin_deg": bin_deg}, source="--bin")
+    place = None if position is None else parse_position(position, "--position")
     outputs = check_outputs((out, "any"), (plot, "png"), overwrite=overwrite, inputs=[*observations, *nav])
     fitted = cn0_curve_from_log(
         observations, nav, position_ecef_m=place, fit=fit, broken_lines="count" if lenient else "stop"

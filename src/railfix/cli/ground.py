@@ -102,9 +102,9 @@ def monitor(
         raise SettingsError("--nav is missing: logs need navigation files")
     observations = [read_observations(path) for path in logs]
     if point:
-        from railfix.run.processor import place_of
+        from railfix.run.processor import parse_position
 
-        points = np.stack([place_of(text, "--point") for text in point])
+        points = np.stack([parse_position(text, "--point") for text in point])
     else:
         points = np.stack([log.header.approximate_ecef_m for log in observations])
         for log, known in zip(logs, points, strict=True):
@@ -141,13 +141,13 @@ def _monitor_live(
     from railfix.ground.triangle import LiveMonitor, TriangleVerdict
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
-    from railfix.run.processor import place_of
+    from railfix.run.processor import parse_position
 
     if not choices.point:
         raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")
     for source in sources:
         check_source(source)
-    points = np.stack([place_of(text, "--point") for text in choices.point])
+    points = np.stack([parse_position(text, "--point") for text in choices.point])
     navigation = read_navigation(choices.nav) if choices.nav else None
     monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[str](), TableConsole()
     recorded = all(is_file(source) for source in sources)
@@ -380,7 +380,7 @@ def train(
     """
     import asyncio
 
-    from railfix.ground.links import BEARERS, bearers_of
+    from railfix.ground.links import BEARERS, create_bearers
     from railfix.ground.serve import parse_address
     from railfix.ground.train import run_train
 
@@ -394,7 +394,7 @@ def train(
     work = run_train(
         number,
         choices.keys,
-        bearers_of(addresses, dict(zip(BEARERS, hosts, strict=True))),
+        create_bearers(addresses, dict(zip(BEARERS, hosts, strict=True))),
         write=lambda line: print(line, flush=True),
         limits=limits,
         integrity=choices.integrity,

@@ -9,12 +9,20 @@ import numpy as np
 import typer
 
 from railfix.cli.console import TableConsole, show_files, show_notes, show_table
-from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, overwriting, settings_of
+from railfix.cli.options import (
+    Choices,
+    OverwriteOption,
+    Without,
+    check_outputs,
+    from_models,
+    overwriting,
+    resolve_settings,
+)
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.tables import plain_table, plural
-from railfix.evaluate.inputs import TABLES, read_run, tables_of
+from railfix.evaluate.inputs import TABLES, list_position_tables, read_run
 from railfix.io.positions_export import style_file, write_positions
-from railfix.pipeline.tables import rounded
+from railfix.pipeline.tables import round_floats
 from railfix.run.checks import examine_files
 from railfix.run.convert import write_mcap
 from railfix.run.inputs import LogReading, input_path
@@ -41,7 +49,7 @@ def locate(
     Exit codes as `railfix --help` says; 7 where no epoch has a position.
     """
     check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
-    settings, _ = settings_of(choices)
+    settings, _ = resolve_settings(choices)
     summary = locate_files(inputs, settings, out=out, reading=reading)
     console = TableConsole()
     north, east, up = summary.sigma_m
@@ -80,7 +88,7 @@ def which_track(
     Exit codes as `railfix --help` says; 5 where the train moves or no track is near.
     """
     check_outputs((out, "picture"), (save_last, "any"), overwrite=overwrite, inputs=inputs.paths)
-    settings, _ = settings_of(choices)
+    settings, _ = resolve_settings(choices)
     decision = which_track_files(inputs, options, settings)
     console = TableConsole()
     last = decision.posteriors[-1]
@@ -177,7 +185,7 @@ def export(
 
     Exit codes as `railfix --help` says; 4 where a package is not installed, 7 where no epoch has a position.
     """
-    tables = tables_of(run)
+    tables = list_position_tables(run)
     if filtered and tables and "train" not in tables:
         raise InputFileError(
             run, "has no positions of the filter; leave --filter out, or repeat the run with the filter"
@@ -193,7 +201,7 @@ def export(
     what = "filter along the track" if table == "train" else "single epochs"
     description = f"Antenna positions of railfix, {what}, {folder.line_name}; {frame}, heights above the ellipsoid"
     write = write_mcap if out.suffix.lower() == ".mcap" else write_positions
-    written = write(rounded(folder.positions), out, description=description)
+    written = write(round_floats(folder.positions), out, description=description)
     console = TableConsole()
     console.print(f"{written:,} positions of {len(folder.positions):,} epochs and antennas, {what}")
     console.print(f"{frame}, heights above the ellipsoid")

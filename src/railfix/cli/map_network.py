@@ -22,7 +22,7 @@ from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import TOLERANCE_M, check_network, read_network
-from railfix.track.network_route import Filled, Rows, fill_gaps, route_of
+from railfix.track.network_route import Filled, Rows, fill_gaps, find_route
 from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 
@@ -190,7 +190,7 @@ def _route_tracks(
 ) -> tuple[list[int], list[str]]:
     """Tracks of the route asked for, and notes on it."""
     if choice.tracks:
-        return net.shortest_route([net.index_of(name.strip()) for name in choice.tracks.split(",")]), []
+        return net.shortest_route([net.find_index(name.strip()) for name in choice.tracks.split(",")]), []
     if choice.via:
         return net.shortest_route([_track_at(net, text) for text in choice.via]), []
     if choice.positions is None:
@@ -198,7 +198,7 @@ def _route_tracks(
             return [0], []
         raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
     log, notes = _positions(choice.positions, net, columns, connecting, reading)
-    passed, left_out = route_of(net, match(net, log))
+    passed, left_out = find_route(net, match(net, log))
     if not passed:
         raise MismatchError(f"{choice.positions}: no position lies near a track of the network")
     if left_out:
@@ -214,7 +214,7 @@ def _positions(
     log = read_plan_positions(path, columns=columns.names)
     if connecting.same_frame == "yes":
         return log, []
-    moved, shift = log.in_frame_of(net, **reading.motion)
+    moved, shift = log.transform_to(net, **reading.motion)
     size = float(np.hypot(shift.east_m, shift.north_m))
     note = (
         f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "

@@ -11,7 +11,7 @@ import polars as pl
 import typer
 
 from railfix.cli.console import TableConsole, show_files, show_notes, show_table, show_verdict
-from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, settings_of
+from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, resolve_settings
 from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
@@ -130,7 +130,7 @@ def survey(
 
     picture = files.picture
     check_outputs((out, "csv"), (picture, "picture"), overwrite=overwrite, inputs=[*runs, *files.nav])
-    settings, _ = settings_of(choices)
+    settings, _ = resolve_settings(choices)
     surveyed = survey_files(
         runs, files.nav, settings,
         limits=limits, name=files.name or out.stem, reading=reading, columns=columns.names,

@@ -247,7 +247,7 @@ class Choices(Settings):
     )
 
 
-def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
+def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
     """Return the settings of the file, overridden by those of the command line; and those that were given."""
     values: dict[str, Any] = {}
     source = "command line"

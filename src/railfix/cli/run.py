@@ -10,8 +10,8 @@ import typer
 
 from railfix.cli.command import SIGNALLED
 from railfix.cli.console import prepare_kernels, progress_bar, show_summary
-from railfix.cli.options import Choices, OutOption, Without, from_models, set_value, settings_of
-from railfix.core.settings import validated
+from railfix.cli.options import Choices, OutOption, Without, from_models, resolve_settings, set_value
+from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
 
@@ -51,7 +51,7 @@ def run(
 
     Exit codes as `railfix --help` says.
     """
-    settings, asked = settings_of(choices)
+    settings, asked = resolve_settings(choices)
     inputs = inputs.replaced(config=choices.config)
     prepare_kernels()
     sys.setswitchinterval(_TURN_S)
@@ -97,11 +97,11 @@ def live(
     if inputs.channels == "2" or any(text.startswith("cbor@") for text in inputs.send):
         import cbor2  # noqa: F401  a missing one is reported before anything is opened
 
-    settings, _ = settings_of(choices)
+    settings, _ = resolve_settings(choices)
     values: dict[str, Any] = {}
     for text in live_setting or ():
         set_value(values, text)
-    inputs = inputs.replaced(config=settings, live=validated(LiveSettings, values, source="--live"))
+    inputs = inputs.replaced(config=settings, live=validate(LiveSettings, values, source="--live"))
     summary, terminated = asyncio.run(run_live(inputs))
     for line in summary:
         typer.echo(line, err=True)

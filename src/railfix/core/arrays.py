@@ -37,7 +37,7 @@ Strings = NDArray[np.str_]  #: Names, for example of satellites.
 _FACTORY: Final = type("Factory", (), {"__repr__": lambda _: "<factory>"})()
 
 
-def changed(instance: Instance, **values: Any) -> Instance:
+def copy_with(instance: Instance, **values: Any) -> Instance:
     """Copy a frozen dataclass with changes, without ``__init__``, ``__post_init__`` and cached properties."""
     copy = object.__new__(type(instance))
     copy.__dict__.update(instance.__dict__, **values)

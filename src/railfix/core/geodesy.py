@@ -78,10 +78,10 @@ def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tupl
     """Compute elevation and azimuth (clockwise from north) [deg] of satellites (T, N, 3) at receivers (T, 3)."""
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)
-    return angles_of(sat - receiver[:, None, :], axes_at(receiver))
+    return compute_angles(sat - receiver[:, None, :], axes_at(receiver))
 
 
-def angles_of(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
+def compute_angles(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
     """Compute elevation and azimuth of lines to satellites (T, N, 3) by the `enu_axes` of receivers."""
     enu = np.matmul(axes, line_ecef_m.swapaxes(1, 2))
     east, north, up = enu[:, 0], enu[:, 1], enu[:, 2]

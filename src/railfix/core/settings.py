@@ -87,7 +87,7 @@ def option(
     return Field(default, description=text, json_schema_extra=extra, **limits)
 
 
-def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
+def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
     """Validate plain values as settings; the SettingsError names the `source`: a path, or "--set"."""
     try:
         return model.model_validate(dict(values))
@@ -161,7 +161,7 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
 
 def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:
     """Read settings from a TOML file; InputFileError as `read_toml`, SettingsError as `validated`."""
-    return validated(model, read_toml(path, what=what), source=str(path))
+    return validate(model, read_toml(path, what=what), source=str(path))
 
 
 def write_toml(path: FilePath, values: Mapping[str, Any], *, what: str = "file", comment: str = "") -> None:
@@ -187,6 +187,6 @@ def read_model_file(model: type[ModelFile], path: FilePath, *, what: str, format
             problem = f"is not {what}: format = '{format_name}' was expected; make one with {command}"
         raise InputFileError(path, problem)
     try:
-        return validated(model, values, source=str(path))
+        return validate(model, values, source=str(path))
     except SettingsError as error:
         raise InputFileError(path, str(error).removeprefix(f"{path}: ").replace("setting ", "entry ", 1)) from None

@@ -22,12 +22,12 @@ from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import AntennaResult, State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
-from railfix.run.driver import Progress, notes_of, open_inputs, sensors_of
+from railfix.run.driver import Progress, collect_notes, open_inputs, read_samples_and_units
 from railfix.run.inputs import RunInputs, RunOptions
 from railfix.run.output import OutputFolder
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.record import NO_FIGURES, RunProvenance, package_versions, run_record
-from railfix.run.sensors import balises_of
+from railfix.run.sensors import load_balises
 from railfix.run.sources import align_logs
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
@@ -163,10 +163,10 @@ def ablate_files(
                 name: filtered.model_copy(update={"filter_sources": chosen})
                 for name, chosen in filter_choices(inputs, config.filter_sources).items()
             }
-        sensors, units = sensors_of(inputs)
-        balises = balises_of(inputs.balises, inputs.balise_list, None, line.track, config)
+        sensors, units = read_samples_and_units(inputs)
+        balises = load_balises(inputs.balises, inputs.balise_list, None, line.track, config)
         processors = {
-            name: processor_of(chosen, navigation, line.trajectories, track=line.track, units=units, balises=balises)
+            name: make_processor(chosen, navigation, line.trajectories, track=line.track, units=units, balises=balises)
             for name, chosen in settings.items()
         }
         received = np.datetime64("NaT", "ns")
@@ -195,7 +195,7 @@ def ablate_files(
             for name, processor in processors.items()
         )
         threshold = config.map_offset.note_threshold
-        notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs, note_statistic=threshold))
+        notes = (*left_out, *collect_notes(line, navigation, tallies[ALL], logs, note_statistic=threshold))
         wall = clock.perf_counter() - began
         made_from = RunProvenance(
             files=[entry.result() for entry in entries],

@@ -27,12 +27,12 @@ from railfix.core.timescale import nearest_rows, seconds
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
 from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, has_position
-from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, read_run, tables_of
+from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, list_position_tables, read_run
 from railfix.evaluate.integrity import STANFORD_COLUMNS
 from railfix.evaluate.place import TrackFiles, find_trajectory
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
-from railfix.io.receiver.framing import head_of, is_receiver_log
+from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
 from railfix.run.campaign import CampaignProgress, CampaignRun, position_runs
 from railfix.run.inputs import Antenna, RunInputs
@@ -122,7 +122,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:
         return f"no row of RTKLIB: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
-    if any(is_receiver_log(head_of(path)) for path in inputs.front):
+    if any(is_receiver_log(read_head(path)) for path in inputs.front):
         return "no row of RTKLIB: the log is not RINEX (railfix convert makes it so)"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -245,7 +245,7 @@ def run_benchmark(
 
 def _judge(case: Case, run: CampaignRun, out: Path) -> tuple[list[dict[str, Any]], list[str]]:
     """Evaluate railfix and the other programs on one case; rows and notes."""
-    tables = tables_of(run.out)
+    tables = list_position_tables(run.out)
     items = [RunAndReference(run=run.out, reference=case.truth, configuration=name, table=name) for name in tables]
     others, notes = _programs(case, run, out)
     items += [RunAndReference(run=path, reference=case.truth, configuration=name) for name, path in others.items()]

@@ -13,7 +13,7 @@ from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import EvaluationOptions, RunFolder, Sections, floats
 from railfix.evaluate.integrity import PARTS, STATED
-from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, bracket, errors_of
+from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, bracket, compute_errors
 from railfix.io.reference_log import AntennaReference
 
 #: Status of an epoch missing in the log.
@@ -170,7 +170,7 @@ def antenna_epochs(
         reference_chainage_m=chainage,
         reference_ecef_m=place,
     )
-    errors = errors_of(run, antenna, answers, method=options.method, files=files)
+    errors = compute_errors(run, antenna, answers, method=options.method, files=files)
     known = at.inside & (np.isfinite(chainage) if errors.method == "chainage" else np.isfinite(place[:, 0]))
     along = _steps(chainage if np.isfinite(chainage[known]).all() else place, known)
     stated_speed = at.of(reference.speed_mps)
@@ -210,10 +210,10 @@ def antenna_epochs(
         columns[f"{prefix}gap_s"] = since_last(np.where(np.isfinite(moved), clock, np.nan), np.isfinite(answered))
     first = run.positions["time_gpst"].to_numpy().min()
     columns["block"] = (seconds(time - first) // options.block_s).astype(np.int64)
-    columns |= {run.column_of(name): column(name) for name in level_columns(mine)}
+    columns |= {run.prefix_column(name): column(name) for name in level_columns(mine)}
     for name in (f"protection_{name}" for name in (*PARTS, *STATED)):
         if name in mine.columns and run.level_kind is not None:
-            columns[run.column_of(name)] = column(name) if name.endswith("_m") else _texts(mine, name, rows)
+            columns[run.prefix_column(name)] = column(name) if name.endswith("_m") else _texts(mine, name, rows)
     table = pl.DataFrame(columns, nan_to_null=True).with_columns(pl.col("n_used").cast(pl.Int64))
     return AntennaEpochs(
         table=table,

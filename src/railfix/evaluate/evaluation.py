@@ -26,7 +26,7 @@ from railfix.evaluate.inputs import (
     read_run,
     read_sections,
 )
-from railfix.evaluate.integrity import Integrity, Level, integrity_of
+from railfix.evaluate.integrity import Integrity, Level, judge_levels
 from railfix.evaluate.intervals import branch_table, interval_table, level_table, outage_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
@@ -49,7 +49,7 @@ class RunAndReference:
     run: Path
     reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` beside the run's log.
     configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
-    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.inputs.tables_of`.
+    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.inputs.list_position_tables`.
     #: Another run on the same log, whose conventional positions take the place of the run's own: one with the screens
     #: elevation and C/N0 alone gives those that P1 compares with.
     conventional: Path | None = None
@@ -165,7 +165,7 @@ def evaluate_runs(
         figures=_figures(epochs, options),
         intervals=_intervals(epochs),
         levels=level_table(epochs, list(KEYS)),
-        integrity=integrity_of(epochs, levels, options),
+        integrity=judge_levels(epochs, levels, options),
         outages=outage_table(epochs),
         branches=branch_table(epochs),
         options=options,

@@ -128,7 +128,7 @@ class RunFolder(RunRecord):
             )
         return float(limit)
 
-    def column_of(self, name: str) -> str:
+    def prefix_column(self, name: str) -> str:
         """Name of a column of the positions in tables of several runs: levels are prefixed with their kind."""
         return f"{self.level_kind}_{name}" if name.startswith("protection_") and self.level_kind else name
 
@@ -149,7 +149,7 @@ def flat_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
     return flat
 
 
-def tables_of(path: Path) -> list[str]:
+def list_position_tables(path: Path) -> list[str]:
     """Names of the tables of positions in the folder of a run, the single-epoch positions first."""
     return [name for name in TABLES if any((path / f"{name}{end}").is_file() for end in _ENDINGS)]
 

@@ -172,7 +172,7 @@ def _sort(
     )
 
 
-def integrity_of(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
+def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
     """Judge levels against errors by kind, of all runs at all alarm limits; empty where no run has levels."""
     own = {limit for _, limit in runs.values() if limit is not None}
     limits = sorted({*options.alarm_limits_m, *own})

@@ -13,7 +13,7 @@ import polars as pl
 from railfix.core.errors import MismatchError
 from railfix.evaluate.epochs import OF_FILTER, level_columns
 from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, edges_reached, has_position
-from railfix.evaluate.inputs import RunFolder, read_run, tables_of
+from railfix.evaluate.inputs import RunFolder, list_position_tables, read_run
 
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
@@ -311,7 +311,7 @@ def _epochs(folder: Path, run: RunFolder, number: int) -> pl.DataFrame:
         "time_gpst", "antenna", "chainage_m", pl.col("status").cast(pl.String),
         *(pl.col(name).cast(pl.Float64) for name in _POSITION_COLUMNS),
     )  # fmt: skip
-    if "train" in tables_of(folder):
+    if "train" in list_position_tables(folder):
         train = read_run(folder, table="train").positions
         tracked = train.select(
             "time_gpst", "antenna", pl.col("chainage_m").alias("filter_m"),

@@ -22,7 +22,7 @@ from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.trajectory import Trajectory, passes_of, short_way_m
+from railfix.track.trajectory import Trajectory, find_segments_near, short_way_m
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 
@@ -97,7 +97,7 @@ def along_track_error(
         return error
     reference, length = reference_ecef_m[at], trajectory.length_m
     nearest_arc, offset = trajectory.nearest(reference)
-    passes = passes_of(reference, trajectory, np.maximum(same_place_m, offset))
+    passes = find_segments_near(reference, trajectory, np.maximum(same_place_m, offset))
     passing = passes.lowest & (np.linalg.norm(passes.offset_m, axis=1) <= same_place_m)
     if np.isfinite(trajectory.turn_m):  # the ends of a closed line are no passes: it goes on there
         passing &= ~((passes.segment == 0) & (passes.along_m <= 0.0))
@@ -180,7 +180,7 @@ class PlaceErrors:
     notes: tuple[str, ...] = ()
 
 
-def errors_of(
+def compute_errors(
     run: RunFolder,
     antenna: str,
     answers: Answers,
@@ -328,7 +328,7 @@ def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, s
     return [given, (recorded[0], recorded[1], recorded[2])]
 
 
-def track_of(run: RunFolder) -> Track:
+def read_run_track(run: RunFolder) -> Track:
     """Return the track that the run used."""
     if not run.tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")

@@ -27,7 +27,7 @@ from railfix.io.logs import scan_observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.base_station import BaseStation
 from railfix.pipeline.carrier_stage import CarrierState
-from railfix.pipeline.corrected_ranges import conditions_of
+from railfix.pipeline.corrected_ranges import collect_conditions
 from railfix.pipeline.processor import EpochProcessor, State
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_scale import RobustClock, robust_clock
@@ -36,7 +36,7 @@ from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource,
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, faulty_stretches, fit_bins
 from railfix.run.driver import open_inputs
 from railfix.run.inputs import ColumnNames, input_option
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.run.record import read_record
 from railfix.run.sources import align_logs
 from railfix.track.trajectory import Trajectory
@@ -317,7 +317,7 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErr
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)
     references = read_reference(source.reference, tuple(past.inputs.logs), columns=source.columns)
-    processor = processor_of(past.config.replaced(filter="off"), navigation, line.trajectories)
+    processor = make_processor(past.config.replaced(filter="off"), navigation, line.trajectories)
     state = State()
     base: StationErrors | None = None
     if source.base:
@@ -343,5 +343,5 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErr
         epochs=epochs,
         files=files | {entry["path"]: entry["sha256"] for entry in past.record["inputs"]},
         base="" if base is None else base.name,
-        conditions=conditions_of(past.config),
+        conditions=collect_conditions(past.config),
     )

@@ -131,7 +131,7 @@ _STANFORD: Final[Sequence[Column]] = (
 )
 
 
-def evaluation_of(evaluation: Evaluation, name: str) -> Evaluation:
+def select_evaluation(evaluation: Evaluation, name: str) -> Evaluation:
     """Return the part of an evaluation that is on one of its runs."""
 
     def own(rows: Any) -> Any:

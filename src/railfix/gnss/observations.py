@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, changed, dataclass, freeze_arrays
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, copy_with, dataclass, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
 from railfix.core.tables import NotebookTable, plural, time_span_text
 from railfix.core.timescale import gps_time
@@ -165,9 +165,9 @@ class Observations(NotebookTable):
             for bound in (rows.start, rows.stop)
         )
         epochs = slice(start, stop, rows.step)
-        channels = slice(None) if names is None else self._channels_of([names] if isinstance(names, str) else names)
+        channels = slice(None) if names is None else self._find_channels([names] if isinstance(names, str) else names)
         arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
-        part = changed(
+        part = copy_with(
             self, time=self.time[epochs], satellite=self.satellite[channels], signal=self.signal[channels],
             **{name: getattr(self, name)[epochs][:, channels] for name in arrays},
             break_before=self.break_before[epochs], receiver_alarm=self.receiver_alarm[epochs],
@@ -191,7 +191,7 @@ class Observations(NotebookTable):
             raise KeyError(f"{bound!r} is no GPS time; expected hh:mm, hh:mm:ss or yyyy-mm-ddThh:mm:ss") from None
         return int(np.searchsorted(self.time, time))
 
-    def _channels_of(self, names: Sequence[str]) -> Indices:
+    def _find_channels(self, names: Sequence[str]) -> Indices:
         """Return the channels of satellites or constellations."""
         found = np.zeros(len(self.satellite), dtype=np.bool_)
         for name in names:

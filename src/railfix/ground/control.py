@@ -374,7 +374,7 @@ class ControlCentre:
         return {"verdict": verdict, "stopped": self.monitor.stopped, "cause": cause if self.monitor.stopped else None}
 
 
-def orders_of(centre: ControlCentre) -> dict[str, Order]:
+def list_orders(centre: ControlCentre) -> dict[str, Order]:
     """Return the orders of the page: stops of one train and of all, their release, and routes."""
 
     def of_train(order: Callable[[int], str | None]) -> Order:

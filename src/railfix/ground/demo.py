@@ -21,8 +21,8 @@ from railfix.core.arrays import Floats
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.core.settings import Settings
 from railfix.ground.centre import ReferenceCurve
-from railfix.ground.control import ControlCentre, orders_of
-from railfix.ground.links import BEARERS, CentreLinks, LinkLimits, LinkName, TrainLinks, bearers_of, draw_coverage
+from railfix.ground.control import ControlCentre, list_orders
+from railfix.ground.links import BEARERS, CentreLinks, LinkLimits, LinkName, TrainLinks, create_bearers, draw_coverage
 from railfix.ground.quic import write_keys
 from railfix.ground.station_fixes import StationFixes, fixes_of_ranges
 from railfix.ground.store import Store
@@ -273,7 +273,7 @@ async def run_demo(
             ]  # fmt: skip
             return {**control.snapshot(), "links": links, "alarms": control.alarms, "done": done}
 
-        page = PageServer(page_app(snapshot, orders_of(control), sessions=Sessions(password=password)), port=port)
+        page = PageServer(page_app(snapshot, list_orders(control), sessions=Sessions(password=password)), port=port)
         await page.start()
         held.push_async_callback(page.stop)
         await centre.start()
@@ -285,7 +285,7 @@ async def run_demo(
             links = trains[number] = TrainLinks(
                 number,
                 folder / "keys",
-                bearers_of(
+                create_bearers(
                     {bearer: relays[number, bearer].address for bearer in BEARERS},
                     {"A": f"127.0.1.{10 + number}", "B": f"127.0.2.{10 + number}"},
                 ),

@@ -118,7 +118,7 @@ class Layout(Settings):
                 continue
             if at < first:
                 pieces.append((0, at, first))
-            pieces.append((lane_of(k, tracks.get(k, 1)), max(at, first), min(high, last)))
+            pieces.append((get_lane(k, tracks.get(k, 1)), max(at, first), min(high, last)))
             at = min(high, last)
         if at < high or not pieces:
             pieces.append((0, at, high))
@@ -138,7 +138,7 @@ class Layout(Settings):
         return None
 
 
-def lane_of(station: int, track: int) -> int:
+def get_lane(station: int, track: int) -> int:
     """Return the number of the lane of a station's track; 0 is the single line."""
     return 2 * station + track
 
@@ -162,7 +162,7 @@ LENGTHS_M: Final = 20.0
 _STEP_M: Final = 2.0
 
 
-def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
+def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
     """Return the layout of a network that is one single line with passing loops.
 
     Its chainage begins at one end and runs along the single line and track 1 of each station. A station is a pair of

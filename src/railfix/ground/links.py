@@ -219,7 +219,7 @@ class Bearer(NamedTuple):
     local: str
 
 
-def bearers_of(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkName, str]) -> dict[LinkName, Bearer]:
+def create_bearers(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkName, str]) -> dict[LinkName, Bearer]:
     """Return the bearers by the centre's addresses and the train's own."""
     return {name: Bearer(addresses[name], local[name]) for name in BEARERS}
 

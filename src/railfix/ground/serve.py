@@ -23,9 +23,9 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings, load_settings
 from railfix.core.timescale import utc_to_gpst
 from railfix.ground.centre import CentreLimits, ReferenceCurve
-from railfix.ground.control import ControlCentre, orders_of
+from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.interlocking import HEAD, InterlockingLimits, TrainInterval
-from railfix.ground.layout import Layout, LoopStation, PointName, layout_of
+from railfix.ground.layout import Layout, LoopStation, PointName, derive_layout
 from railfix.ground.links import BEARERS, CentreLinks, LinkName
 from railfix.ground.quic import check_keys
 from railfix.ground.station_fixes import stream_fixes
@@ -142,7 +142,7 @@ class CentreFile(Settings):
         """
         if not self.network:
             return self
-        stations = layout_of(read_network([folder / name for name in self.network]), drive=self.drive).stations
+        stations = derive_layout(read_network([folder / name for name in self.network]), drive=self.drive).stations
         try:
             return self.replaced(stations=stations, network=())
         except SettingsError as error:
@@ -232,7 +232,7 @@ async def run_centre(
             alarms = [*(text for text in (control.database, links.alarm) if text is not None), *control.alarms]
             return {**control.snapshot(), "links": _heard(control, links), "alarms": alarms, "done": done}
 
-        app = page_app(snapshot, orders_of(control), sessions=Sessions(password=password))
+        app = page_app(snapshot, list_orders(control), sessions=Sessions(password=password))
         loopback = page[0] == "localhost" or _is_loopback(page[0])
         certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
         try:

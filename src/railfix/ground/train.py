@@ -22,7 +22,7 @@ from pydantic import Field
 from railfix.core.settings import Settings, option
 from railfix.ground.links import Bearer, LinkMode, LinkName, TrainLinks, first_sequence
 from railfix.ground.quic import check_keys
-from railfix.io.train_message import MessageError, TrainMessage, encode, from_json, validated_message
+from railfix.io.train_message import MessageError, TrainMessage, encode, from_json, validate_message
 
 #: Version of the message; a receiver rejects others.
 VERSION: Final = 2
@@ -63,7 +63,7 @@ class Authority(Settings):
         version, *values = _FORM.unpack(data)
         if version != VERSION:
             raise MessageError(f"is an authority of version {version}, {VERSION} was expected")
-        return validated_message(cls, dict(zip(cls.model_fields, values, strict=True)))
+        return validate_message(cls, dict(zip(cls.model_fields, values, strict=True)))
 
 
 #: Way back of the safe front end that is no error of two places [m].

@@ -22,7 +22,7 @@ from railfix.io.rinex.navigation_records import (
     glonass_records,
     kepler_records,
 )
-from railfix.io.rinex.observations_lines import KINDS, signal_of
+from railfix.io.rinex.observations_lines import KINDS, find_signal
 from railfix.io.rinex.write_navigation import check_messages, glonass_numbers, kepler_numbers
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
         lock = None if flags is None else np.asarray(flags.transpose(*_DIMENSIONS).values, dtype=np.float64)
         for k in np.flatnonzero(np.isfinite(values).any(axis=0)):
             own = str(satellites[k])
-            code = signal_of(name, system=own[0], version=version, declared=types)
+            code = find_signal(name, system=own[0], version=version, declared=types)
             if code is None:
                 continue
             channel = columns.setdefault((own, code), {})

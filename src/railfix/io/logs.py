@@ -19,7 +19,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
 from railfix.io.mate import mate_table, read_mate_observations
-from railfix.io.receiver.framing import head_of, is_receiver_log
+from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.io.rinex.observations import (
     DEFAULT_EPOCHS,
     in_pieces,
@@ -92,7 +92,7 @@ def _by_georinex(
 
     parts: list[Observations] = []
     for name in paths:
-        if is_receiver_log(head_of(name)):
+        if is_receiver_log(read_head(name)):
             raise MismatchError(f"{name} is a receiver's log, and georinex reads RINEX; leave out reader")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # a default of xarray that georinex relies on
@@ -126,7 +126,7 @@ def scan_observations(
     paths, letters = path_names(path), None if systems is None else list(systems)
     if any(mate_table(p) == "S_GNSS_SAT" for p in paths):
         return _mate_pieces(paths, letters, (_instant(start), _instant(end)), epochs)
-    receiver = [is_receiver_log(head_of(p)) for p in paths]
+    receiver = [is_receiver_log(read_head(p)) for p in paths]
     if not any(receiver):
         return rinex.scan_observations(
             paths, epochs=epochs, broken_lines=broken_lines, systems=letters, start=start, end=end, progress=progress
@@ -223,7 +223,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
         A file cannot be read or holds no usable record.
     """
     names = path_names(paths)
-    receiver = [is_receiver_log(head_of(name)) for name in names]
+    receiver = [is_receiver_log(read_head(name)) for name in names]
     parts = []
     if not all(receiver):
         files = [name for name, is_log in zip(names, receiver, strict=True) if not is_log]

@@ -17,7 +17,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import SECONDS_PER_DAY, from_week, timedelta, utc_to_gpst
 from railfix.gnss.observations import first_problems
 from railfix.io.position_log import PositionLog, read_positions
-from railfix.io.receiver.framing import head_of, is_receiver_log
+from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.io.receiver.log import read_receiver_positions
 
 #: Quality as RTKLIB numbers it, by the position type of NovAtel.
@@ -288,6 +288,6 @@ def read_any_positions(
         return read_gpx_positions(path)
     if ending(path) in (".asc", ".ascii", ".gps"):
         return read_novatel_positions(path)
-    if ending(path) != ".csv" and is_receiver_log(head_of(path)):
+    if ending(path) != ".csv" and is_receiver_log(read_head(path)):
         return read_receiver_positions(path, date=date)
     return read_positions(path)

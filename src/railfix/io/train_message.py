@@ -143,7 +143,7 @@ def decode(data: bytes) -> TrainMessage:
         expected = bool if name in _TRUTHS else int
         if type(value) is not expected:
             raise MessageError(f"{name}: {type(value).__name__} instead of {expected.__name__}")
-    return validated_message(TrainMessage, named)
+    return validate_message(TrainMessage, named)
 
 
 def _entries(data: bytes) -> int:
@@ -152,7 +152,7 @@ def _entries(data: bytes) -> int:
     return size if size < 24 else int.from_bytes(data[1 : 1 + (1 << (size - 24))], "big") if size < 28 else -1
 
 
-def validated_message(kind: type[Model], values: dict[str, Any]) -> Model:
+def validate_message(kind: type[Model], values: dict[str, Any]) -> Model:
     """Return a message of a kind from its values; MessageError where they are out of range."""
     try:
         return kind.model_validate(values)
@@ -190,7 +190,7 @@ def from_json(line: str) -> TrainMessage:
             values["interference"] = SuspectedInterference[str(values["interference"]).upper()]
     except (KeyError, TypeError):
         raise MessageError("has an unknown status, source or interference") from None
-    return validated_message(TrainMessage, values)
+    return validate_message(TrainMessage, values)
 
 
 _LARGEST_LENGTH: Final = 32_766  #: Largest value of a length of packet 0; one more means unknown.

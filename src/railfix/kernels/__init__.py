@@ -60,6 +60,6 @@ def missing() -> list[str]:
     return names
 
 
-def announced() -> None:
+def suppress_announcement() -> None:
     """Leave the line that tells of compilation away: the caller has told it."""
     import_module("railfix.kernels.compiling").ANNOUNCEMENT.said = True

@@ -103,7 +103,7 @@ _IS_SUITED: Final = _SUITED[0] <= tuple(int(part) for part in numba.__version__.
 
 
 @contextmanager
-def resolved_once() -> Generator[None]:
+def keep_resolutions() -> Generator[None]:
     """Keep what numba finds for an operator or a function of its own and types of arguments.
 
     It would ask all implementations anew at each use: a fifth of the time that compiling takes.

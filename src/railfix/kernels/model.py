@@ -50,7 +50,7 @@ def _invert_scaled(matrix: Floats, scale: Floats, inverse: Floats) -> None:
 
 
 @kernel
-def linearised(
+def linearise_ranges(
     ranges: Any, place_ecef_m: Floats, axes: Floats, prior: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Linearise ranges.

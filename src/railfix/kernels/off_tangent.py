@@ -62,7 +62,7 @@ def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, flo
 
 
 @inner
-def _tail_of(form: Floats, clear_m: float) -> float:
+def _compute_tail(form: Floats, clear_m: float) -> float:
     """Return the tail of a form by its own matrix and slope."""
     x, y, z, c_xx, c_yy, _, inverse = _lowest(form)
     if inverse == 0.0:
@@ -322,19 +322,19 @@ def risk_off_tangent(
         root, of_sides = math.sqrt(max(every[0], 0.0)), 0.0
         for c in range(sides.shape[1]):
             if side_prior > 0.0 and _without_side(sides[t, c], used[:n], residuals, every, form):
-                of_sides += side_prior * _tail_of(form, clear_m[t])
+                of_sides += side_prior * _compute_tail(form, clear_m[t])
         total[t] = of_sides + 2.0 * _tail(clear_m[t], spread, start, root, 0.0)
         total[t] += singles * _tail(clear_m[t], spread, start, root, one)
         total[t] += 0.5 * (singles * singles - squares) * _tail(clear_m[t], spread, start, root, two)
         if total[t] <= enough:
             continue
-        spent = of_sides + 2.0 * _tail_of(every, clear_m[t])
+        spent = of_sides + 2.0 * _compute_tail(every, clear_m[t])
         for i in range(n):
             for j in range(-1, i):
                 p = likely[used[i]] * (likely[used[j]] if j >= 0 else 1.0)
                 if p > 0.0:
                     _without(i, j, residuals, every, form)
-                    spent += p * _tail_of(form, clear_m[t])
+                    spent += p * _compute_tail(form, clear_m[t])
         total[t] = spent
     return total
 

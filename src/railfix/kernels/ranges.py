@@ -222,7 +222,7 @@ def invert(matrix: Floats, inverse: Floats) -> None:
 
 
 @kernel
-def iterated_points(
+def iterate_points(
     ranges: Any, start_ecef_m: Floats, enough: Masks, tolerance_m: float, most: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """Iterate 3-D positions.
@@ -344,7 +344,7 @@ def _along(
 
 
 @kernel
-def iterated_along(
+def iterate_along(
     ranges: Any, line: Any, vertex: Indices, tolerance_m: float, most: int
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
     """Iterate positions along the line.

@@ -39,7 +39,7 @@ def _word(data: Bytes, at: np.uintp) -> np.uint64:
 
 
 @kernel
-def decoded_fields(
+def decode_fields(
     data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
 ) -> tuple[Floats, Bytes, Masks]:
     """Decode the fields of the usual form, shape (n, k); the arguments are those of `read_fields`.
@@ -93,7 +93,7 @@ def decoded_fields(
 
 
 @kernel
-def placed_fields(
+def place_fields(
     kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
 ) -> tuple[Floats, Bytes]:
     """Put fields in their places of the dense arrays, which are filled in place and returned; zeros are absent.

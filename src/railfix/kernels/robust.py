@@ -16,7 +16,7 @@ _LEAST_SCALE = 0.05
 
 
 @kernel
-def reweighted(
+def reweight_ranges(
     ranges: Any,
     place_ecef_m: Floats,
     information: Floats,

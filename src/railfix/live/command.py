@@ -25,7 +25,7 @@ from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import TABLES
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveInputs, LiveSettings
-from railfix.live.sinks import Outlet, file_of, open_sink
+from railfix.live.sinks import Outlet, open_sink, parse_file_target
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.stream import FOREVER, Sensed
@@ -34,11 +34,11 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.pipeline.tables import rounded
-from railfix.run.driver import time_of
+from railfix.pipeline.tables import round_floats
+from railfix.run.driver import find_record_time
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
-from railfix.run.processor import check_base_place, place_of, processor_of
-from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
+from railfix.run.processor import check_base_place, make_processor, parse_position
+from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
 
 #: Results that are kept in memory before they are written.
@@ -71,7 +71,7 @@ class ResultTables:
             if tables:
                 table = pl.concat(tables)
                 self._folder.append_parquet(f"{name}.parquet", table)
-                self._folder.append_csv(f"{name}.csv", rounded(table))
+                self._folder.append_csv(f"{name}.csv", round_floats(table))
                 tables.clear()
 
     def __exit__(
@@ -97,7 +97,7 @@ def _files_read(inputs: LiveInputs) -> list[Path]:
 
 def _check_outputs(inputs: LiveInputs) -> None:
     """Raise OutputError where a file to be written is one that is read, or is written twice."""
-    named = [file_of(text) for text in inputs.send]
+    named = [parse_file_target(text) for text in inputs.send]
     written = [path for path in (*named, inputs.state, inputs.log) if path is not None]
     for k, path in enumerate(written):
         check_not_input(path, _files_read(inputs))
@@ -265,16 +265,18 @@ def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, Epo
     navigation = no_navigation()
     if inputs.nav:
         navigation = read_navigation(list(inputs.nav), date=inputs.logs.instant)
-    at = time_of(navigation)
+    at = find_record_time(navigation)
     if at is None:
         at = np.datetime64("now", "ns") if inputs.logs.instant is None else inputs.logs.instant
     line = open_line(inputs.track, inputs.vehicle, antennas=inputs.antennas, reading=inputs.reading, at=at)
-    balises = balises_of(inputs.sensors.get("balises"), inputs.balise_list, inputs.virtual_balises, line.track, config)
+    balises = load_balises(
+        inputs.sensors.get("balises"), inputs.balise_list, inputs.virtual_balises, line.track, config
+    )
     base: Floats | Literal["stream"] | None = None
     check_base_place(inputs.base, inputs.base_place)
     if inputs.base is not None:
-        base = "stream" if inputs.base_place is None else place_of(inputs.base_place, "--base-place")
-    return line, processor_of(
+        base = "stream" if inputs.base_place is None else parse_position(inputs.base_place, "--base-place")
+    return line, make_processor(
         config, navigation, line.trajectories, track=line.track, units=units, balises=balises, base_ecef_m=base
     )
 

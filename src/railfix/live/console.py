@@ -331,7 +331,7 @@ class SensorWatch:
                 self._samples, self._blocks, self._begin = [], [], _NEVER
         self._has_radar = self._has_radar or len(sensed.samples.radar) > 0
         if len(sensed.samples.radar):
-            self._radar = self._radar.joined(SensorSamples(radar=sensed.samples.radar))
+            self._radar = self._radar.merge(SensorSamples(radar=sensed.samples.radar))
             if not table:
                 self._radar = self._radar.between(sensed.until - 2 * np.timedelta64(_RADAR_NS, "ns"), FOREVER)
 
@@ -378,7 +378,7 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
     """All parts as one, neighbours first: each sample is copied a few times, not once a part."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
-        parts = [early.joined(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]
+        parts = [early.merge(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]
     return parts[0]
 
 

@@ -20,12 +20,12 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
-from railfix.live.message import message_of, no_input_message
+from railfix.live.message import create_message, no_input_message
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import FOREVER, Lag, Sensed
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.received import merged_navigation
+from railfix.pipeline.received import merge_navigation
 from railfix.pipeline.results import Result, State
 from railfix.ranges.sbas import SbasMessages
 
@@ -71,9 +71,9 @@ class _FromSatellites:
         """Both together."""
         navigation, messages = self.navigation, self.messages
         if later.navigation is not None:
-            navigation = later.navigation if navigation is None else merged_navigation(navigation, later.navigation)
+            navigation = later.navigation if navigation is None else merge_navigation(navigation, later.navigation)
         if later.messages is not None:
-            messages = later.messages if messages is None else messages.joined(later.messages)
+            messages = later.messages if messages is None else messages.merge(later.messages)
         base = [part for part in (self.base, later.base) if part is not None]
         return _FromSatellites(
             heard=later.heard, navigation=navigation, messages=messages, base=concatenate(base) if base else None
@@ -157,7 +157,7 @@ class LiveEngine:
         """Take samples of a sensor on board that was named when the engine was made."""
         self._heard_to[sensed.sensor] = np.fmax(self._heard_to[sensed.sensor], sensed.until)
         if sensed.samples:
-            self._samples = self._samples.joined(sensed.samples)
+            self._samples = self._samples.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
         """Sensors that have not been heard up to an epoch."""
@@ -181,7 +181,7 @@ class LiveEngine:
         """Start the clock: from here on every period has a message, also before the first epoch."""
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
-    def saved(self, *, reserved: int = 0) -> EngineState:
+    def export_state(self, *, reserved: int = 0) -> EngineState:
         """What a restarted session continues from; `reserved` numbers of messages are left out for a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has come to continue from it
@@ -287,7 +287,7 @@ class LiveEngine:
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
-            numbered = [self._send(output, self._tag_of(output)) for output in outputs]
+            numbered = [self._send(output, self._get_tag(output)) for output in outputs]
             if outputs:
                 self._due_ns, self._silent = now_ns, False
         else:
@@ -336,7 +336,7 @@ class LiveEngine:
         return replace(output, message=output.message.replaced(sequence=self._sequence, sent_ns=sent_ns))
 
     @staticmethod
-    def _tag_of(output: LiveOutput) -> int:
+    def _get_tag(output: LiveOutput) -> int:
         """Time tag of the newest epoch of an output."""
         assert output.result is not None
         return max(int((a.time[-1] - GPS_EPOCH).astype(np.int64)) for a in output.result.antennas.values())
@@ -390,7 +390,7 @@ class LiveEngine:
         )
         self._tell_changes((self._state.received or self.processor.received).notes)
         self._check_order(result)
-        return LiveOutput(message=message_of(result, self.settings), result=result)
+        return LiveOutput(message=create_message(result, self.settings), result=result)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
         """Samples since the epoch before up to an epoch; later ones wait."""

@@ -19,7 +19,7 @@ import polars as pl
 from railfix.core.timescale import GPS_EPOCH, gpst_minus_utc
 from railfix.io.train_message import MessageStatus, TrainMessage, encode, etcs_report, to_json
 from railfix.live.engine import LiveOutput
-from railfix.live.message import antenna_of
+from railfix.live.message import choose_antenna
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.results import Result
 from railfix.pipeline.tables import passing_table, positions_table, train_table
@@ -154,7 +154,7 @@ def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
     """Latitude, longitude [deg], ellipsoidal height and along-track sigma [m] of the antenna of the message."""
     if output.result is None:
         return None
-    name = antenna_of(output.result)
+    name = choose_antenna(output.result)
     antenna, track = output.result.antennas[name], output.result.fusion.get(name)
     if track is not None and len(track) and math.isfinite(float(track.chainage_m[-1])):
         values = (track.latitude_deg[-1], track.longitude_deg[-1], track.height_m[-1], track.tracked.sigma_m[-1])

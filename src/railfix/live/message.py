@@ -42,15 +42,15 @@ def no_input_message(settings: LiveSettings, time_ns: int) -> TrainMessage:
     )
 
 
-def message_of(result: Result, settings: LiveSettings) -> TrainMessage:
+def create_message(result: Result, settings: LiveSettings) -> TrainMessage:
     """Return the message of one processed epoch; the sender numbers it.
 
     The place is that of the filter along the track where it runs, else that of the single epoch, of the antenna that
-    `antenna_of` names. The bounds are the filter's over- and under-reading amounts where it has a level
+    `choose_antenna` names. The bounds are the filter's over- and under-reading amounts where it has a level
     (`tracking.level`); else the protection level of the single epoch, widened by the distance of the filter's place
     from it, so that they hold for both. A doubtful place has none.
     """
-    name = antenna_of(result)
+    name = choose_antenna(result)
     antenna = result.antennas[name]
     track = result.fusion.get(name)
     sources = Source(0)
@@ -102,12 +102,12 @@ def message_of(result: Result, settings: LiveSettings) -> TrainMessage:
         length_cm=_up_cm(settings.length_m),
         status=status,
         sources=sources,
-        interference=_suspected(result),
+        interference=_find_suspicion(result),
         **values,  # type: ignore[arg-type]
     )
 
 
-def _suspected(result: Result) -> SuspectedInterference | None:
+def _find_suspicion(result: Result) -> SuspectedInterference | None:
     """The worst interference of the antennas at the last epoch; None where it is not looked for."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max(found)) if found else None
@@ -123,7 +123,7 @@ def _name_sources(track: AlongTrack) -> Source:
     return sources
 
 
-def antenna_of(result: Result) -> str:
+def choose_antenna(result: Result) -> str:
     """The antenna whose place goes out: one that has a place, of two the one with the smaller protection level."""
 
     def worth(name: str) -> tuple[bool, float]:

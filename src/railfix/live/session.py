@@ -154,7 +154,7 @@ class _Session:
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
         """Process what the pumps bring until all have ended; a restart can continue from there."""
         read_to_ns, due = self.read_to_ns, 0
-        self.reserved_from = self.engine.saved().sequence
+        self.reserved_from = self.engine.export_state().sequence
         self.save(reserved=self.reserved)
         try:
             while read_to_ns.keys() - {BASE}:  # a base station's stream alone has no end
@@ -167,7 +167,7 @@ class _Session:
                 if isinstance(item, Sensed):
                     skipped, units = self.metrics.skipped, self.engine.processor.units
                     skipped[f"lines of the {item.sensor} that are no rows"] += item.skipped
-                    skipped["ranges to ground units that are not surveyed"] += item.unsurveyed(units)
+                    skipped["ranges to ground units that are not surveyed"] += item.count_unsurveyed(units)
                     self.engine.add_samples(item)
                     if self.hooks.sensed is not None:
                         self.hooks.sensed(item)
@@ -301,7 +301,7 @@ class _Session:
         """Hand over what a restart needs, where somebody wants it."""
         if self.hooks.save is not None:
             streams = {name: state.after_break() for name, state in self.streams.items()}
-            self.hooks.save(SavedSession(engine=self.engine.saved(reserved=reserved), streams=streams))
+            self.hooks.save(SavedSession(engine=self.engine.export_state(reserved=reserved), streams=streams))
 
 
 class _Pace:

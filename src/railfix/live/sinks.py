@@ -287,7 +287,7 @@ class TcpServerSink:
             writer.close()
 
 
-def file_of(text: str) -> Path | None:
+def parse_file_target(text: str) -> Path | None:
     """The file that a text ``FORM@TARGET`` names; None for another target."""
     target = text.partition("@")[2]
     other = target in ("", "-") or urlsplit(target).scheme in ("udp", "tcp-server", "mqtt")

@@ -21,15 +21,15 @@ from railfix.core.errors import InputFileError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.receiver import rtcm, sbf, ubx
-from railfix.io.receiver.ephemerides import navigation_of
-from railfix.io.receiver.framing import SbasFrames, find_frames, head_of, is_receiver_log
+from railfix.io.receiver.ephemerides import assemble_navigation
+from railfix.io.receiver.framing import SbasFrames, find_frames, is_receiver_log, read_head
 from railfix.io.receiver.log import StreamState, at_station, decode
-from railfix.io.receiver.measurements import Tracking, observations_of
+from railfix.io.receiver.measurements import Tracking, join_observations
 from railfix.io.rinex import scan_observations
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Connected, Lost, Place, is_file, read_source
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.run.sensors import COLUMNS, samples_of
+from railfix.run.sensors import COLUMNS, make_samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,13 +85,13 @@ def epoch_ends(buffer: Bytes) -> Indices:
 
 def _receive(data: bytes, state: ReceiverState) -> ReceivedData:
     piece, stream = decode(data, state.stream)
-    observations, tracking = observations_of(
+    observations, tracking = join_observations(
         piece.measurements, replace(state.tracking, last=np.datetime64("NaT", "ns"))
     )
     records = piece.ephemerides
     return ReceivedData(
         epochs=single_epochs(at_station(observations, piece.station)),
-        navigation=navigation_of(records) if records.records or records.klobuchar else None,
+        navigation=assemble_navigation(records) if records.records or records.klobuchar else None,
         sbas=piece.sbas if len(piece.sbas) else None,
         skipped_bytes=piece.skipped_bytes,
         bad_checksums=piece.bad_checksums,
@@ -133,7 +133,7 @@ async def arrivals(
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
     """What a source's data complete, item by item, and the breaks of its connection; `place` as for `read_source`."""
     path = source.removeprefix("file:")
-    if source != "-" and is_file(source) and not is_receiver_log(head_of(path)):
+    if source != "-" and is_file(source) and not is_receiver_log(read_head(path)):
         for piece in scan_observations(path, epochs=200):
             for epoch in single_epochs(piece):
                 yield ReceivedData(epochs=(epoch,), after=state)
@@ -186,7 +186,7 @@ class Sensed:
     until: np.datetime64
     skipped: int = 0  #: Lines that are no rows, or whose time is before that of the row before.
 
-    def unsurveyed(self, units: GroundUnits | None) -> int:
+    def count_unsurveyed(self, units: GroundUnits | None) -> int:
         """Count the ranges to ground units that are not among these, which are not used."""
         return int(np.count_nonzero(~np.isin(self.samples.ranging.station, () if units is None else units.name)))
 
@@ -268,7 +268,7 @@ class SensorLines:
             return SensorSamples()
         columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         samples: dict[str, Any] = {
-            self.sensor: samples_of(self.sensor, np.array(times, dtype="datetime64[ns]"), columns)
+            self.sensor: make_samples(self.sensor, np.array(times, dtype="datetime64[ns]"), columns)
         }
         return SensorSamples(**samples)
 

@@ -24,9 +24,9 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.protection.open_places import Forms
 from railfix.integrity.raim.model import ModelArrays
 from railfix.io import read_navigation, read_observations
-from railfix.kernels.compiling import resolved_once
+from railfix.kernels.compiling import keep_resolutions
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import processor_of
+from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -52,7 +52,7 @@ def prepare_kernels() -> bool:
     if not missing:
         return False
     begin = time.monotonic()
-    kernels.announced()
+    kernels.suppress_announcement()
     _say("compiling for this processor, once: about forty seconds on two cores")
     environment = {**os.environ, kernels.FILTER_ALONE: "1"}
     if kernels.FILTER in missing:
@@ -89,7 +89,7 @@ def _run(settings: _Settings) -> None:
     """
     gc.disable()
     try:
-        with resolved_once():
+        with keep_resolutions():
             _process(settings)
             if settings is _STAGES:
                 _look_beyond()
@@ -108,7 +108,7 @@ def _process(settings: _Settings) -> None:
     paths = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
     navigation = read_navigation(inputs.nav)
     for chosen, epochs in settings:
-        processor, state = processor_of(parse_config(chosen), navigation, paths), None
+        processor, state = make_processor(parse_config(chosen), navigation, paths), None
         processor.process({name: log[:epochs] for name, log in logs.items()})
         for epoch in range(epochs):
             _, state = processor.process({name: log[epoch : epoch + 1] for name, log in logs.items()}, state)

@@ -119,7 +119,7 @@ class ListedBalises:
     def __len__(self) -> int:
         return len(self.name)
 
-    def index_of(self, names: Strings) -> Indices:
+    def find_index(self, names: Strings) -> Indices:
         """Return the rows of the balises of these names, -1 for one that is not listed."""
         rows = {str(self.name[k]): k for k in np.flatnonzero(~self.virtual)}
         return np.array([rows.get(str(name), -1) for name in names], dtype=np.intp)
@@ -153,7 +153,7 @@ class SensorSamples:
             parts[name] = type(rows)(**{f.name: getattr(rows, f.name)[first:last] for f in fields(rows)})
         return SensorSamples(**parts, silent=self.silent)
 
-    def joined(self, later: SensorSamples) -> SensorSamples:
+    def merge(self, later: SensorSamples) -> SensorSamples:
         """Return these samples and others in order of time; some of the others may be older than some of these."""
         parts: dict[str, Any] = {}
         for name, after in later.tables.items():

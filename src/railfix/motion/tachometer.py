@@ -266,7 +266,7 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
     return np.where(np.arange(len(step)) < middle, before, after)
 
 
-def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
+def estimate_wheel(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
     """Return the wheel with the given distance of a pulse, or the median of estimates from good fixes."""
     source = "given"
     if pulses.kind == "distance":

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, changed
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, copy_with
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -80,15 +80,15 @@ def along_track(
     balises of `surroundings`.
     """
     epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
-    epochs = changed(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
+    epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
     line = Line.of(trajectory) if state.line is None else state.line
-    tracked, sensed, replays, after = _tracked(
-        epochs, trajectory, line, config, changed(state, slips=slips), samples, surroundings,
+    tracked, sensed, replays, after = _run_filter(
+        epochs, trajectory, line, config, copy_with(state, slips=slips), samples, surroundings,
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
-    tracked = doubted(tracked, beside, TrackStatus.MAP_OFFSET)
-    tracked = doubted(tracked, single.spoofed & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
+    tracked = mark_doubtful(tracked, beside, TrackStatus.MAP_OFFSET)
+    tracked = mark_doubtful(tracked, single.spoofed & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     wheel = None
     if config.interference.use == "on" and any(replay.sensors.wheel_m is not None for replay in replays):
         wheel, alone = _against_wheel(replays, single.arc_m, single.sigma_m, after.wheel, config)
@@ -96,8 +96,8 @@ def along_track(
         if config.interference.wheel_level == "on":
             sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
             pulled, filtered = _against_wheel(replays, tracked.arc_m, sure, after.pulled, config)
-            after, tracked = replace(after, pulled=filtered), _bounded_by_wheel(tracked, pulled.bound_m)
-        tracked = doubted(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
+            after, tracked = replace(after, pulled=filtered), _bound_by_wheel(tracked, pulled.bound_m)
+        tracked = mark_doubtful(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
     inside = on_line_m(tracked, trajectory)
     chainage = trajectory.chainage_at(inside)
 
@@ -110,15 +110,15 @@ def along_track(
 
     speed, sigma = tracked.speed_mps, tracked.speed_sigma_mps
     direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
-    result = AlongTrack.made(
+    result = AlongTrack.create(
         later, tracked=tracked, chainage_m=chainage, direction=direction.astype(np.int8),
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS, sensed=sensed,
         spacing_error_m=np.full(len(tracked), np.nan), wheel=wheel, replay=replays,
     )  # fmt: skip
-    return result, changed(after, line=line)
+    return result, copy_with(after, line=line)
 
 
-def _bounded_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
+def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
     """Return places whose finite levels are at least what a pull may have got to unseen."""
     levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
     return replace(
@@ -138,7 +138,7 @@ def _against_wheel(
     )  # fmt: skip
 
 
-def checked(
+def apply_spacing_verdict(
     result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
 ) -> tuple[AlongTrack, FilterState]:
     """Return the positions with the verdict on distance and speed from those of the other antenna, and the state.
@@ -151,8 +151,8 @@ def checked(
         disagreed[1:], error = np.where(spacing.reject, time, np.datetime64("NaT", "ns")), spacing.metric
     disagreed = np.fmax.accumulate(disagreed)
     held = seconds(time - disagreed[1:]) <= held_s
-    tracked = doubted(result.tracked, held & is_bounded(result.tracked.status), TrackStatus.ANTENNAS_DISAGREE)
-    return changed(result, tracked=tracked, spacing_error_m=error), changed(state, disagreed=disagreed[-1])
+    tracked = mark_doubtful(result.tracked, held & is_bounded(result.tracked.status), TrackStatus.ANTENNAS_DISAGREE)
+    return copy_with(result, tracked=tracked, spacing_error_m=error), copy_with(state, disagreed=disagreed[-1])
 
 
 def with_passings(
@@ -171,7 +171,7 @@ def with_passings(
     return replace(result, passings=found), replace(state, passings=after)
 
 
-def doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
+def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
     """Return places with a status of doubt at some epochs; nothing bounds their error there."""
     if not doubtful.any():
         return tracked
@@ -179,10 +179,10 @@ def doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
     unbounded = doubtful & ~np.isnan(tracked.level_m)
     names = ("level_m", "ground_level_m", "amount_m")
     levels = {name: np.where(unbounded, np.inf, getattr(tracked, name)) for name in names}
-    return changed(tracked, status=told, **levels)
+    return copy_with(tracked, status=told, **levels)
 
 
-def _tracked(
+def _run_filter(
     epochs: GnssEpochs,
     trajectory: Trajectory,
     line: Line,
@@ -229,11 +229,11 @@ def _tracked(
             tracked, after, level = track_with_levels(part, line, state.track, level, config.tracking, sensors)
         else:
             tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
-        fixed = _fixed(tracked) if len(part) else state.fixed
-        state = changed(state, track=after, level=level, sensors=kept, fixed=fixed)
+        fixed = _find_fix(tracked) if len(part) else state.fixed
+        state = copy_with(state, track=after, level=level, sensors=kept, fixed=fixed)
         parts.append(tracked)
         motions.append(sensed)
-    return _join(parts), SensedMotion.joined(motions), tuple(replays), state
+    return _join(parts), SensedMotion.concatenate(motions), tuple(replays), state
 
 
 def _gate(
@@ -292,7 +292,7 @@ def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
     return replace(state, sensors=sensors, anchor=fixed, gate=gate)
 
 
-def _fixed(tracked: Tracked) -> FilterFix:
+def _find_fix(tracked: Tracked) -> FilterFix:
     decided = int(tracked.status[-1]) in (TrackStatus.TRACKING, TrackStatus.COASTING)
     arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
     sigma = float(tracked.sigma_m[-1])

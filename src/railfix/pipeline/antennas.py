@@ -14,16 +14,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Datetimes, Floats, Masks, changed, read_only
+from railfix.core.arrays import Datetimes, Floats, Masks, copy_with, read_only
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.filter_result import COORDINATES
-from railfix.pipeline.level_stage import judged
+from railfix.pipeline.level_stage import apply_verdicts
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
-from railfix.positioning.antenna_rows import AntennaRows, joined
+from railfix.positioning.antenna_rows import AntennaRows, join_rows
 from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.screens.base import on_pairs, pair_epochs
 from railfix.track.track import interpolate_kilometrage
@@ -76,15 +76,15 @@ def antenna_results(
         "corrected_code_m": lambda: on_all_channels(corrected.corrected_code_m),
         "residual_m": lambda: on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
     }
-    raim = changed(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan))
-    result = AntennaResult.made(
+    raim = copy_with(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan))
+    result = AntennaResult.create(
         later, time=obs.time, satellite=obs.satellite, signal=obs.signal, status=solution.status, chainage_m=chainage,
         arc_m=arc, along_sigma_m=np.where(has, solution.along_sigma_m, np.nan), own_sigma_m=solution.own_sigma_m,
         noise_scale=solution.noise_scale, conventional_status=solution.point_status, conventional_ecef_m=point.ecef_m,
         cn0_dbhz=obs.cn0_dbhz, satellites=corrected.satellites, columns=corrected.columns, second=corrected.second,
         combined=corrected.combined, screens=corrected.screens, single_point=point, section=solution.place.section,
         constrained=constrained, phase=solution.phase, raim=raim,
-        protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
+        protection=None if protection is None else apply_verdicts(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset, araim=solution.araim, clocks=corrected.clocks,
         clock_offset_m=solution.ties.offset_m, clock_offset_sigma_m=solution.ties.sigma_m,
         interference=None,  # of each antenna
@@ -118,14 +118,14 @@ def judge_pairs(
     judged = dict(ranges)
     for screen, limits in screens if pair is not None else ():
         for name, verdicts in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
-            judged[name] = judged[name].judged(verdicts)
+            judged[name] = judged[name].apply(verdicts)
     return judged
 
 
 def with_screens(corrected: CorrectedRanges, ranges: Mapping[str, CorrectedRanges]) -> CorrectedRanges:
     """Return the ranges of all antennas with what the screens and the carrier phases of each have changed."""
     names = ("reason", "sigma_m", "corrected_code_m", "bound_sigma_m", "bias_m", "combined", "slips")
-    return changed(corrected, **{name: joined([getattr(own, name) for own in ranges.values()]) for name in names})
+    return copy_with(corrected, **{name: join_rows([getattr(own, name) for own in ranges.values()]) for name in names})
 
 
 def position_verdicts(
@@ -216,7 +216,7 @@ class AntennaOrder:
             self._stretches[key] = (before[0] + more[0], before[1] + more[1], before[2] + more[2])
         return len(self._stretches) > seen
 
-    def measured(self) -> tuple[float, float]:
+    def measure(self) -> tuple[float, float]:
         """Mean distance of the front antenna ahead of the rear one, and its sigma [m]; NaN before a verdict.
 
         A stretch has the mean of its distances with the variance of a single pair, as what disturbs the positions there
@@ -233,7 +233,7 @@ class AntennaOrder:
     @property
     def note(self) -> str | None:
         """Sentence on antennas in the wrong order; None where their order is right, or not certain."""
-        mean, sigma = self.measured()
+        mean, sigma = self.measure()
         right = abs(self.distance_m)
         ahead = float(np.sign(self.distance_m)) * mean
         exchanged = right >= _LEAST_DISTANCE_M and -2.0 * right < ahead < -_CERTAIN * sigma

@@ -64,7 +64,7 @@ def balise_epochs(
     epoch before the chunk, and its epochs, shape (T + 1,).
     """
     found = BaliseEpochs.none(len(edges) - 1)
-    index, arc = listed.index_of(readings.balise), arcs_of_balises(listed, trajectory, limits)
+    index, arc = listed.find_index(readings.balise), arcs_of_balises(listed, trajectory, limits)
     epoch = np.searchsorted(edges, readings.time, side="left") - 1
     known = (index >= 0) & (epoch >= 0) & (epoch < len(edges) - 1)
     known[known] = np.isfinite(arc[index[known]])
@@ -167,16 +167,16 @@ def find_passings(
     values = np.stack([getattr(tracked, name)[rows] for name in _VALUES], axis=1)
     time, values = np.concatenate([state.time, tracked.time[rows]]), np.concatenate([state.values, values])
     if not len(time):
-        return (), replace(state, waiting=_joined(state.waiting, readings))
+        return (), replace(state, waiting=_join_readings(state.waiting, readings))
     state, wrong = _judge(
-        _joined(state.waiting, readings), listed, arcs, trajectory.turn_m, time, values, state, limits
+        _join_readings(state.waiting, readings), listed, arcs, trajectory.turn_m, time, values, state, limits
     )
     passed, state = _pass(listed, arcs, trajectory.turn_m, time, values, state)
     found = sorted([*wrong, *passed], key=lambda passing: passing.time)
     return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=state.right[-1:])
 
 
-def _joined(before: BaliseReadings, after: BaliseReadings) -> BaliseReadings:
+def _join_readings(before: BaliseReadings, after: BaliseReadings) -> BaliseReadings:
     names = [f.name for f in fields(BaliseReadings)]
     return BaliseReadings(**{n: np.concatenate([getattr(before, n), getattr(after, n)]) for n in names})
 
@@ -195,7 +195,7 @@ def _judge(
     wrong: list[Passing] = []
     read, right = state.read.copy(), list(state.right)
     heard = readings.time <= time[-1]
-    index = listed.index_of(readings.balise)
+    index = listed.find_index(readings.balise)
     for k in np.flatnonzero(heard):  # a few balises
         at, mark, balise = readings.time[k], int(index[k]), str(readings.balise[k])
         row = min(int(np.searchsorted(time, at)), len(time) - 1)

@@ -13,7 +13,7 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_w
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises
-from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
+from railfix.pipeline.carrier_stage import CarrierState, smooth_ranges, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import correct_ranges
@@ -79,7 +79,7 @@ class BaseStation:
         self._antenna: tuple[Floats, AntennaRows] | None = None
         self._book = ChannelBook(self._config)
 
-    def received(
+    def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
         """Return the state after more observations of the station, without what no epoch from `began` on needs."""
@@ -92,11 +92,11 @@ class BaseStation:
             if errors is not None and np.linalg.norm(errors.ecef_m - place) > _SAME_PLACE_M:
                 errors, state = None, BaseState()
             new, carrier = self.errors(obs, received, state.carrier, place)
-            state = BaseState(errors=new if errors is None else errors.joined(new), carrier=carrier)
+            state = BaseState(errors=new if errors is None else errors.merge(new), carrier=carrier)
         if np.isnat(began) or state.errors is None:
             return state
         kept = np.timedelta64(round(2e9 * LONGEST_AGE_S), "ns")
-        return replace(state, errors=state.errors.kept_from(began - kept))
+        return replace(state, errors=state.errors.drop_before(began - kept))
 
     def _rows(self, ecef_m: Floats) -> AntennaRows:
         """A short line through the station."""
@@ -115,7 +115,7 @@ class BaseStation:
         channels = self._book.of(obs, received.navigation)
         corrected = correct_ranges(obs, channels, self._config, own, self._rows(ecef_m))
         corrected, carrier = with_slips(corrected, self._config, carrier)
-        corrected, carrier = smoothed(corrected, self._config, carrier)
+        corrected, carrier = smooth_ranges(corrected, self._config, carrier)
         slips = corrected.slips
         assert slips is not None
         used = corrected.reason == Reason.USED

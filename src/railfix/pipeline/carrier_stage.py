@@ -23,11 +23,11 @@ from railfix.positioning.carrier import (
     SmoothingState,
     TrackedPhases,
     corrected_phase_m,
+    count_repeats,
     find_slips,
     last_arcs,
     number_arcs,
     phase_positions,
-    repeats_of,
     smooth_codes,
     track_jumps,
 )
@@ -60,7 +60,7 @@ def with_slips(ranges: CorrectedRanges, config: Config, state: CarrierState) -> 
     return replace(ranges, slips=slips), replace(state, slips=after)
 
 
-def smoothed(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tuple[CorrectedRanges, CarrierState]:
+def smooth_ranges(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tuple[CorrectedRanges, CarrierState]:
     """Return the ranges with their codes smoothed by their phases; the weights stay those of raw codes.
 
     Multipath and the error floor are not averaged out as white noise is. The ranges need their slips
@@ -151,7 +151,7 @@ def _lasting(
     before = last_arcs(corrected.satellite, corrected.signal, state.arcs)
     latest = np.maximum.accumulate(np.concatenate([before[None], phases.arc_id]))
     ended = np.datetime64("NaT", "ns") if state.phase is None else state.phase.memories[-1].time
-    repeats = repeats_of(np.concatenate([np.array([ended]), corrected.time]), limits)[1:]
+    repeats = count_repeats(np.concatenate([np.array([ended]), corrected.time]), limits)[1:]
     share = np.where(phases.arc_id > latest[:-1], 1.0, 1.0 / repeats[:, None])
     return replace(ranges, weight=ranges.weight * share), replace(phases, weight=phases.weight * share)
 

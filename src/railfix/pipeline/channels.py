@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, changed, dataclass, read_only
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, copy_with, dataclass, read_only
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation, glonass_channels
@@ -103,12 +103,12 @@ def missing_notes(received: Received, config: Config, second: SecondCodes | None
     return tuple(notes)
 
 
-def noise_of(signal: str) -> float:
+def relative_noise(signal: str) -> float:
     """Return noise and multipath of a signal ("G5Q") over those of L1 C/A at the same C/N0."""
     return _FAST_NOISE if signal[:2] in _FAST else 1.0
 
 
-def combined(
+def combine_frequencies(
     ranges: CorrectedRanges, config: Config, ionosphere_sigma_m: float, state: TwoFrequencyState
 ) -> tuple[CorrectedRanges, TwoFrequencyState]:
     """Return the ranges with two codes combined, and weighted down where the two disagree."""
@@ -139,7 +139,7 @@ def combined(
         local_m = np.sqrt(np.maximum(local_m**2 - nominal_m**2, 0.0))
     joint = np.isfinite(found.share)
     magnified = np.where(joint, np.abs(1.0 - found.share) + np.abs(found.share), 1.0)
-    ranges = changed(
+    ranges = copy_with(
         ranges,
         corrected_code_m=np.where(joint, found.code_m, ranges.corrected_code_m),
         sigma_m=np.where(joint, np.sqrt(ranges.sigma_m**2 + found.variance_m2), ranges.sigma_m),
@@ -149,7 +149,7 @@ def combined(
     )
     screened = Screened(metric=found.difference_m, reject=found.suspected)
     verdict = Verdict(name=NAME, reason=Reason.USED, screened=screened, error_m=found.difference_m)
-    return ranges.judged([verdict]), state
+    return ranges.apply([verdict]), state
 
 
 def _field_of_ionosphere(ranges: CorrectedRanges, vertical_m: float) -> Floats:
@@ -330,7 +330,7 @@ class ChannelBook:
         ]
         _, groups = np.unique(np.array([group for _, group in pairs], dtype="<U12"), return_inverse=True)
         ratio = (frequency_hz[columns][:, None] / frequency_hz[second]) ** 2 if width else np.empty(second.shape)
-        noise = np.array([[noise_of(other) for other in others] for others in signal.tolist()], dtype=np.float64)
+        noise = np.array([[relative_noise(other) for other in others] for others in signal.tolist()], dtype=np.float64)
         return {
             "second": read_only(second),
             "second_signal": read_only(signal),

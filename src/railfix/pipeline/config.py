@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, create_model, field_validator, model_validator
 
-from railfix.core.settings import Settings, load_settings, validated
+from railfix.core.settings import Settings, load_settings, validate
 from railfix.integrity.interference import InterferenceLimits
 from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
@@ -291,7 +291,7 @@ def parse_config(values: Mapping[str, Any], *, source: str = "settings") -> Conf
     SettingsError
         Names the source, the setting, and what was expected.
     """
-    return validated(Config, values, source=source)
+    return validate(Config, values, source=source)
 
 
 def load_config(path: str | PathLike[str]) -> Config:

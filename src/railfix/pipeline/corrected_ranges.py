@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed, dataclass, kernel_array
+from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, copy_with, dataclass, kernel_array
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
@@ -97,23 +97,23 @@ class CorrectedRanges(AntennaRanges, OnDemand):
         """Letter of each receiver clock."""
         return self.channels.clocks
 
-    def rejected(self, mask: Masks, reason: Reason) -> CorrectedRanges:
+    def reject(self, mask: Masks, reason: Reason) -> CorrectedRanges:
         """Return the ranges with a reason added to the observed channels of a mask, shape (T, K)."""
         if not mask.any():
             return self
         hit = mask & ((self.reason & int(Reason.NOT_OBSERVED)) == 0)
-        return changed(self, reason=np.where(hit, self.reason | int(reason), self.reason))
+        return copy_with(self, reason=np.where(hit, self.reason | int(reason), self.reason))
 
-    def judged(self, verdicts: Iterable[Verdict]) -> CorrectedRanges:
+    def apply(self, verdicts: Iterable[Verdict]) -> CorrectedRanges:
         """Return the ranges with the verdicts of a screen: what fails is rejected, or weighted down."""
         ranges = self
         for verdict in verdicts:
             reject = verdict.screened.reject
             if verdict.error_m is None:
-                ranges = ranges.rejected(reject, verdict.reason)
+                ranges = ranges.reject(reject, verdict.reason)
             elif reject.any():
-                ranges = changed(ranges, sigma_m=suspicion_sigma_m(reject, verdict.error_m, ranges.sigma_m))
-            ranges = changed(ranges, screens={**ranges.screens, verdict.name: verdict.screened})
+                ranges = copy_with(ranges, sigma_m=suspicion_sigma_m(reject, verdict.error_m, ranges.sigma_m))
+            ranges = copy_with(ranges, screens={**ranges.screens, verdict.name: verdict.screened})
         return ranges
 
     def ranges(self) -> Ranges:
@@ -285,7 +285,7 @@ def without(ranges: Ranges, dropped: Masks) -> Ranges:
     return replace(ranges, weight=np.where(dropped, 0.0, ranges.weight))
 
 
-def conditions_of(config: Config) -> Conditions:
+def collect_conditions(config: Config) -> Conditions:
     """Settings that the errors of the ranges depend on: the conditions of an error model made from such a run."""
     return Conditions(
         systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, changed, dataclass, read_only
+from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, copy_with, dataclass, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
@@ -23,13 +23,13 @@ from railfix.integrity.interference import (
     PowerState,
     Sign,
     Suspicion,
-    held,
+    hold_signs,
     motion_signs,
     power_signs,
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
-from railfix.positioning.antenna_rows import AntennaRows, joined, rows_of
+from railfix.positioning.antenna_rows import AntennaRows, join_rows, take_rows
 
 if TYPE_CHECKING:
     from railfix.pipeline.corrected_ranges import CorrectedRanges
@@ -123,7 +123,7 @@ def _find_interference(
     motion, motion_state = motion_signs(inputs, state.motion, limits, fitted)
     signs = _signs(alarm, power, motion, limits)
     hold, release = _times(limits)
-    _, stays, held_state = held(inputs.time, signs, state.held, hold_s=hold, release_s=release)
+    _, stays, held_state = hold_signs(inputs.time, signs, state.held, hold_s=hold, release_s=release)
     causes = (stays * np.array([int(cause) for cause in CAUSES])).sum(axis=1, dtype=np.int64)
     after = replace(state, power=power_state, motion=motion_state, held=held_state)
     return Interference(causes=causes, power=power, motion=motion), after
@@ -204,10 +204,12 @@ def _on_all_epochs(
         every = latest = known[-1]
     else:
         row = due.group - (state.latest is None)
-        every = joined(known)
-        every, latest = rows_of(every, row), rows_of(every, row[-1:])
+        every = join_rows(known)
+        every, latest = take_rows(every, row), take_rows(every, row[-1:])
     count = len(due.rows)
-    after = changed(state, second=due.last, alarm=int(due.alarm[count]), broken=bool(due.broken[count]), latest=latest)
+    after = copy_with(
+        state, second=due.last, alarm=int(due.alarm[count]), broken=bool(due.broken[count]), latest=latest
+    )
     return every, after
 
 
@@ -229,7 +231,7 @@ def with_wheel(results: Mapping[str, AntennaResult], fusion: Mapping[str, AlongT
             continue
         found = replace(found, causes=np.where(wheel.parted, found.causes | int(Sign.WHEEL_PARTS), found.causes))
         status = with_statuses(result.status, found.suspicion)
-        after[name] = changed(result, interference=found, status=status)
+        after[name] = copy_with(result, interference=found, status=status)
     return after
 
 
@@ -269,4 +271,4 @@ def judge_interference(
         found.append(new)
         after.append(state)
     kind = suspicion(np.concatenate([own.causes for own in found]))
-    return changed(solution, status=with_statuses(solution.status, kind)), found, after
+    return copy_with(solution, status=with_statuses(solution.status, kind)), found, after

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Floats, Masks, changed
+from railfix.core.arrays import Codes, Floats, Masks, copy_with
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, Status
@@ -52,7 +52,7 @@ _ALARMING: Final = np.array(
 BASES: Final[tuple[str, str]] = ("measured", "indicative")
 
 
-def basis_of(config: Config) -> str:
+def choose_basis(config: Config) -> str:
     """Return which of `BASES` the levels of a run are."""
     return BASES[0] if config.risk.priors == "measured" else BASES[1]
 
@@ -74,7 +74,7 @@ def prior_basis_text(facts: Mapping[str, Any]) -> str:
     return text
 
 
-def kind_of(config: Config) -> str:
+def choose_kind(config: Config) -> str:
     """Return which of `KINDS` the levels of a run are."""
     return KINDS[0] if config.sbas else KINDS[1]
 
@@ -83,11 +83,11 @@ def level_facts(config: Config) -> dict[str, Any]:
     """Return the basis of the levels of a run as plain values; empty where they are off."""
     if config.protection == "off":
         return {}
-    risk = risk_of(config)
+    risk = get_risk_budget(config)
     sigmas = "noise settings times the receiver's estimated scale, 1 at least: no promise about tails"
     return {
-        "kind": kind_of(config),
-        "basis": basis_of(config),
+        "kind": choose_kind(config),
+        "basis": choose_basis(config),
         "priors": risk.priors,
         "sigmas": sigmas if config.error_model is None else str(config.error_model),
         "alarm_limit_m": config.alarm_limit_m,
@@ -103,9 +103,9 @@ def level_facts(config: Config) -> dict[str, Any]:
     }
 
 
-def risk_of(config: Config) -> RiskBudget:
+def get_risk_budget(config: Config) -> RiskBudget:
     """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones are left."""
-    return config.risk if kind_of(config) == "separation" else config.local_risk
+    return config.risk if choose_kind(config) == "separation" else config.local_risk
 
 
 def level_scale(scale: Floats, config: Config) -> Floats:
@@ -131,13 +131,13 @@ def protection_levels(
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = along_track_level(
         replace(model, covariance_m2=covariance), [name[0] for name in corrected.satellite.tolist()],
-        risk=risk_of(config), scale=level_scale(scale, config),
+        risk=get_risk_budget(config), scale=level_scale(scale, config),
         overbound=None if config.error_model is None else RangeBounds(corrected.bound_sigma_m, corrected.bias_m),
         map_error=MapDeviation(np.array(offset.beyond_m).T, offset.seen), sides=sides,
         n_excluded=raim.excluded.sum(axis=1),
     )  # fmt: skip
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
+    return ProtectionResult(level=level, status=status, kind=choose_kind(config), basis=choose_basis(config))
 
 
 def bounding_model(
@@ -166,7 +166,7 @@ def unresolved_alternatives(
     return places_beyond_the_level(
         antennas, place.constrained.arc_m, bounding[0],
         np.where(place.section.excess > config.section.threshold, protection.level.level_m, np.nan), bounding[1],
-        [name[0] for name in corrected.satellite.tolist()], risk_of(config), sides,
+        [name[0] for name in corrected.satellite.tolist()], get_risk_budget(config), sides,
     )  # fmt: skip
 
 
@@ -177,7 +177,7 @@ def low_sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: fl
     return np.concatenate([(low & ~right)[:, None], (low & right)[:, None]], axis=1)
 
 
-def judged(
+def apply_verdicts(
     protection: ProtectionResult, status: Codes, has: Masks, chainage_m: Floats, config: Config
 ) -> ProtectionResult:
     """Return the levels with the verdicts on the positions applied.
@@ -193,7 +193,7 @@ def judged(
     verdict = np.where(_ALARMING[status], int(LevelStatus.ALARM), verdict)
     doubtful = status == int(Status.AMBIGUOUS)
     verdict = np.where(doubtful & (verdict == int(LevelStatus.AVAILABLE)), int(LevelStatus.UNAVAILABLE), verdict)
-    return changed(protection, level=level, status=verdict.astype(np.int8))
+    return copy_with(protection, level=level, status=verdict.astype(np.int8))
 
 
 def _where_it_holds(level: ProtectionLevel, has: Masks, chainage_m: Floats, config: Config) -> ProtectionLevel:
@@ -250,15 +250,15 @@ def with_araim(
     )  # fmt: skip
     budget = config.araim
     near = np.nan_to_num(place, nan=1e6)
-    axes = antennas.axes_of(np.maximum(solution.place.constrained.section, 0))
-    on_line = with_map(_turned(ranges, axes), antennas.sigma_plan_m, antennas.sigma_height_m, budget.map_prior)
+    axes = antennas.get_axes(np.maximum(solution.place.constrained.section, 0))
+    on_line = with_map(_rotate_geometry(ranges, axes), antennas.sigma_plan_m, antennas.sigma_height_m, budget.map_prior)
     horizontal = budget.phmi_horizontal / 2.0, budget.false_alarm_horizontal / 2.0
-    return changed(
+    return copy_with(
         solution,
         araim=AraimResult(
             along=araim_levels(on_line, [budget.phmi_along], [budget.false_alarm_along], budget),
             space=araim_levels(
-                _turned(ranges, enu_axes(*geodetic_from_ecef(near)[:2])),
+                _rotate_geometry(ranges, enu_axes(*geodetic_from_ecef(near)[:2])),
                 [horizontal[0], horizontal[0], budget.phmi_vertical],
                 [horizontal[1], horizontal[1], budget.false_alarm_vertical],
                 budget,
@@ -277,11 +277,11 @@ def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, M
     return to_satellite / distance, clocks.reshape(-1, len(clock)).T, channels
 
 
-def _turned(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
+def _rotate_geometry(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
     """Return the geometry with the position along other axes, rows of shape (T, 3, 3)."""
     design = geometry.design.copy()
     design[..., :_SPACE] = design[..., :_SPACE] @ axes.swapaxes(1, 2)
-    return changed(geometry, design=design)
+    return copy_with(geometry, design=design)
 
 
 def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: float) -> AraimGeometry:

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Masks, changed, dataclass
+from railfix.core.arrays import Masks, copy_with, dataclass
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.along_track import along_track, checked, with_passings
+from railfix.pipeline.along_track import along_track, apply_spacing_verdict, with_passings
 from railfix.pipeline.antennas import (
     AntennaOrder,
     antenna_results,
@@ -31,10 +31,10 @@ from railfix.pipeline.antennas import (
     with_screens,
 )
 from railfix.pipeline.base_station import BaseStation, Stations, check_base
-from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
-from railfix.pipeline.channels import ChannelBook, combined, missing_notes
+from railfix.pipeline.carrier_stage import CarrierState, smooth_ranges, with_slips
+from railfix.pipeline.channels import ChannelBook, combine_frequencies, missing_notes
 from railfix.pipeline.config import SCREEN_NAMES, Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, conditions_of, correct_ranges
+from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, collect_conditions, correct_ranges
 from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
 from railfix.pipeline.interference_stage import Interference, judge_interference, with_wheel
 from railfix.pipeline.level_stage import with_araim
@@ -43,7 +43,7 @@ from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensed_motion import LineFeatures
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.solution import Solution, solve
-from railfix.positioning.antenna_rows import AntennaRows, rows_of, stack_observations
+from railfix.positioning.antenna_rows import AntennaRows, stack_observations, take_rows
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
@@ -92,7 +92,7 @@ class EpochProcessor:
     Parameters
     ----------
     config : Config
-        The files that it names are not read here; pass their contents (`railfix.run.processor_of` does).
+        The files that it names are not read here; pass their contents (`railfix.run.make_processor` does).
     trajectories : mapping of str to Trajectory
         The trajectory of each antenna, one or two ("front", "rear").
     navigation : Navigation, optional
@@ -192,7 +192,7 @@ class EpochProcessor:
         notes = [note for screen, limits in self.screens for note in screen.notes(limits, self.setup)]
         check_base(self.config, self._base)
         conditions = None if self._error_model is None else self._error_model.conditions
-        if conditions and (differences := condition_differences(conditions, conditions_of(self.config))):
+        if conditions and (differences := condition_differences(conditions, collect_conditions(self.config))):
             notes.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
         faults = None if self._error_model is None else self._error_model.faults
         if faults is not None and "side_upper" not in faults.model_fields_set:
@@ -247,12 +247,12 @@ class EpochProcessor:
         SettingsError
             As the class.
         """
-        screened, state = self.screened(
+        screened, state = self.screen(
             observations, state, navigation=navigation, messages=messages, sensors=sensors, base=base
         )
         return self.along_track(*self.single_epochs(screened, state))
 
-    def screened(
+    def screen(
         self,
         observations: Mapping[str, Observations],
         state: State | None = None,
@@ -280,13 +280,13 @@ class EpochProcessor:
         )
         base_state = None
         if self._base is not None:
-            base_state = self._base.received(base, received, state.base, began)
+            base_state = self._base.add_observations(base, received, state.base, began)
             received = base_state.beside(received)
         names, (obs, parts) = tuple(observations), stack_observations(list(observations.values()))
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         channels = self._channels.of(obs, received.navigation)
         corrected = correct_ranges(obs, channels, self.config, received, antennas, error_model=self._error_model)
-        ranges, own_states = self._screened(names, antennas, corrected, received, state)
+        ranges, own_states = self._screen_antennas(names, antennas, corrected, received, state)
         pair = self._pair(ranges)
         ranges = judge_pairs(self._of_pairs, pair, ranges)
         screened = ScreenedChunk(
@@ -300,8 +300,8 @@ class EpochProcessor:
         )  # fmt: skip
         after = dict(state.antennas)
         for name, part, own in zip(names, observations.values(), own_states, strict=True):
-            after[name] = changed(own, ended=part.time[-1] if len(part) else own.ended)
-        return screened, changed(state, received=received, antennas=after, base=base_state)
+            after[name] = copy_with(own, ended=part.time[-1] if len(part) else own.ended)
+        return screened, copy_with(state, received=received, antennas=after, base=base_state)
 
     def single_epochs(self, screened: ScreenedChunk, state: State) -> tuple[SolvedChunk, State]:
         """Return the single epochs of one chunk: the second part of `process`, before the filter."""
@@ -312,11 +312,11 @@ class EpochProcessor:
         solution, interference, signs = judge_interference(
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
-        own_states = [changed(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
+        own_states = [copy_with(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         solution = with_araim(corrected, solution, antennas, self._support, self.config)
         results = self._results(antennas, corrected, solution, interference, screened)
         solved = SolvedChunk(screened=screened, results=results, ranges=corrected, off_map=solution.off_map)
-        return solved, changed(state, antennas={**state.antennas, **dict(zip(names, own_states, strict=True))})
+        return solved, copy_with(state, antennas={**state.antennas, **dict(zip(names, own_states, strict=True))})
 
     def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
         """Return the results of one chunk with those of the filter, where it is on: the third part of `process`.
@@ -332,38 +332,38 @@ class EpochProcessor:
                 if name not in solved.results:
                     filter_states[name] = replace(own, sensors=waiting_samples(own.sensors, sensors))
         if self.config.filter == "track":
-            found = self._filtered(solved, state)
+            found = self._filter_antennas(solved, state)
             motions = {name: tracked.motion for name, (tracked, _) in found.items()}
             spacing = filter_verdicts(self._of_positions, solved.screened.pair, motions)
             held_s, limits = self.config.antenna_spacing.filter_held_s, self.config.sensors.balise
             for name, (tracked, own) in found.items():
-                tracked, own = checked(tracked, spacing.get(name), own, held_s)
+                tracked, own = apply_spacing_verdict(tracked, spacing.get(name), own, held_s)
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
         result = Result(antennas=with_wheel(solved.results, fusion), notes=solved.screened.notes, fusion=fusion)
-        return result, changed(state, fusion=filter_states)
+        return result, copy_with(state, fusion=filter_states)
 
-    def _screened(
+    def _screen_antennas(
         self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, received: Received, state: State
     ) -> tuple[dict[str, CorrectedRanges], list[AntennaState]]:
         """Return the ranges of each antenna after the screens that judge one antenna alone, and its new state."""
         ranges, after = {}, []
         for name, rows in zip(names, antennas.parts, strict=True):
             before = state.antennas.get(name) or AntennaState()
-            own, states = rows_of(corrected, rows), dict(before.screens)
+            own, states = take_rows(corrected, rows), dict(before.screens)
             for screen, limits in self._of_observations:
                 verdicts, screen_state = screen.judge(own, limits, self.setup, states.get(screen.name))
-                own = own.judged(verdicts)
+                own = own.apply(verdicts)
                 if screen_state is not None:
                     states[screen.name] = screen_state
-            own, two = combined(own, self.config, received.ionosphere_sigma_m, before.two_frequencies)
+            own, two = combine_frequencies(own, self.config, received.ionosphere_sigma_m, before.two_frequencies)
             carrier = before.carrier
             if self.config.carrier != "off":
                 own, carrier = with_slips(own, self.config, carrier or CarrierState())
                 if self.config.carrier == "smoothed":
-                    own, carrier = smoothed(own, self.config, carrier)
+                    own, carrier = smooth_ranges(own, self.config, carrier)
             ranges[name] = own
-            after.append(changed(before, screens=states, carrier=carrier, two_frequencies=two))
+            after.append(copy_with(before, screens=states, carrier=carrier, two_frequencies=two))
         return ranges, after
 
     def _results(
@@ -385,19 +385,19 @@ class EpochProcessor:
                 doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
                 status[rows] = np.where(doubtful, verdict.status, status[rows])
                 screens[name][verdict.name] = verdict.screened
-        results = antenna_results(corrected, antennas, changed(solution, status=status), chainage, self.config)
+        results = antenna_results(corrected, antennas, copy_with(solution, status=status), chainage, self.config)
         return {
-            name: changed(rows_of(results, rows), screens=screens[name], interference=own)
+            name: copy_with(take_rows(results, rows), screens=screens[name], interference=own)
             for (name, rows), own in zip(screened.rows.items(), interference, strict=True)
         }
 
-    def _filtered(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
+    def _filter_antennas(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
         """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
 
         def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
             rows, sensors = solved.screened.rows[name], solved.screened.sensors
             return along_track(
-                rows_of(solved.ranges, rows),
+                take_rows(solved.ranges, rows),
                 single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
                 self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
                 samples=sensors, surroundings=self._line_references(name, sensors),

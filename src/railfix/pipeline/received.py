@@ -87,7 +87,7 @@ def known_from_start(
         )
     except ValueError as error:
         raise SettingsError(f"sbas_prn = {config.sbas_prn}: {error}") from None
-    state = SbasState(prn=sbas.prn, limits=config.sbas_limits, band=config.sbas_band).received(messages)
+    state = SbasState(prn=sbas.prn, limits=config.sbas_limits, band=config.sbas_band).add_messages(messages)
     return _with_notes(replace(received, messages=state, sbas=sbas), config)
 
 
@@ -111,13 +111,13 @@ def receive(
         return before
     after = before
     if navigation is not None:
-        after = replace(before, navigation=_current(merged_navigation(before.navigation, navigation), time))
+        after = replace(before, navigation=_current(merge_navigation(before.navigation, navigation), time))
     if messages is not None:
         state = before.messages
         if state is None:
             state = _empty_state(config)
-        state = state.received(messages)
-        state = state if np.isnat(time) else state.kept_from(time)
+        state = state.add_messages(messages)
+        state = state if np.isnat(time) else state.drop_before(time)
         after = replace(after, messages=state, sbas=state.corrections)
     return _with_notes(after, config)
 
@@ -161,7 +161,7 @@ def _drop_expired(table: Records, label: Strings, validity: Floats, time: np.dat
     return replace(table, **{item.name: getattr(table, item.name)[kept] for item in fields(table)})
 
 
-def merged_navigation(old: Navigation, new: Navigation) -> Navigation:
+def merge_navigation(old: Navigation, new: Navigation) -> Navigation:
     """Return old and new navigation data together."""
     return Navigation(
         kepler=_unite(old.kepler, new.kepler, _KEPLER_KEY),

@@ -115,24 +115,24 @@ def float_column(values: Floats) -> pl.Series:
     return pl.Series(values=np.ascontiguousarray(values, dtype=np.float64), nan_to_null=True)
 
 
-def table_of(columns: Mapping[str, Column[Source]], source: Source, rows: int, **given: str) -> pl.DataFrame:
+def make_table(columns: Mapping[str, Column[Source]], source: Source, rows: int, **given: str) -> pl.DataFrame:
     """Return a table of columns with one row an epoch; `given` has the value of columns that the source has not."""
     return pl.DataFrame(
         {name: column.series(given.get(name, column.of(source)), rows) for name, column in columns.items()}
     )
 
 
-def _screened(result: AntennaResult, column: ScreenColumn) -> Floats | None:
+def _get_screened(result: AntennaResult, column: ScreenColumn) -> Floats | None:
     """Return the array of a column that a screen fills; None where the screen is off."""
     return getattr(result.screens[column.verdict], column.field) if column.verdict in result.screens else None
 
 
 def _position_column(column: ScreenColumn) -> Column[AntennaResult]:
-    return Column(column.name, column.meaning, lambda r: _screened(r, column))
+    return Column(column.name, column.meaning, lambda r: _get_screened(r, column))
 
 
 def _observation_column(column: ScreenColumn) -> Column[Observed]:
-    return Column(column.name, column.meaning, lambda o: o.on_all_channels(_screened(o.result, column)))
+    return Column(column.name, column.meaning, lambda o: o.on_all_channels(_get_screened(o.result, column)))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings, changed, dataclass
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings, copy_with, dataclass
 from railfix.core.reasons import Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.gnss.orbits import SatelliteStates
@@ -292,10 +292,10 @@ class Result(NotebookTable):
         return html_table(rows, caption=time_span_text(next(iter(self.antennas.values())).time)) + html_list(self.notes)
 
 
-def patched(result: Rows, epochs: Indices, part: Rows) -> Rows:
+def patch(result: Rows, epochs: Indices, part: Rows) -> Rows:
     """Return a result with some epochs replaced, by index; every field has the epochs on axis 0."""
     values = {}
     for item in fields(result):
         values[item.name] = array = np.array(getattr(result, item.name))
         array[epochs] = getattr(part, item.name)
-    return changed(result, **values)
+    return copy_with(result, **values)

@@ -292,7 +292,7 @@ class SensedMotion:
     under_m: Floats
 
     @classmethod
-    def joined(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
+    def concatenate(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
         """Return parts one after the other."""
         if len(parts) == 1:
             return parts[0]

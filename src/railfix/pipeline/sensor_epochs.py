@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Masks, changed, dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks, copy_with, dataclass
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.features import HALF_LENGTH_M, SCALE_SIGMA
@@ -119,7 +119,7 @@ class SensorState:
 
 def with_samples(state: SensorState, samples: SensorSamples | None) -> SensorState:
     """Return the state with samples that wait for the next epoch."""
-    return replace(state, samples=state.samples.joined(samples)) if samples else state
+    return replace(state, samples=state.samples.merge(samples)) if samples else state
 
 
 def waiting_samples(state: SensorState, samples: SensorSamples) -> SensorState:
@@ -150,7 +150,7 @@ def sensor_epochs(
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
-        return SensorEpochs(), nothing_sensed(len(time)), changed(state, time=last)
+        return SensorEpochs(), nothing_sensed(len(time)), copy_with(state, time=last)
     state = with_samples(state, samples)
     if not len(time):
         return SensorEpochs(), nothing_sensed(0), state

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, changed, dataclass
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, dataclass
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.protection.araim import AraimResult
@@ -19,25 +19,25 @@ from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.filter_result import OffMapState, off_map_epochs
 from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
-from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
+from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patch
 from railfix.pipeline.solve import (
     Place,
+    count_redundancy,
     fault_free,
     lasting_errors,
     model_again,
     place_on_lines,
-    redundancy_of,
     validate_point,
     with_p4_level,
 )
-from railfix.positioning.antenna_rows import AntennaRows, rows_of
+from railfix.positioning.antenna_rows import AntennaRows, take_rows
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
     NoiseState,
     RobustFit,
+    compute_information,
     epoch_variance,
-    information_of,
     noise_scale,
     own_sigma_m,
     robust_fit,
@@ -132,7 +132,7 @@ def solve(
         ranges = replace(ranges, ties=ties)
         tied = _tie(ranges, ties, point, corrected.anchor_ecef_m, config)
     place = place_on_lines(ranges, antennas, tied, config)
-    corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
+    corrected = corrected.reject(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
     learning, noises = config.noise_scale, [state.noise for state in states]
     windows = Windows.of(
         time, antennas.parts, [(noise.time, noise.age) for noise in noises],
@@ -152,11 +152,11 @@ def solve(
         corrected, ranges, antennas, place, raised, config, [state.lasting for state in states]
     )
     if lasting.any():
-        corrected = corrected.rejected(lasting, Reason.LASTING_ERROR)
+        corrected = corrected.reject(lasting, Reason.LASTING_ERROR)
         on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
     robust, robust_sums = robust_scale([noise.robust for noise in noises])
     ranges, place, raim = fault_free(ranges, antennas, place, model, robust, on_line.kept, config)
-    constrained, redundancy = place.constrained, redundancy_of(ranges)
+    constrained, redundancy = place.constrained, count_redundancy(ranges)
     model = model_again(model, ranges, antennas, constrained, np.flatnonzero(raim.excluded.any(axis=1)))
     off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)
     teaching = ~off_map & ~raim.faulty
@@ -178,7 +178,7 @@ def solve(
     )  # fmt: skip
     if "raim" in config.screens and config.raim_protection == "on":
         raim = with_p4_level(raim, model, scale, config)
-    corrected = corrected.rejected(raim.excluded, Reason.FAULT_EXCLUDED)
+    corrected = corrected.reject(raim.excluded, Reason.FAULT_EXCLUDED)
     level, open_elsewhere = None, np.zeros(len(ranges), dtype=bool)
     if config.protection == "on" and config.carrier not in ("float", "fixed"):
         section = np.maximum(constrained.section, 0)
@@ -199,7 +199,7 @@ def solve(
         def own_phase(
             index: SearchIndex, rows: slice, state: CarrierState | None
         ) -> tuple[PhasePositions, CarrierState]:
-            own = rows_of(corrected, rows), rows_of(ranges, rows)
+            own = take_rows(corrected, rows), take_rows(ranges, rows)
             return code_and_phase(*own, index.trajectory, constrained.arc_m[rows], config, state or CarrierState())
 
         phase, carriers = antennas.each_with_state(own_phase, carriers)
@@ -215,14 +215,14 @@ def solve(
         ties=ties, raim=raim, status=np.zeros(len(ranges), dtype=np.int8), noise_scale=scale, own_sigma_m=own_sigma,
         arc_m=arc, along_sigma_m=along_sigma, phase=phase, protection=level, map_offset=offset, off_map=away,
     )  # fmt: skip
-    solution = changed(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
+    solution = copy_with(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
     after = []
     for k, (state, (when, age)) in enumerate(zip(states, windows.last, strict=True)):
         noise = NoiseState(time=when, age=age, robust=robust_sums[k], remaining=stated_sums[k])
         after.append(
-            changed(
+            copy_with(
                 state, offsets=offsets[k], noise=noise, map_offset=map_states[k], off_map=off_map_states[k],
-                lasting=changed(lasting_states[k], noise=raised_sums[k]), carrier=carriers[k],
+                lasting=copy_with(lasting_states[k], noise=raised_sums[k]), carrier=carriers[k],
             )
         )  # fmt: skip
     return corrected, solution, after
@@ -236,7 +236,7 @@ def _tie(ranges: Ranges, ties: ClockTies, point: SinglePoint, anchor_ecef_m: Flo
     start = np.where(np.isnan(point.ecef_m), anchor_ecef_m, point.ecef_m)
     if len(rows) == len(ranges):
         return single_point(ranges, start, limits=config.single_point)
-    return patched(point, rows, single_point(ranges.take(rows), start[rows], limits=config.single_point))
+    return patch(point, rows, single_point(ranges.take(rows), start[rows], limits=config.single_point))
 
 
 def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> tuple[Ranges, SinglePoint]:
@@ -249,7 +249,7 @@ def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config:
         return ranges, point
     agreeing = without(ranges, dropped)
     again = single_point(agreeing.take(changed), place[changed], limits=config.single_point)
-    return agreeing, patched(point, changed, again)
+    return agreeing, patch(point, changed, again)
 
 
 def _fit_on_line(
@@ -259,7 +259,7 @@ def _fit_on_line(
     arc, section = place.constrained.arc_m, np.maximum(place.constrained.section, 0)
     known = np.isfinite(arc)
     at = np.where(known[:, None], antennas.at_arc(arc), corrected.anchor_ecef_m)
-    information = information_of(antennas.axes_of(section), antennas.sigma_plan_m, antennas.sigma_height_m)
+    information = compute_information(antennas.get_axes(section), antennas.sigma_plan_m, antennas.sigma_height_m)
     fit = robust_fit(ranges, at, information=information, limits=config.robust_fit)
     return fit, known & ~_off_map(ranges, antennas, place, arc, config)
 
@@ -321,7 +321,7 @@ def _status(
     config: Config,
 ) -> Codes:
     """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first."""
-    redundancy, constrained, section = redundancy_of(ranges), solution.place.constrained, solution.place.section
+    redundancy, constrained, section = count_redundancy(ranges), solution.place.constrained, solution.place.section
     conditions = [
         (~np.isfinite(corrected.code_m).any(axis=1), Status.NO_OBSERVATION),
         ((ranges.n_used < config.min_satellites) | (redundancy < 0), Status.TOO_FEW_SATELLITES),

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, changed, dataclass, kernel_array
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, copy_with, dataclass, kernel_array
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,
@@ -31,7 +31,7 @@ from railfix.integrity.raim import (
 from railfix.integrity.raim.model import model_on_line
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
-from railfix.pipeline.results import RaimResult, patched
+from railfix.pipeline.results import RaimResult, patch
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.noise_scale import LastingErrorState
 from railfix.positioning.normal_equations import (
@@ -69,15 +69,15 @@ def place_on_lines(ranges: Ranges, antennas: AntennaRows, point: SinglePoint, co
     return Place(point=point, section=section, constrained=constrained)
 
 
-def solved_again(ranges: Ranges, index: SearchIndex, place: Place, epochs: Indices, config: Config) -> Place:
+def solve_again(ranges: Ranges, index: SearchIndex, place: Place, epochs: Indices, config: Config) -> Place:
     """Return positions of which those of some epochs of one antenna are solved again, from other ranges."""
     part = ranges.take(epochs)
     point = single_point(part, place.point.ecef_m[epochs], limits=config.single_point)
     solved = place_on_line(part, index, point, config)
     return Place(
-        point=patched(place.point, epochs, solved.point),
-        section=patched(place.section, epochs, solved.section),
-        constrained=patched(place.constrained, epochs, solved.constrained),
+        point=patch(place.point, epochs, solved.point),
+        section=patch(place.section, epochs, solved.section),
+        constrained=patch(place.constrained, epochs, solved.constrained),
     )
 
 
@@ -85,7 +85,7 @@ def line_model(ranges: Ranges, antennas: AntennaRows, constrained: Constrained) 
     """Return the model of positions on the line (`constrained_model`); NaN in the epochs without one."""
     section = np.maximum(constrained.section, 0)
     place = antennas.at_arc(constrained.arc_m)
-    return model_on_line(ranges, place, antennas.axes_of(section), antennas.sigma_plan_m, antennas.sigma_height_m)
+    return model_on_line(ranges, place, antennas.get_axes(section), antennas.sigma_plan_m, antennas.sigma_height_m)
 
 
 def model_again(
@@ -94,11 +94,11 @@ def model_again(
     """Return the model with that of some rising epochs made again, from other ranges and places."""
     for index, own in antennas.split(epochs):
         arc, section = constrained.arc_m[own], np.maximum(constrained.section[own], 0)
-        model = model.patched(own, constrained_model(ranges.take(own), index.trajectory, arc, section=section))
+        model = model.patch(own, constrained_model(ranges.take(own), index.trajectory, arc, section=section))
     return model
 
 
-def redundancy_of(ranges: Ranges) -> Integers:
+def count_redundancy(ranges: Ranges) -> Integers:
     """Return the number of ranges beyond the clocks and the distance along the line, shape (T,)."""
     return np.asarray(ranges.n_used - ranges.n_clocks - 1, dtype=np.int64)
 
@@ -162,7 +162,7 @@ def fault_free(
     positions; `scale`: noise scale of the receiver, shape (T,). Without "raim" among the screens nothing is tested.
     """
     limits, constrained = config.raim, place.constrained
-    test = detect(constrained.wsse, constrained.residual_m, redundancy_of(ranges), limits=limits, scale=scale)
+    test = detect(constrained.wsse, constrained.residual_m, count_redundancy(ranges), limits=limits, scale=scale)
     on = "raim" in config.screens
     raim = RaimResult(
         outcome=np.where(test.testable & on, int(Outcome.PASSED), int(Outcome.UNTESTABLE)).astype(np.int8),
@@ -184,10 +184,10 @@ def fault_free(
         return ranges, place, raim
     ranges = without(ranges, raim.excluded)
     for index, epochs in antennas.split(changed):
-        place = solved_again(ranges, index, place, epochs, config)
+        place = solve_again(ranges, index, place, epochs, config)
     # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
     recheck = detect(
-        place.constrained.wsse[changed], place.constrained.residual_m[changed], redundancy_of(ranges)[changed],
+        place.constrained.wsse[changed], place.constrained.residual_m[changed], count_redundancy(ranges)[changed],
         limits=limits, scale=scale[changed],
     )  # fmt: skip
     raim.outcome[changed[recheck.detected]] = Outcome.UNRESOLVED
@@ -212,7 +212,7 @@ def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: I
     rejected = (ranges.weight[epochs] > 0) & ~agreeing[epochs]
     rest = without(ranges.take(epochs), rejected)
     raim.outcome[epochs], raim.own_error_m[epochs] = Outcome.UNRESOLVED, np.nan
-    raim.excluded[epochs] = rejected & (redundancy_of(rest) >= min_redundancy)[:, None]
+    raim.excluded[epochs] = rejected & (count_redundancy(rest) >= min_redundancy)[:, None]
 
 
 def _second_attempt(
@@ -281,17 +281,17 @@ def lasting_errors(
             found &= ranges.weight > 0
         if not found.any():
             continue
-        found &= (redundancy_of(without(ranges, found)) >= _LEAST_FREEDOM)[:, None]
+        found &= (count_redundancy(without(ranges, found)) >= _LEAST_FREEDOM)[:, None]
         left_out |= found
         if found.any():
             ranges = without(ranges, found)
             solved = np.flatnonzero(found.any(axis=1))
             for index, epochs in antennas.split(solved):
-                place = solved_again(ranges, index, place, epochs, config)
+                place = solve_again(ranges, index, place, epochs, config)
             model = model_again(model, ranges, antennas, place.constrained, solved)
             error = _own_errors(model, noise, limits.clipped)
     after_states = [
-        changed(state, time=when, age=age, channel=channel, sums=sums[:, k].T) if len(time[rows]) else state
+        copy_with(state, time=when, age=age, channel=channel, sums=sums[:, k].T) if len(time[rows]) else state
         for k, (rows, state, (when, age)) in enumerate(zip(antennas.parts, states, windows.last, strict=True))
     ]
     return ranges, place, model, left_out, after_states

@@ -30,7 +30,7 @@ from railfix.pipeline.result_columns import (
     by_name,
     decimals,
     float_column,
-    table_of,
+    make_table,
 )
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
     """Return one row an epoch of one antenna, also where there is no position: `POSITION_COLUMNS`."""
-    return table_of(POSITION_COLUMNS, result, len(result.time), antenna=name)
+    return make_table(POSITION_COLUMNS, result, len(result.time), antenna=name)
 
 
 def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
@@ -104,7 +104,7 @@ def observations_table(result: Result) -> pl.DataFrame:
     return in_time_order(parts)
 
 
-def rounded(table: pl.DataFrame) -> pl.DataFrame:
+def round_floats(table: pl.DataFrame) -> pl.DataFrame:
     """Return a table with its floats rounded to what CSV files get: 0.1 mm, 1e-9 deg."""
     floats = [name for name, kind in table.schema.items() if kind == pl.Float64]
     return table.with_columns(pl.col(name).round(decimals(name)) for name in floats)
@@ -367,18 +367,18 @@ def with_smoothed(table: pl.DataFrame, smoothed: Mapping[str, pl.DataFrame]) -> 
 
 def smoothed_table(result: SmoothedTrack, trajectory: Trajectory) -> pl.DataFrame:
     """Return `SMOOTHED_COLUMNS` of one antenna, one row per epoch."""
-    return table_of(SMOOTHED_COLUMNS, SmoothedAntenna(result, trajectory), len(result.time))
+    return make_table(SMOOTHED_COLUMNS, SmoothedAntenna(result, trajectory), len(result.time))
 
 
 def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
     """Return the filtered positions of one antenna, one row per epoch."""
-    return table_of(TRAIN_COLUMNS, result, len(result), antenna=name)
+    return make_table(TRAIN_COLUMNS, result, len(result), antenna=name)
 
 
 _TIME: Final = pl.Datetime("ns")
 
 
-def _of(name: str) -> Any:
+def _get_field(name: str) -> Any:
     """Return a getter of one field of all passings."""
     return lambda passings: np.array([getattr(passing, name) for passing in passings])
 
@@ -386,36 +386,36 @@ def _of(name: str) -> Any:
 #: Columns of the table of passings.
 PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
     (
-        Column("time_gpst", "when the place was passed, by the filter; or a reading that is wrong", _of("time"),
+        Column("time_gpst", "when the place was passed, by the filter; or a reading that is wrong", _get_field("time"),
                dtype=_TIME),
         Column("earliest_gpst", "begin of the interval of the passing, by the level: before, the train was not there",
-               _of("earliest"), dtype=_TIME),
-        Column("latest_gpst", "its end", _of("latest"), dtype=_TIME),
+               _get_field("earliest"), dtype=_TIME),
+        Column("latest_gpst", "its end", _get_field("latest"), dtype=_TIME),
         EPOCH[1],
-        Column("balise", "name in the list, or as read", _of("balise"), dtype=pl.String()),
+        Column("balise", "name in the list, or as read", _get_field("balise"), dtype=pl.String()),
         Column(
             "verdict",
             "`virtual`: no balise; `read`, `missing`: passed with and without a reading; `contradicts`: read where the "
             "filter excludes it; `not_listed`",
-            _of("verdict"), words=VERDICTS,
+            _get_field("verdict"), words=VERDICTS,
         ),
-        Column("chainage_m", "as listed", _of("chainage_m")),
-        Column("read_gpst", "time of the reading", _of("read"), dtype=_TIME),
+        Column("chainage_m", "as listed", _get_field("chainage_m")),
+        Column("read_gpst", "time of the reading", _get_field("read"), dtype=_TIME),
         Column("read_error_m", "of a reading that contradicts: listed place less that of the filter",
-               _of("read_error_m")),
-        Column("speed_mps", "at the passing, + toward rising chainage", _of("speed_mps")),
-        Column("protection_level_m", "of the place at the passing", _of("level_m")),
+               _get_field("read_error_m")),
+        Column("speed_mps", "at the passing, + toward rising chainage", _get_field("speed_mps")),
+        Column("protection_level_m", "of the place at the passing", _get_field("level_m")),
         Column("doubt_over_m", "how far the train may be behind the place: `L_DOUBTOVER` less `Q_LOCACC`",
-               _of("amount_m")),
-        Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _of("amount_m")),
+               _get_field("amount_m")),
+        Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _get_field("amount_m")),
         Column("odometer_m", "for comparison: 5 m and 5 % of the way since the last balise read (SUBSET-041)",
-               _of("odometer_m")),
+               _get_field("odometer_m")),
     )
 )  # fmt: skip
 
 
 def passing_table(result: Result) -> pl.DataFrame:
     """Return the passings of a chunk, with `PASSING_COLUMNS`."""
-    parts = [table_of(PASSING_COLUMNS, own.passings, len(own.passings), antenna=name)
+    parts = [make_table(PASSING_COLUMNS, own.passings, len(own.passings), antenna=name)
              for name, own in result.fusion.items()]  # fmt: skip
-    return pl.concat(parts).sort("time_gpst", maintain_order=True) if parts else table_of(PASSING_COLUMNS, (), 0)
+    return pl.concat(parts).sort("time_gpst", maintain_order=True) if parts else make_table(PASSING_COLUMNS, (), 0)

@@ -30,7 +30,7 @@ class OnDemand:
     """Base of dataclasses with fields that are computed when they are first asked for: most are not, epoch by epoch."""
 
     @classmethod
-    def made(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
+    def create(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
         """Return an instance with some fields; `later` returns another by its name, and those made with it."""
         return cast(Value, _make(cls, {**members, "_later": later}))
 
@@ -76,14 +76,14 @@ class AntennaRows:
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
         """Return the same, joined."""
-        return joined(self.apart(function, *of_antennas))
+        return join_rows(self.apart(function, *of_antennas))
 
     def each_with_state(
         self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
     ) -> tuple[Value, list[State]]:
         """Return the joined first results of a function for each antenna, and a list of its second ones."""
         found = self.apart(function, *of_antennas)
-        return joined([rows for rows, _ in found]), [state for _, state in found]
+        return join_rows([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
         """Yield the search index and the rows of each antenna that has any of some rising ones."""
@@ -105,11 +105,11 @@ class AntennaRows:
 
     def at_arc(self, arc_m: Floats) -> Floats:
         """Points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
-        return self._interpolated(arc_m, _lines(self.indices).ecef_m)
+        return self._interpolate(arc_m, _lines(self.indices).ecef_m)
 
     def chainage_at(self, arc_m: Floats) -> Floats:
         """Chainages at arc lengths, shape (T,) [m]; NaN for NaN."""
-        return self._interpolated(arc_m, _lines(self.indices).chainage_m)
+        return self._interpolate(arc_m, _lines(self.indices).chainage_m)
 
     def segment_at(self, arc_m: Floats) -> Indices:
         """Section of each arc length on its line, shape (T,), as `Trajectory.segment_at`."""
@@ -120,11 +120,11 @@ class AntennaRows:
             section[rows] = np.minimum(np.maximum(found, 0), len(of_line) - 2)
         return section
 
-    def axes_of(self, section: Indices) -> Floats:
+    def get_axes(self, section: Indices) -> Floats:
         """Unit vectors along, across and up at sections of the lines, shape (T, 3, 3)."""
         return np.asarray(_lines(self.indices).axes[section + self._first])
 
-    def _interpolated(self, arc_m: Floats, values: Floats) -> Floats:
+    def _interpolate(self, arc_m: Floats, values: Floats) -> Floats:
         """Interpolate values of the points of all lines at arc lengths."""
         lines = _lines(self.indices)
         return between_points(arc_m, lines.arc_m, lines.length_m, values, self.segment_at(arc_m) + self._first)
@@ -150,7 +150,7 @@ def _lines(indices: tuple[SearchIndex, ...]) -> _Lines:
     length, axes = np.full(points[-1], np.nan), np.full((points[-1], 3, 3), np.nan)
     for line, first in zip(lines, points[:-1].tolist(), strict=True):
         own = slice(first, first + len(line) - 1)
-        length[own], axes[own] = line.length_m, line.axes_of(np.arange(len(line) - 1))
+        length[own], axes[own] = line.length_m, line.get_axes(np.arange(len(line) - 1))
     arc, ecef, chainage = (
         np.concatenate([getattr(line, n) for line in lines]) for n in ("arc_m", "ecef_m", "chainage_m")
     )
@@ -164,7 +164,7 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         return first, (EVERY,)
     ends = [0, *accumulate(map(len, observations))]
     same = all(_has_same_channels(first, other) for other in others)
-    stacked = joined(observations) if same else stack_parts(observations)
+    stacked = join_rows(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
 
 
@@ -189,7 +189,7 @@ def _defaults(kind: Any) -> tuple[str, ...]:
     return tuple(name for name in _members(kind) if hasattr(kind, name))
 
 
-def joined(values: Sequence[Value]) -> Value:
+def join_rows(values: Sequence[Value]) -> Value:
     """Join arrays row after row, or those of dataclasses or of tuples; what is neither is that of the first."""
     first: Any = values[0]
     if len(values) == 1:
@@ -211,12 +211,12 @@ def _join(values: Sequence[Any]) -> Any:
     )
 
 
-def rows_of(value: Value, rows: slice | Indices) -> Value:
+def take_rows(value: Value, rows: slice | Indices) -> Value:
     """Return some rows of an array, or of the arrays of a dataclass and of those within it."""
-    return value if rows is EVERY else cast(Value, _rows_of(value, rows))
+    return value if rows is EVERY else cast(Value, _take_rows(value, rows))
 
 
-def _rows_of(value: Any, rows: slice | Indices) -> Any:
+def _take_rows(value: Any, rows: slice | Indices) -> Any:
     if value.__class__ is np.ndarray:
         return value[rows]
     if not (has_rows := _members(value.__class__)):
@@ -227,14 +227,14 @@ def _rows_of(value: Any, rows: slice | Indices) -> Any:
             if item.__class__ is np.ndarray and has_rows[name]:
                 members[name] = item[rows]
         for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field is to be taken
-            members[name] = _rows_of(own[name], rows)
-        return value.made(
-            lambda n: {n: _rows_of(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
+            members[name] = _take_rows(own[name], rows)
+        return value.create(
+            lambda n: {n: _take_rows(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
         )
     for name, of_rows in has_rows.items():
         item = own[name]
         if of_rows and item is not None:
-            item = item[rows] if item.__class__ is np.ndarray else _rows_of(item, rows)
+            item = item[rows] if item.__class__ is np.ndarray else _take_rows(item, rows)
         members[name] = item
     return _make(type(value), members)
 

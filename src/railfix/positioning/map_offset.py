@@ -140,7 +140,7 @@ def map_offset(
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
     arc = np.where(usable, arc_m, 0.0)
-    axes, place = antennas.axes_of(antennas.segment_at(arc))[:, 1:], antennas.at_arc(arc)
+    axes, place = antennas.get_axes(antennas.segment_at(arc))[:, 1:], antennas.at_arc(arc)
     at = np.where(usable[:, None], point.ecef_m, place)
     covariance = np.where(usable[:, None, None], point.covariance_m2, np.eye(3))
     terms = terms_of_epochs(

@@ -83,10 +83,10 @@ class RobustFit:
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
     """Inverse covariance of the place across and above sections of the line, shape (T, 3, 3) [1/m^2] in ECEF."""
-    return information_of(trajectory.axes_of(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
+    return compute_information(trajectory.get_axes(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 
-def information_of(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
+def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
     """Return the same by the axes of the line there, shape (T, 3, 3), and the sigmas of its map."""
     across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
@@ -107,7 +107,7 @@ def robust_fit(
         nothing = np.zeros(len(ranges), dtype=np.int64)
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
     freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
-    kept, wsse, solved = kernels.robust.reweighted(
+    kept, wsse, solved = kernels.robust.reweight_ranges(
         ranges.arrays, kernel_array(place_ecef_m),
         kernel_array(np.empty((0, 3, 3)) if information is None else information),
         np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN, limits.keep, limits.reject,

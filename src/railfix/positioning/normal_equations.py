@@ -243,12 +243,12 @@ def _on_line(
 def _from(
     vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """`iterated_along` of a trajectory, from points of it."""
+    """`iterate_along` of a trajectory, from points of it."""
     line = SectionArrays(
         trajectory.ecef_m[:-1], trajectory.tangent, trajectory.across, trajectory.up, trajectory.length_m,
         trajectory.sigma_plan_m, trajectory.sigma_height_m,
     )  # fmt: skip
-    return kernels.ranges.iterated_along(ranges.arrays, line, vertex, limits.tolerance_m, limits.max_iterations)
+    return kernels.ranges.iterate_along(ranges.arrays, line, vertex, limits.tolerance_m, limits.max_iterations)
 
 
 class SectionArrays(NamedTuple):
@@ -293,7 +293,7 @@ class SinglePoint:
 def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLimits | None = None) -> SinglePoint:
     """Compute single-point positions of all epochs at once, from starts (T, 3) [m] within a few thousand kilometres."""
     limits = limits or SinglePointLimits()
-    place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterated_points(
+    place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterate_points(
         ranges.arrays, kernel_array(start_ecef_m), np.asarray(ranges.n_used - ranges.n_clocks >= 3),
         limits.tolerance_m, limits.max_iterations,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Datetimes, Floats, dataclass
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.core.geodesy import angles_of, enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import compute_angles, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 
 _RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of its tables [deg].
@@ -157,7 +157,7 @@ class SeenFrom:
     def of(cls, receiver_ecef_m: Floats, satellite_ecef_m: Floats) -> SeenFrom:
         """Directions and geodetic coordinates from Earth-fixed positions."""
         latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
-        elevation, azimuth = angles_of(satellite_ecef_m - receiver_ecef_m[:, None], enu_axes(latitude, longitude))
+        elevation, azimuth = compute_angles(satellite_ecef_m - receiver_ecef_m[:, None], enu_axes(latitude, longitude))
         return cls(
             receiver_ecef_m=receiver_ecef_m,
             latitude_deg=latitude,

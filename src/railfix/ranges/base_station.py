@@ -63,7 +63,7 @@ class BaseErrors:
     def __len__(self) -> int:
         return len(self.time)
 
-    def joined(self, later: BaseErrors) -> BaseErrors:
+    def merge(self, later: BaseErrors) -> BaseErrors:
         """Return these errors and later ones, with the channels of both."""
         parts = (self, later)
         keys = sorted({key for part in parts for key in part.keys})
@@ -82,7 +82,7 @@ class BaseErrors:
         """Satellite and signal of each channel."""
         return list(zip(self.satellite.tolist(), self.signal.tolist(), strict=True))
 
-    def kept_from(self, time: np.datetime64) -> BaseErrors:
+    def drop_before(self, time: np.datetime64) -> BaseErrors:
         """Return the errors of epochs from `time` on, and of channels that have any."""
         rows = self.time >= time
         seen = np.isfinite(self.code_m[rows]).any(axis=0)

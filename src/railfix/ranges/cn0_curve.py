@@ -157,20 +157,20 @@ class Cn0Curve:
     def _by_key(self) -> dict[tuple[str, str], Cn0Mean]:
         return {(mean.kind, mean.signal): mean for mean in self.means}
 
-    def _of(self, satellite: Strings, signal: Strings) -> list[Cn0Mean | None]:
+    def _find(self, satellite: Strings, signal: Strings) -> list[Cn0Mean | None]:
         pairs = zip(satellite.tolist(), signal.tolist(), strict=True)
         return [self._by_key.get((satellite_kind(name), code)) for name, code in pairs]
 
     def covers(self, satellite: Strings, signal: Strings) -> Masks:
         """Whether there is a curve for each channel, shape (M,)."""
-        return np.array([mean is not None for mean in self._of(satellite, signal)], dtype=bool)
+        return np.array([mean is not None for mean in self._find(satellite, signal)], dtype=bool)
 
     def mean_dbhz(self, elevation_deg: ArrayLike, *, satellite: Strings, signal: Strings) -> Floats:
         """Mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where there is no curve."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         result = np.full(elevation.shape, np.nan)
         columns: dict[tuple[str, str], list[int]] = defaultdict(list)
-        for m, mean in enumerate(self._of(satellite, signal)):
+        for m, mean in enumerate(self._find(satellite, signal)):
             if mean is not None:
                 columns[mean.kind, mean.signal].append(m)
         for key, at in columns.items():

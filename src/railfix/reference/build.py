@@ -21,7 +21,7 @@ from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import Acceleration, Pulses
-from railfix.motion.tachometer import Wheel, wheel_of
+from railfix.motion.tachometer import Wheel, estimate_wheel
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.fixes import Fixes, ReferenceSettings, judge_alone, judge_pair, judge_place, judge_travel
 from railfix.reference.smoother import (
@@ -140,7 +140,7 @@ class _ReferenceBuilder:
         wheel = None
         if (pulses := self.data.pulses) is not None:
             _check_time(pulses.path, pulses.time, fixes.time[good])
-            wheel = wheel_of(pulses, self.settings.pulse_m, fixes.time[good], fixes.arc_m[good])
+            wheel = estimate_wheel(pulses, self.settings.pulse_m, fixes.time[good], fixes.arc_m[good])
         if self.data.acceleration is not None:
             _check_time(self.data.acceleration.path, self.data.acceleration.time, fixes.time[good])
         judged, (settings, _) = fixes, self._calibrate(speeds, wheel, fixes)
@@ -210,13 +210,13 @@ class _ReferenceBuilder:
             settings = settings.replaced(doppler_bias_mps=lasting_error_mps(misclosures, settings))
             sources["doppler"] = {
                 "lasting_error_mps": settings.doppler_bias_mps,
-                "lasting_error_from": _source_of(misclosures),
+                "lasting_error_from": _name_source(misclosures),
             }
         if wheel is not None:
             way = wheel.distance_m(fixes.time[good], self._hint(fixes.time[good], joined, fixes))
             misclosures = self._closings(fixes, way, np.full(len(way), 0.0), reading_m=wheel.reading_sigma_m)
             settings = settings.replaced(slip_m=slip_m(misclosures, settings))
-            sources["pulses"] = {"slip_m": settings.slip_m, "slip_from": _source_of(misclosures)}
+            sources["pulses"] = {"slip_m": settings.slip_m, "slip_from": _name_source(misclosures)}
         return settings, sources
 
     def _closings(self, fixes: Fixes, way: Floats, variance: Floats, *, reading_m: float = 0.0) -> Closings:
@@ -368,7 +368,7 @@ class _ReferenceBuilder:
         return facts
 
 
-def _source_of(misclosures: Closings) -> str:
+def _name_source(misclosures: Closings) -> str:
     return f"{len(misclosures)} windows between fixes" if len(misclosures) >= WINDOWS else "settings"
 
 

@@ -17,7 +17,7 @@ from railfix.core.settings import Settings, option
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.positioning.doppler_speed import DopplerSpeedLimits
-from railfix.track.trajectory import Trajectory, passes_of
+from railfix.track.trajectory import Trajectory, find_segments_near
 
 
 def _positive(default: float) -> Any:
@@ -224,7 +224,7 @@ def match(
     offset = ecef_m - trajectory.at_arc(nearest)
     arc = np.full(count, np.nan)
     lateral, height = _beside(offset, trajectory, section)
-    passes = passes_of(ecef_m, trajectory, float(np.hypot(lateral_m, height_m)))
+    passes = find_segments_near(ecef_m, trajectory, float(np.hypot(lateral_m, height_m)))
     beside, above = _beside(passes.offset_m, trajectory, passes.segment)
     # beyond the ends of the line there is nothing to be on
     beyond = np.abs(passes.along_m - passes.foot_m) > 0.5

@@ -17,7 +17,7 @@ from railfix.core.errors import RailfixError
 from railfix.core.files import write_whole
 from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
-from railfix.evaluate.inputs import POSITIONS_TABLE, floats, read_table, tables_of
+from railfix.evaluate.inputs import POSITIONS_TABLE, floats, list_position_tables, read_table
 from railfix.report.charts_page import Block, Notes, Sentence, charts_page
 from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
@@ -99,7 +99,7 @@ def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Pa
 
 def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Rows of the filter, or of single epochs without one, with their errors where there is a reference."""
-    name = next((table for table in tables_of(folder) if table != POSITIONS_TABLE), POSITIONS_TABLE)
+    name = next((table for table in list_position_tables(folder) if table != POSITIONS_TABLE), POSITIONS_TABLE)
     table = read_table(folder, name, columns=cs.by_name("protection_level_m", require_all=False))[1]
     table = table.with_columns(pl.col("antenna", "status").cast(pl.String))
     if reference is None:

@@ -15,11 +15,11 @@ from railfix.core.tables import Table, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.evaluate.inputs import floats
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name, positions_diagram
-from railfix.evaluate.tables import evaluation_of, level_tables
+from railfix.evaluate.tables import level_tables, select_evaluation
 from railfix.pipeline.level_stage import prior_basis_text
 from railfix.report.charts_page import Absent, Block
 from railfix.report.plots.campaign import processing_time
-from railfix.report.plots.chart import Chart, SkyEpochs, start_of
+from railfix.report.plots.chart import Chart, SkyEpochs, find_start
 from railfix.report.plots.errors import (
     error_over_chainage,
     error_over_time,
@@ -29,7 +29,7 @@ from railfix.report.plots.errors import (
     stanford,
 )
 from railfix.report.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
-from railfix.report.plots.screens import missing_columns, screen_over_chainage, screen_over_time, screens_of
+from railfix.report.plots.screens import list_screens, missing_columns, screen_over_chainage, screen_over_time
 from railfix.report.plots.signals import CN0_COLUMNS, SKY_COLUMNS, SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.report.runs import ReportedRun
 
@@ -55,7 +55,7 @@ def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
         return [_assumptions(run, kind), _availability(run)]
     tables: list[Block] = [_assumptions(run, kind)]
     for name, of in ((run.name_in(evaluation), ""), (run.name_in(evaluation, "train"), "filter-")):
-        found = level_tables(evaluation_of(evaluation, name), worst=WORST) if name else []
+        found = level_tables(select_evaluation(evaluation, name), worst=WORST) if name else []
         tables += [replace(table, name=f"{of}{table.name}") for table in found]
     return tables
 
@@ -112,7 +112,7 @@ def _availability(run: ReportedRun) -> Table:
 
 def _rows_available(run: ReportedRun, limits: Sequence[float], options: EvaluationOptions) -> Iterator[list[str]]:
     for antenna in run.folder.antennas:
-        positions = run.positions_of(antenna)
+        positions = run.get_positions(antenna)
         level = floats(positions, "protection_level_m")
         finite = level[np.isfinite(level)]
         middle = np.percentile(finite, [50.0, 95.0]) if len(finite) else np.full(2, np.nan)
@@ -156,25 +156,25 @@ class Group:
 
 def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:
     """Plan of the line and errors over chainage of one antenna, or protection levels without a reference."""
-    positions, errors = run.positions_of(antenna), run.errors_of(antenna)
+    positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     if errors is not None:
         beside = error_over_chainage(errors, filtered=run.filter_rows(antenna))
     else:
         beside = levels_over_chainage(positions, _alarm_limit(run))
         beside = interval_over_chainage(positions) if beside.empty else beside
     charts = _keep(_plan(run, antenna, background), beside)
-    return Group(title="", charts=charts, start=start_of(positions))
+    return Group(title="", charts=charts, start=find_start(positions))
 
 
 def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart:
     """Plan, coloured by error, by protection level without a reference, or by status without either."""
-    positions, errors = run.positions_of(antenna), run.errors_of(antenna)
+    positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     level = floats(positions, "protection_level_m")
     return plan(
         positions,
         error_m=None if errors is None else _align(positions, errors),
         level_m=level if np.isfinite(level).any() else None,
-        filtered=run.train_of(antenna),
+        filtered=run.get_train(antenna),
         track=run.track,
         tunnels_m=_tunnels(errors),
         background=background,
@@ -186,13 +186,13 @@ def antenna_groups(
     run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS, background: Sequence[Floats] = ()
 ) -> Iterator[Group]:
     """Charts of one antenna of a run; `sky`: most epochs of the sky plot, `background`: lines below the plan [deg]."""
-    positions, errors = run.positions_of(antenna), run.errors_of(antenna)
-    start = start_of(positions)
+    positions, errors = run.get_positions(antenna), run.get_errors(antenna)
+    start = find_start(positions)
     yield Group(title="The line", charts=_keep(_plan(run, antenna, background)), start=start)
     if errors is not None:
         filtered = run.filter_rows(antenna)
         over = _keep(error_over_time(errors, filtered=filtered), error_over_chainage(errors, filtered=filtered))
-        yield Group(title="Errors", charts=over, start=start_of(errors))
+        yield Group(title="Errors", charts=over, start=find_start(errors))
     else:
         yield Group(title="Errors", charts=(), start=start, absent=(NO_REFERENCE,))
     limit = _alarm_limit(run)
@@ -234,7 +234,7 @@ def _screens(
         reason = f"The tables lack {', '.join(missing)}, so there are no charts of the screens; run again."
         return Group(title="Screens", charts=(), start=start, absent=(reason,))
     charts: list[Chart] = []
-    for screen in screens_of(run.config, positions, observations):
+    for screen in list_screens(run.config, positions, observations):
         charts.append(screen_over_time(screen.picture, screen.epoch_time, epoch=screen.epoch))
         charts.append(screen_over_chainage(screen.picture, screen.epoch_chainage_m, epoch=screen.epoch))
     absent = () if charts else (f"No active screen of the {antenna} antenna tested anything.",)
@@ -244,7 +244,7 @@ def _screens(
 def run_group(run: ReportedRun) -> Group:
     """Charts of all antennas of a run together."""
     chunks = run.record.get("chunks") or {}
-    start = start_of(run.folder.positions)
+    start = find_start(run.folder.positions)
     if not all(chunks.get(name) for name in ("first_epoch_gpst", "epochs", "positioning_s")):
         return Group(title="Processing time", charts=(), start=start, absent=(NO_TIMES,))
     try:

@@ -14,7 +14,7 @@ from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED
 from railfix.evaluate.inputs import floats
-from railfix.report.runs import ReportedRun, figures_of
+from railfix.report.runs import ReportedRun, get_figures
 from railfix.run.record import level_basis
 
 
@@ -40,7 +40,7 @@ class Headline:
 
 def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> Headline:
     """Verdict and key figures of one antenna, against the reference where there is one."""
-    errors = run.errors_of(antenna)
+    errors = run.get_errors(antenna)
     if evaluation is not None and errors is not None:
         compared = _compare(errors)
         if len(compared.on_map_m):
@@ -115,7 +115,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
     rates = share(compared.rate, 1), share(compared.conventional_rate, 1)
     of_filter = f"{share(filtered['rate'], 1)} of all" if filtered else ""
     figures.append(KeyFigure(name="epochs with a position", value=rates[0], filtered=of_filter, beside=rates[1]))
-    own = figures_of(evaluation, run, antenna, "constrained_ok")
+    own = get_figures(evaluation, run, antenna, "constrained_ok")
     return Headline(
         verdict=verdict,
         figures=(
@@ -222,7 +222,7 @@ def _describe_marked(compared: _Compared) -> list[str]:
 
 def _without_errors(run: ReportedRun, antenna: str) -> Headline:
     facts: Mapping[str, Any] = (run.record.get("antennas") or {}).get(antenna) or {}
-    positions = run.positions_of(antenna)
+    positions = run.get_positions(antenna)
     observed = positions.filter("observed")
     has = np.isfinite(floats(observed, "chainage_m"))
     passed = has & observed["status"].is_in(PASSED).to_numpy()
@@ -231,7 +231,7 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
     level = floats(observed, "protection_level_m")
     level = level[np.isfinite(level)]
     rate = float(has.mean()) if len(has) else np.nan
-    train = run.train_of(antenna)
+    train = run.get_train(antenna)
     tracked = np.empty(0) if train is None else floats(train, "along_sigma_m")
     placed = tracked[np.isfinite(tracked)]
     shown, of_what = (rate, "of the epochs with satellite signals") if not len(tracked) else (

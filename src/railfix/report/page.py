@@ -15,7 +15,7 @@ from railfix.core.files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.evaluate.inputs import flat_settings
-from railfix.evaluate.tables import error_tables, evaluation_of, group_tables
+from railfix.evaluate.tables import error_tables, group_tables, select_evaluation
 from railfix.report.charts_page import (
     Absent,
     Block,
@@ -32,7 +32,7 @@ from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna
 from railfix.report.headline import headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
-from railfix.report.runs import ReportedRun, figures_of, read_runs
+from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
 
@@ -56,7 +56,7 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                 number(_plain(sigma.get("p95_m"))),
             ]
             if evaluation:
-                figures = {p: figures_of(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
+                figures = {p: get_figures(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
                 row += [number(figures["constrained"].get(k)) for k in ("mean_m", "std_m", "p95_m", "max_m")]
                 row += [number(figures["conventional"].get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
@@ -145,7 +145,7 @@ def budget(run: ReportedRun) -> list[Block]:
 
 def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
     """Figures of merit of one run, on the map beside conventional."""
-    return _with_groups(evaluation_of(evaluation, run.name_in(evaluation)))
+    return _with_groups(select_evaluation(evaluation, run.name_in(evaluation)))
 
 
 def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
@@ -153,7 +153,7 @@ def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
     name = run.name_in(evaluation, "train")
     if not name:
         return [Absent("The run has no filter along the track (railfix run --filter off).")]
-    return _with_groups(evaluation_of(evaluation, name), of="filter-")
+    return _with_groups(select_evaluation(evaluation, name), of="filter-")
 
 
 def _with_groups(evaluation: Evaluation, *, of: str = "") -> list[Block]:
@@ -249,7 +249,7 @@ def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers:
         f"{run.name}, {antenna}": errors
         for run in runs
         for antenna in run.folder.antennas
-        if (errors := run.errors_of(antenna)) is not None
+        if (errors := run.get_errors(antenna)) is not None
     }
     chart = error_ranges(series)
     return PagePart(title="", figures=() if chart.empty else (figure(chart, numbers),))

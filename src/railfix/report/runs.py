@@ -15,8 +15,8 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.tables import reading_table
 from railfix.evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.evaluate.evaluation import EvaluatedRun, short_names
-from railfix.evaluate.inputs import NO_MORE, POSITIONS_TABLE, RunFolder, read_run, read_table, tables_of
-from railfix.evaluate.place import track_of
+from railfix.evaluate.inputs import NO_MORE, POSITIONS_TABLE, RunFolder, list_position_tables, read_run, read_table
+from railfix.evaluate.place import read_run_track
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
 from railfix.screens import SCREENS
@@ -67,11 +67,11 @@ class ReportedRun:
         """``run.json``."""
         return self.folder.record
 
-    def positions_of(self, antenna: str) -> pl.DataFrame:
+    def get_positions(self, antenna: str) -> pl.DataFrame:
         """Rows of one antenna in order of time."""
         return self.folder.positions.filter(antenna=antenna)
 
-    def errors_of(self, antenna: str) -> pl.DataFrame | None:
+    def get_errors(self, antenna: str) -> pl.DataFrame | None:
         """Rows of one antenna, None without a reference."""
         return None if self.errors is None else self.errors.filter(antenna=antenna)
 
@@ -79,12 +79,12 @@ class ReportedRun:
         """Rows of the filter along the track, None without."""
         return None if self.filtered is None else self.filtered.filter(antenna=antenna)
 
-    def train_of(self, antenna: str) -> pl.DataFrame | None:
+    def get_train(self, antenna: str) -> pl.DataFrame | None:
         """Positions by the filter along the track, None without."""
         return None if self.train is None else self.train.filter(antenna=antenna)
 
 
-def figures_of(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
+def get_figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
     """Figures of merit of one antenna and kind of position; empty where there are none."""
     rows = evaluation.figures.filter(
         grouping="all", epochs_of="own", run=run.name_in(evaluation), antenna=antenna, position=position
@@ -129,7 +129,7 @@ def read_runs(
             [
                 RunAndReference(run=path, reference=reference, table=table, conventional=other)
                 for path, reference, other in zip(paths, each, beside, strict=True)
-                for table in tables_of(path) or [POSITIONS_TABLE]
+                for table in list_position_tables(path) or [POSITIONS_TABLE]
             ],
             options=options,
         )
@@ -144,7 +144,7 @@ def read_runs(
         _report(
             name,
             read_run(path, conventional=other, columns=_POSITIONS),
-            {table: evaluated[own, table] for table in tables_of(path) if (own, table) in evaluated},
+            {table: evaluated[own, table] for table in list_position_tables(path) if (own, table) in evaluated},
             other,
         )
         for name, path, own, other in zip(short_names(resolved), paths, resolved, beside, strict=True)
@@ -162,7 +162,7 @@ def _report(
     facts, errors = evaluated.get(POSITIONS_TABLE, (None, None))
     if facts is not None:
         notes += facts.notes
-    train = "train" in tables_of(folder.path)
+    train = "train" in list_position_tables(folder.path)
     return ReportedRun(
         name=name,
         folder=folder,
@@ -204,6 +204,6 @@ def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[st
 def _track(folder: RunFolder) -> tuple[Track | None, tuple[str, ...]]:
     """Track that the run used, or a note on why the line is drawn from the positions."""
     try:
-        return track_of(folder), ()
+        return read_run_track(folder), ()
     except RailfixError as error:
         return None, (f"the line is drawn where there are positions, because the track cannot be read: {error}",)

@@ -11,7 +11,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Masks
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.result_columns import Column, by_name, table_of
+from railfix.pipeline.result_columns import Column, by_name, make_table
 from railfix.run.output import OutputFolder
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs
@@ -76,7 +76,7 @@ def add_batch(checks: Mapping[str, BatchCheck], folder: OutputFolder) -> list[st
     for name, check in checks.items():
         if check:
             batch, apart, wrong = check.fit()
-            table = table_of(BATCH_COLUMNS, (batch, check.trajectory), len(batch.time))
+            table = make_table(BATCH_COLUMNS, (batch, check.trajectory), len(batch.time))
             found.append(table.with_columns(time_gpst=batch.time, antenna=pl.lit(name)))
             notes += _note(name, batch, apart, wrong, check.trajectory)
     if found:

@@ -350,14 +350,14 @@ def _place_facts(ecef_m: Floats) -> tuple[str, ...]:
     return (f"near latitude {latitude:.4f}, longitude {longitude:.4f}, height {height:.0f} m",)
 
 
-def _of(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
+def _filter(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
     return [finding for finding in findings if finding.kind == kind]
 
 
 def _problems(findings: Sequence[FileFinding]) -> list[str]:
     """Return what does not fit together, and what is missing for a run, a sentence each."""
-    problems = [f"{finding.path}: is of no kind that railfix reads" for finding in _of(findings, "unknown")]
-    logs, navigation, tracks = (_of(findings, kind) for kind in ("observations", "navigation", "track"))
+    problems = [f"{finding.path}: is of no kind that railfix reads" for finding in _filter(findings, "unknown")]
+    logs, navigation, tracks = (_filter(findings, kind) for kind in ("observations", "navigation", "track"))
     if not logs:
         problems.append("there is no log of observations: give a RINEX observation file or a receiver's log")
     if not navigation and logs:
@@ -391,7 +391,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
 
 def _command(findings: Sequence[FileFinding]) -> str:
     """Return the command of a run, blank where a file for it is missing."""
-    logs, navigation, tracks = (_of(findings, kind) for kind in ("observations", "navigation", "track"))
+    logs, navigation, tracks = (_filter(findings, kind) for kind in ("observations", "navigation", "track"))
     if not (logs and navigation and tracks) or len(logs) > 2:
         return ""
     logs = sorted(logs, key=lambda log: "rear" in log.path.name.lower())
@@ -402,5 +402,5 @@ def _command(findings: Sequence[FileFinding]) -> str:
     words += [word for finding in tracks for word in ("--track", str(finding.path))]
     options: dict[Kind, str] = {"vehicle": "--vehicle", "settings": "--config"}
     for kind, option in options.items():
-        words += [word for finding in _of(findings, kind)[:1] for word in (option, str(finding.path))]
+        words += [word for finding in _filter(findings, kind)[:1] for word in (option, str(finding.path))]
     return shlex.join([*words, "--out", "results"])

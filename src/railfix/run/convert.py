@@ -203,7 +203,7 @@ _COLUMNS: Final[dict[str, dict[str, str]]] = {
 }  # fmt: skip
 
 
-def inputs_of(folder: Path) -> dict[str, Any]:
+def find_inputs(folder: Path) -> dict[str, Any]:
     """Return the inputs of a run that the tables in a folder give, by the names of `railfix.run.inputs.RunInputs`.
 
     InputFileError: the folder has no S_GNSS_SAT, or no table of the track.

@@ -20,16 +20,16 @@ from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import level_facts, prior_basis_text, risk_of
+from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
 from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk, State
 from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
-from railfix.run.processor import BaseLog, base_log, processor_of
-from railfix.run.record import RunProvenance, figures_of, package_versions, run_record
+from railfix.run.processor import BaseLog, base_log, make_processor
+from railfix.run.record import RunProvenance, compute_figures, package_versions, run_record
 from railfix.run.sensor_checks import SensorChecks
-from railfix.run.sensors import balises_of, check_filter, read_sensors, units_of_ranges
+from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges
 from railfix.run.sources import TRACK_FILE, Log, OpenedLine, align_logs, open_line, read_ahead, without_beside
 from railfix.run.tally import Replays, ResultRows, Tally, add_smoothed, shorten_notes
 from railfix.screens import SCREENS
@@ -86,10 +86,10 @@ def run_files(
     ):
         entries, packages = inputs.entries(hashing, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
-        sensors, units = sensors_of(inputs)
-        balises = balises_of(inputs.balises, inputs.balise_list, inputs.virtual_balises, line.track, config)
+        sensors, units = read_samples_and_units(inputs)
+        balises = load_balises(inputs.balises, inputs.balise_list, inputs.virtual_balises, line.track, config)
         base = base_log(inputs.base, options)
-        processor = processor_of(
+        processor = make_processor(
             config, navigation, line.trajectories, track=line.track, units=units, balises=balises,
             base_ecef_m=None if base is None else base.ecef_m,
         )  # fmt: skip
@@ -107,7 +107,7 @@ def run_files(
         if base is not None:
             check_base(base, tally, line.trajectories)
         notes = (
-            *notes_of(line, navigation, tally, logs, causes, note_statistic=config.map_offset.note_threshold),
+            *collect_notes(line, navigation, tally, logs, causes, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
             *shorten_notes(rows.balise_notes),
@@ -116,7 +116,7 @@ def run_files(
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
         add_mate_results(folder, line.track, inputs.logs["front"][0])
-        figures = figures_of(folder, tally, config)
+        figures = compute_figures(folder, tally, config)
         wall = clock.perf_counter() - began
         made_from = RunProvenance(
             files=sources, packages=packages.result(), asked=asked or {}, config=config, options=options,
@@ -139,9 +139,9 @@ def open_inputs(
         from railfix.io.sp3 import read_sp3
 
         navigation = replace(navigation, precise=read_sp3(inputs.sp3))
-    at = time_of(navigation)
+    at = find_record_time(navigation)
 
-    def log_of(paths: tuple[Path, ...]) -> Log:
+    def open_log(paths: tuple[Path, ...]) -> Log:
         return Log(
             paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, start=options.start,
             end=options.end, date=options.logs.instant,
@@ -151,18 +151,18 @@ def open_inputs(
 
     paths = next(iter(inputs.logs.values()))
     positions = LogPositions(
-        path=str(paths[0]), parts=log_of(paths).parts, navigation=navigation, config=config, time=at,
+        path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
         reading=options.track,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
         log=positions,
     )  # fmt: skip
-    logs = {name: log_of(paths) for name, paths in inputs.logs.items()}
+    logs = {name: open_log(paths) for name, paths in inputs.logs.items()}
     return navigation, line, logs
 
 
-def time_of(navigation: Navigation) -> np.datetime64 | None:
+def find_record_time(navigation: Navigation) -> np.datetime64 | None:
     """A time within days of the records, for the epoch of reference frames."""
     clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
     if navigation.precise is not None:
@@ -170,7 +170,7 @@ def time_of(navigation: Navigation) -> np.datetime64 | None:
     return None if not len(clocks) else np.sort(clocks)[len(clocks) // 2]
 
 
-def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
+def read_samples_and_units(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
     """Read the samples of the sensors on board, and the ground units that they measured ranges to."""
     samples = read_sensors(
         tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging,
@@ -197,7 +197,7 @@ def _position(
     written: Future[None] | None = None
     chunks = read_ahead(align_logs({name: log.parts() for name, log in logs.items()}))
     began = clock.perf_counter()
-    screened = read_ahead(_screened(chunks, others, processor))
+    screened = read_ahead(_screen_chunks(chunks, others, processor))
     for solved in read_ahead(_single_epochs(screened, processor)):
         result, state = processor.along_track(solved, state)
         if rows.line.route is not None:
@@ -224,7 +224,7 @@ def _batches(logs: Iterable[Antenna], line: OpenedLine) -> dict[str, BatchCheck]
     return {name: BatchCheck(trajectory=line.trajectories[name]) for name in logs}
 
 
-def _screened(
+def _screen_chunks(
     chunks: Iterator[dict[str, Observations]],
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
@@ -235,7 +235,7 @@ def _screened(
     for chunk in chunks:
         end = max(own.time[-1] for own in chunk.values() if len(own))
         sensors, base = samples.between(after, end), None if station is None else station.until(end)
-        screened, state = processor.screened(chunk, state, sensors=sensors, base=base)
+        screened, state = processor.screen(chunk, state, sensors=sensors, base=base)
         after = end
         yield screened
 
@@ -280,7 +280,7 @@ _TRACK: Final = "is this the right track?"
 _NAMED: Final = 3
 
 
-def notes_of(
+def collect_notes(
     line: OpenedLine,
     navigation: Navigation,
     tally: Tally,
@@ -357,7 +357,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
                 f"{name}: {of_antenna.without_budget} epochs without a protection level, where more faults at a time "
                 "than can be left out, or more satellites excluded, are likelier than the risk allows (settings risk)"
             )
-    risk = risk_of(config)
+    risk = get_risk_budget(config)
     yield (
         f"protection level: {prior_basis_text(level_facts(config))} (railfix error-model measures priors; "
         "risk.local_prior, risk.side_prior and risk.priors state them)"

@@ -16,7 +16,7 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import BrokenLines, fingerprint
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.io.position_log import column_names
-from railfix.io.receiver.framing import head_of, is_receiver_log
+from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
 from railfix.run.output import Overwrite
 from railfix.track.frames import MapMotion
@@ -151,10 +151,10 @@ class RunInputs(InputFiles):
         """Inputs that a folder of tables gives, beside those that are given themselves."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
-        from railfix.run.convert import inputs_of
+        from railfix.run.convert import find_inputs
 
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
-        return {**inputs_of(Path(values["mate"])), **given}
+        return {**find_inputs(Path(values["mate"])), **given}
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -183,7 +183,7 @@ class RunInputs(InputFiles):
         """
         if config.sbas != "stream":
             return config
-        logs = tuple(path for paths in self.logs.values() for path in paths if is_receiver_log(head_of(path)))
+        logs = tuple(path for paths in self.logs.values() for path in paths if is_receiver_log(read_head(path)))
         if not logs:
             raise SettingsError("sbas = stream: RINEX logs carry no SBAS messages; name a log of them (--sbas FILE)")
         return config.replaced(sbas=logs)

@@ -19,7 +19,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.io.nmea import read_any_positions
-from railfix.io.receiver.framing import head_of, is_receiver_log
+from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
@@ -223,7 +223,7 @@ def survey_files(
                 notes += log.notes
                 runs.append(run_of_log(log, limits))
                 continue
-            own = not nav and is_receiver_log(head_of(path))
+            own = not nav and is_receiver_log(read_head(path))
             if not nav and not own:
                 message = "is a log of observations, which needs navigation files: give --nav"
                 raise InputFileError(path, f"{message}; positions are files {', '.join(POSITION_ENDINGS)}")

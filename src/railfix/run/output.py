@@ -332,7 +332,7 @@ class OutputFolder:
         """Write a table again, Parquet and CSV, some rows at a time, changed."""
         import polars as pl
 
-        from railfix.pipeline.tables import rounded
+        from railfix.pipeline.tables import round_floats
 
         file = f"{name}.parquet"
         self._csv.pop(f"{name}.csv").close()
@@ -342,7 +342,7 @@ class OutputFolder:
             for start in range(0, before.select(pl.len()).collect().item(), _ROWS):
                 table = transform(before.slice(start, _ROWS).collect())
                 self.append_parquet(file, table)
-                self.append_csv(f"{name}.csv", rounded(table))
+                self.append_csv(f"{name}.csv", round_floats(table))
 
     def scan(self, name: str) -> pl.LazyFrame:
         """Return a Parquet file that has ended."""

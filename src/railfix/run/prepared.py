@@ -124,7 +124,7 @@ class PreparedLines:
             self.notes.append(f"{self._folder}: the prepared line could not be kept ({reason}); set {VARIABLE}")
 
 
-def key_of(kind: str, *parts: object) -> str:
+def compute_key(kind: str, *parts: object) -> str:
     """Return the key of what is made of `parts`: files by their content, arrays, and anything else as text."""
     digest = hashlib.sha256(f"{kind} {__version__} {_code()}".encode())
     for part in parts:
@@ -147,7 +147,7 @@ def _code() -> list[tuple[str, int, int]]:
 def track_key(track: Track) -> str:
     """Return the key of a track as it is in memory."""
     plain, arrays = _parts(track)
-    return key_of("track", json.dumps(plain), *arrays.values(), repr(track.provenance))
+    return compute_key("track", json.dumps(plain), *arrays.values(), repr(track.provenance))
 
 
 def _parts(value: Track | Trajectory) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

@@ -42,7 +42,7 @@ def with_measured_priors(config: Config) -> Config:
     return config.replaced(risk=risk, no_level_m=config.no_level_m or rate.no_level_m)
 
 
-def processor_of(
+def make_processor(
     config: Config,
     navigation: Navigation,
     trajectories: Mapping[str, Trajectory],
@@ -85,7 +85,7 @@ def processor_of(
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 
-def place_of(text: str, option: str) -> Floats:
+def parse_position(text: str, option: str) -> Floats:
     """Return a position given as LAT,LON,HEIGHT on the command line, ECEF, shape (3,) [m]."""
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
@@ -106,7 +106,7 @@ class BaseLog:
             raise InputFileError(log.paths[0], "has no epoch in the time asked for")
         header = self._waiting.header
         self.span = self._waiting.time[0], self._waiting.time[-1]  #: Times of the epochs read so far.
-        self.ecef_m = header.approximate_ecef_m if place is None else place_of(place, "--base-place")
+        self.ecef_m = header.approximate_ecef_m if place is None else parse_position(place, "--base-place")
         if not np.linalg.norm(np.nan_to_num(self.ecef_m)) > 1e6:
             raise InputFileError(log.paths[0], "its header has no position; give that of the station (--base-place)")
 

@@ -19,7 +19,7 @@ from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_json_object, source_commit
 from railfix.core.reasons import Status
-from railfix.core.settings import Model, validated
+from railfix.core.settings import Model, validate
 from railfix.core.tables import Table, count, number, reading_table, share
 from railfix.gnss.navigation import Navigation
 from railfix.kernels import numba_version
@@ -38,7 +38,7 @@ PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka",
 NO_FIGURES: Final = {"along_sigma_m": None, "protection_level": None, "filter": None}
 
 
-def figures_of(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
+def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
     """Return percentiles of each antenna from the rows written [m]; None in place of what the run has not.
 
     Of sigma along the line; of protection levels, the finite ones, with epochs by status; of the filter, with epochs by
@@ -110,7 +110,7 @@ def run_record(
     figures: Mapping[str, Mapping[str, Any]],
     wall_s: float,
 ) -> dict[str, Any]:
-    """Return the content of ``run.json`` as plain values; `figures` are those of `figures_of`."""
+    """Return the content of ``run.json`` as plain values; `figures` are those of `compute_figures`."""
     navigation, config = made_from.navigation, made_from.config
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
@@ -202,12 +202,12 @@ class RunRecord:
         values = {
             name: tuple(self.input_paths(name)) if name in several else self.input_paths(name)[0] for name in kinds
         }
-        return self._this_version(lambda: validated(RunInputs, values, source="inputs"))
+        return self._this_version(lambda: validate(RunInputs, values, source="inputs"))
 
     @cached_property
     def options(self) -> RunOptions:
         """Options that were used."""
-        return self._this_version(lambda: validated(RunOptions, self.part("options"), source="options"))
+        return self._this_version(lambda: validate(RunOptions, self.part("options"), source="options"))
 
     def _this_version(self, read: Callable[[], Model]) -> Model:
         try:

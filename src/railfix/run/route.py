@@ -29,7 +29,7 @@ from railfix.track import Track
 from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog, match, plan_log
-from railfix.track.network_route import route_of
+from railfix.track.network_route import find_route
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
@@ -296,13 +296,13 @@ class LogPositions:
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         own = self.positions
-        positions, _ = plan_log(self.path, own.time, own.ecef_m, own.sigma_m).in_frame_of(
+        positions, _ = plan_log(self.path, own.time, own.ecef_m, own.sigma_m).transform_to(
             network, **self.reading.motion
         )
         matched = match(network, positions)
         used = np.flatnonzero(np.isfinite(matched.probability))
         positions, matched = positions.take(used), matched.take(used)
-        tracks, left_out = route_of(network, matched)
+        tracks, left_out = find_route(network, matched)
         if not tracks:
             raise MismatchError(
                 f"{self.path}: no position lies near a track of the network; is it the map of this region, and its CRS "

@@ -56,7 +56,7 @@ class PositionMotion:
     heading_rate_radps: Floats
 
 
-def motion_of(places: pl.DataFrame, trajectory: Trajectory) -> PositionMotion:
+def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMotion:
     """Compute the motion by ``time_gpst`` and ``chainage_m`` of single epochs, from cells of 4 s that have some."""
     time = places["time_gpst"].to_numpy().astype("datetime64[ns]")
     since = seconds(time - time[0])
@@ -88,7 +88,7 @@ def sign_notes(
     yield from _forces_at_rest(inertial)
     if len(places) < 2:
         return
-    motion, facing = motion_of(places, trajectory), trajectory.front_sign
+    motion, facing = compute_motion(places, trajectory), trajectory.front_sign
     time, forward = motion.time, facing * motion.speed_mps
     if len(wheel):
         directed = "the direction of its pulses is" if wheel.direction.any() else None

@@ -65,11 +65,11 @@ def read_sensors(
         if path is not None:
             table = _table(path, sensor)
             columns = {name: _column(path, table, name) for name in _names_of_columns(sensor)}
-            samples[sensor] = samples_of(sensor, _times(table), columns)
+            samples[sensor] = make_samples(sensor, _times(table), columns)
     return SensorSamples(**samples)
 
 
-def samples_of(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Samples:
+def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Samples:
     """Return samples from all columns of the table of a sensor but the time; NaN where a number is absent."""
     values = dict(columns)
     if sensor == "tachometer":
@@ -155,7 +155,7 @@ def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
     return spans
 
 
-def balises_of(
+def load_balises(
     readings: Path | str | None, places: Path | None, virtual: Path | None, track: Track, config: Config
 ) -> ListedBalises | None:
     """Read the places of the balises that the train reads, a table or a stream, and of virtual ones; None without.
@@ -227,13 +227,13 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
     if len(falling):
         raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
     if kind in _SILENT:  # a stream that was recorded has rows with the time alone (`railfix.live.stream`)
-        table = table.filter(~pl.all_horizontal(_columns_of(table, kind).is_null()))
+        table = table.filter(~pl.all_horizontal(_list_columns(table, kind).is_null()))
         if not len(table):
             raise InputFileError(path, f"has no row of the {kind} but its time; leave the file out")
     return table
 
 
-def _columns_of(table: pl.DataFrame, kind: str) -> pl.Expr:
+def _list_columns(table: pl.DataFrame, kind: str) -> pl.Expr:
     """Those that the table has beside the time."""
     return pl.col([name for name in _names_of_columns(kind) if name in table.columns])
 
@@ -258,7 +258,7 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
         raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
     if not len(table):
         raise InputFileError(path, f"has no rows; expected those of the {kind}, or leave the file out")
-    empty = table.select(pl.all_horizontal(_columns_of(table, kind).is_null())).to_series()
+    empty = table.select(pl.all_horizontal(_list_columns(table, kind).is_null())).to_series()
     return table.with_columns(
         _numbers(path, table[name], may_be_empty=empty if name == "pulse" else pl.Series([name != "chainage_m"]))
         for name in _names_of_columns(kind)

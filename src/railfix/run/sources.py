@@ -18,12 +18,12 @@ from railfix.core.files import BrokenLines
 from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import scan_observations
-from railfix.pipeline.along_track import doubted
+from railfix.pipeline.along_track import mark_doubtful
 from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import judged
+from railfix.pipeline.level_stage import apply_verdicts
 from railfix.pipeline.results import Result
 from railfix.run.inputs import OF_LOG, Antenna, TrackReading
-from railfix.run.prepared import PreparedLines, key_of, track_key
+from railfix.run.prepared import PreparedLines, compute_key, track_key
 from railfix.run.route import RouteOfLog
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
@@ -124,7 +124,7 @@ def open_line(
     gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
     """
     prepared = PreparedLines(use=reading.cache == "use")
-    key = key_of("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
+    key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
     centreline, route = None if heights == OF_LOG else prepared.track(key), None
     if centreline is None:
         centreline, route = _read_line(track, reading, heights=heights, log=log)
@@ -171,7 +171,7 @@ def _read_line(
     check_heights(segments, heights, **options)
     route = None
     if len(track) == 1 and len(segments) > 1:
-        from railfix.track.network_read import is_route, network_of
+        from railfix.track.network_read import connect_network, is_route
 
         if not is_route(segments):
             if log is None:
@@ -179,7 +179,7 @@ def _read_line(
                     f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one with "
                     "'railfix map route'"
                 )
-            route = log.route(network_of(segments, track))
+            route = log.route(connect_network(segments, track))
             segments = [route.network.tracks[k] for k in route.tracks]
     if heights == OF_LOG and log is None:
         raise SettingsError("--heights log: heights of the log itself are for railfix run; give a file here")
@@ -206,7 +206,7 @@ def _paths(
     of_track = track_key(track)
     paths: dict[str, Trajectory] = {}
     for name in antennas:
-        key = key_of("path", of_track, body.model_dump_json(), name, reading.reference)
+        key = compute_key("path", of_track, body.model_dump_json(), name, reading.reference)
         path = prepared.path(key)
         if path is None:
             path = antenna_trajectory(track, body, name, reference=reading.reference)
@@ -315,11 +315,11 @@ def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
         if protection is not None:
             has = np.isfinite(single.chainage_m)
             level = replace(protection.level, level_m=np.where(beside & has, np.inf, protection.level.level_m))
-            protection = judged(replace(protection, level=level), status, has, single.chainage_m, config)
+            protection = apply_verdicts(replace(protection, level=level), status, has, single.chainage_m, config)
         antennas[name] = replace(single, status=status, protection=protection)
     for name, filtered in fusion.items():
         tracked = filtered.tracked
         beside = route.is_uncertain(tracked.time, filtered.chainage_m, risk=config.track_risk)
         beside &= is_bounded(tracked.status)
-        fusion[name] = replace(filtered, tracked=doubted(tracked, beside, TrackStatus.MAP_OFFSET))
+        fusion[name] = replace(filtered, tracked=mark_doubtful(tracked, beside, TrackStatus.MAP_OFFSET))
     return replace(result, antennas=antennas, fusion=fusion)

@@ -26,7 +26,7 @@ from railfix.pipeline.tables import (
     observations_table,
     passing_table,
     positions_table,
-    rounded,
+    round_floats,
     smoothed_table,
     train_table,
     with_smoothed,
@@ -342,7 +342,7 @@ class ResultRows:
         for name, table in tables.items():
             self.folder.append_parquet(f"{name}.parquet", table)
             if name != "observations":
-                self.folder.append_csv(f"{name}.csv", rounded(table))
+                self.folder.append_csv(f"{name}.csv", round_floats(table))
 
     def compare_batches(self) -> list[str]:
         """Compare the filter with the batches after the last chunk; return a note an antenna."""

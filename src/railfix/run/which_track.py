@@ -27,7 +27,7 @@ from railfix.io.logs import read_navigation
 from railfix.pipeline.config import Config
 from railfix.positioning.which_track import NONE, StandstillErrors, TrackPosterior, YardTrack, track_posterior
 from railfix.run.inputs import InputFiles, LogReading, TrackReading, input_option
-from railfix.run.processor import place_of
+from railfix.run.processor import parse_position
 from railfix.run.sources import Log
 from railfix.run.standstill import StandstillCodes, standstill_codes
 from railfix.track.frames import in_map_frame
@@ -105,7 +105,7 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     weights = {}
     for pair in text.split(","):
         name, equals, value = pair.rpartition("=")
-        number = network.index_of(name.strip()) if equals else -1
+        number = network.find_index(name.strip()) if equals else -1
         try:
             weight = float(value)
         except ValueError:
@@ -268,7 +268,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     navigation = read_navigation(inputs.nav, date=options.logs.instant)
     base = None
     if options.base_place is not None:
-        base = _observations(inputs.base, options), place_of(options.base_place, "--base-place")
+        base = _observations(inputs.base, options), parse_position(options.base_place, "--base-place")
     codes: list[StandstillCodes] = []
     for paths in (inputs.front, inputs.rear):
         if paths:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Strings, changed, dataclass, medians
+from railfix.core.arrays import Floats, Strings, copy_with, dataclass, medians
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -245,7 +245,7 @@ def antenna_pair_screen(
         clocks=CLOCKS[limits.clocks], zone=zone,
     )  # fmt: skip
     if screened.reject.any():
-        screened = changed(screened, reject=screened.reject & (np.abs(metric) > screened.ambiguity_m))
+        screened = copy_with(screened, reject=screened.reject & (np.abs(metric) > screened.ambiguity_m))
     return screened
 
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Strings, changed, dataclass, freeze_arrays, medians, read_only
+from railfix.core.arrays import Datetimes, Floats, Strings, copy_with, dataclass, freeze_arrays, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
@@ -240,7 +240,7 @@ def doppler_screen(
     reject, level, since = kernels.screens.suspicions(
         when.astype(np.int64), metric, limit, before.level_m, before.since.astype(np.int64), int(limits.hold_s * _NS)
     )
-    after = changed(
+    after = copy_with(
         before, time=when[-1], satellite=satellite, signal=signal, code_m=read_only(code[-1].copy()),
         doppler_hz=read_only(doppler[-1].copy()), code_sigma_m=read_only(sigma[-1].copy()),
         level_m=read_only(level[-1].copy()), since=read_only(since.astype("datetime64[ns]")),

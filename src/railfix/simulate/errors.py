@@ -129,15 +129,15 @@ class RandomFunction:
     @classmethod
     def smooth(cls, rng: np.random.Generator, *, sigma: float, correlation: float) -> Self:
         """Function with the correlation exp(-d^2 / (2 correlation^2))."""
-        return cls._of(rng, sigma, rng.normal(0.0, 1.0 / correlation, _COSINES))
+        return cls._draw(rng, sigma, rng.normal(0.0, 1.0 / correlation, _COSINES))
 
     @classmethod
     def periodic(cls, rng: np.random.Generator, *, sigma: float, period: float) -> Self:
         """Oscillation about one period, with a relative bandwidth of 15 percent."""
-        return cls._of(rng, sigma, 2.0 * np.pi / period * (1.0 + 0.15 * rng.normal(0.0, 1.0, _COSINES)))
+        return cls._draw(rng, sigma, 2.0 * np.pi / period * (1.0 + 0.15 * rng.normal(0.0, 1.0, _COSINES)))
 
     @classmethod
-    def _of(cls, rng: np.random.Generator, sigma: float, frequency: Floats) -> Self:
+    def _draw(cls, rng: np.random.Generator, sigma: float, frequency: Floats) -> Self:
         phase = rng.uniform(0.0, 2.0 * np.pi, _COSINES)
         return cls(amplitude=sigma * float(np.sqrt(2.0 / _COSINES)), frequency=frequency, phase=phase)
 

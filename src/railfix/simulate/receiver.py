@@ -203,7 +203,7 @@ _WITH_L5: Final = {"G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q"), "C":
 _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
-def signals_of(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
+def list_signals(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
     """Signals that a receiver observes of a constellation."""
     return (_WITH_L5 if settings.has_l5 else SIGNALS)[letter][: settings.signals_per_satellite]
 
@@ -229,7 +229,7 @@ class Receiver:
         self.wavelength_m = SPEED_OF_LIGHT / frequency
         #: Ionospheric delay relative to that on L1.
         self.scale = (FREQUENCY_L1 / frequency) ** 2
-        self.second = np.array([g != signals_of(n[0], scenario.receiver)[0] for n, g in channels])
+        self.second = np.array([g != list_signals(n[0], scenario.receiver)[0] for n, g in channels])
         self.group_delay_error_m = common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
         offsets = [errors.intersystem.get(name[0], InterSystemSettings()) for name, _ in channels]
         self.offset_m = np.array([o.offset_m + (o.rear_difference_m if antenna == "rear" else 0.0) for o in offsets])

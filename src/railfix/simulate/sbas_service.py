@@ -150,7 +150,7 @@ class Service:
         names = {str(name) for name in simulation.navigation.kepler.satellite}
         # All of the mask, not only what the train sees; each satellite's errors are its own, so they are the same.
         self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
-        self._errors, self._start = simulation.errors_of(self.satellites), scenario.start
+        self._errors, self._start = simulation.compute_errors(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))
         self._rng = {key: np.random.default_rng([scenario.seed, key]) for key in (CLOCK, _ORBIT, _DELAY)}
         self._last_s = scenario.duration_s

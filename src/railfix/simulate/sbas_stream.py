@@ -16,7 +16,7 @@ from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, SLOT_OF
 from railfix.ranges.sbas.messages import PREAMBLES, message_type
-from railfix.simulate.receiver import group_delay_s, signals_of
+from railfix.simulate.receiver import group_delay_s, list_signals
 from railfix.simulate.sbas_service import CLOCK, FAST_PERIOD_S, Field, Service, pack_message
 from railfix.simulate.settings import SbasSettings
 
@@ -105,7 +105,9 @@ class SimulatedDfmc(Service):
     def clocks_m(self, second: float) -> Floats:
         """Corrections of clocks [m] for ionosphere-free codes: GPS without delays, Galileo F/NAV, BeiDou B-CNAV1."""
         names, at = self.satellites, self._instant(second)
-        first, other = ([signals_of(name[0], self._simulation.scenario.receiver)[k] for name in names] for k in (0, 1))
+        first, other = (
+            [list_signals(name[0], self._simulation.scenario.receiver)[k] for name in names] for k in (0, 1)
+        )
         ratio = np.array([(CARRIER_FREQUENCY[name[0]]["1"] / CARRIER_FREQUENCY[name[0]]["5"]) ** 2 for name in names])
         delay_m = [self._errors.group_delay_m(names, signals) for signals in (first, other)]
         time, kepler = self._start + timedelta(at), self._simulation.navigation.kepler

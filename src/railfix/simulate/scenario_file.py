@@ -32,7 +32,7 @@ from typing import Any, Final
 from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
-from railfix.core.settings import read_toml, validated
+from railfix.core.settings import read_toml, validate
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario
@@ -65,7 +65,7 @@ class Recipe:
         name = self.names[number]
         source = f"{self.path}, run {name}" if name else str(self.path)
         source += " with the settings of the command line" if changes else ""
-        scenario = validated(Scenario, table, source=source)
+        scenario = validate(Scenario, table, source=source)
         if not to_the_end:
             return scenario
         try:

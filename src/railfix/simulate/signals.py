@@ -21,7 +21,7 @@ from railfix.simulate.environment import Environment
 from railfix.simulate.environment.settings import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.errors import CommonErrors, fault_m
 from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
-from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, ionosphere_m, signals_of, troposphere_m
+from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, ionosphere_m, list_signals, troposphere_m
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 CN0_STEP_DBHZ: Final = 0.25  #: Receivers report C/N0 in steps [dB-Hz].
@@ -82,9 +82,9 @@ class Simulation:
     @cached_property
     def common_errors(self) -> CommonErrors:
         """Errors of satellites and atmosphere, of `satellites`."""
-        return self.errors_of(self.satellites)
+        return self.compute_errors(self.satellites)
 
-    def errors_of(self, satellites: Sequence[str]) -> CommonErrors:
+    def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
         """Errors of satellites and atmosphere; those of a satellite do not depend on the others."""
         scenario = self.scenario
         return CommonErrors(
@@ -135,7 +135,7 @@ class Simulation:
             elevation, _ = elevation_azimuth(link.satellite_ecef_m[:, None, :], place)
             if elevation.max() > scenario.sky.cutoff_deg - 0.5:
                 names.append(satellite)
-        return tuple((name, signal) for name in names for signal in signals_of(name[0], scenario.receiver))
+        return tuple((name, signal) for name in names for signal in list_signals(name[0], scenario.receiver))
 
     def header(self, antenna: str) -> ObservationHeader:
         """Header of a receiver's log; the approximate position is rounded to 100 m, that of the station is exact."""

@@ -171,7 +171,7 @@ Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 @lru_cache(maxsize=32)
 def kind_of_frame(crs: str) -> Kind:
     """How a CRS is tied to the Earth; SettingsError when it is unknown."""
-    geodetic = geodetic_of(crs)
+    geodetic = get_geodetic_frame(crs)
     name = geodetic.name
     if name in REALISATIONS:
         return "dynamic"
@@ -179,7 +179,7 @@ def kind_of_frame(crs: str) -> Kind:
         return "wgs84"
     if name in HELD:
         return "moves with its plate"
-    return "older datum" if operation_of(crs) is None else "moves with its plate"
+    return "older datum" if find_operation(crs) is None else "moves with its plate"
 
 
 @lru_cache(maxsize=64)
@@ -226,14 +226,14 @@ def unit_of_heights(crs: str | None) -> float:
     return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
 
-def vertical_of(crs: str | None) -> CRS | None:
+def get_vertical_datum(crs: str | None) -> CRS | None:
     """The height datum of a compound CRS, None for others."""
     system = None if crs is None else find_crs(crs)
     return system.sub_crs_list[1] if system is not None and system.is_compound else None
 
 
 @lru_cache(maxsize=64)
-def geodetic_of(crs: str) -> CRS:
+def get_geodetic_frame(crs: str) -> CRS:
     """The geodetic frame that a CRS is based on."""
     geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
@@ -242,9 +242,9 @@ def geodetic_of(crs: str) -> CRS:
 
 
 @lru_cache(maxsize=32)
-def operation_of(crs: str) -> Transformer | None:
+def find_operation(crs: str) -> Transformer | None:
     """Return PROJ's best transformation to the working frame; None where PROJ has none between modern frames."""
-    source = geodetic_of(crs)
+    source = get_geodetic_frame(crs)
     sources = [source] if source.name not in SAME else [source, CRS.from_user_input(SAME[source.name][0])]
     for frame in sources:
         usable = [t for t in _operations(frame.to_3d(), CRS.from_user_input(WORKING_FRAME)) if t.accuracy <= MODERN_M]
@@ -274,7 +274,7 @@ def _operations(source: CRS, target: CRS, *, over: CRS | None = None) -> list[Tr
 def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats, Floats, str]:
     """Return latitude and longitude of map coordinates, and the frame; of an older datum its modern one."""
     kind = kind_of_frame(crs)
-    frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
+    frame = _modern_frame(crs)[0] if kind == "older datum" else _find_frame(crs)
     longitude, latitude = (np.asarray(v, np.float64) for v in _in_plan(crs, frame).transform(x, y))
     _check_area(crs, latitude, longitude, path=path)
     if find_crs(crs).is_projected:
@@ -293,7 +293,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
         raise InputFileError(
             path, f"some coordinates lie outside the CRS {crs}; give the right one (--crs), in the unit of the file"
         )
-    geodetic = geodetic_of(crs)
+    geodetic = get_geodetic_frame(crs)
     outside, area = ~is_in_area(geodetic, latitude_deg, longitude_deg, margin_deg=MARGIN_DEG), geodetic.area_of_use
     if area is None or not outside.any():
         return
@@ -310,7 +310,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> tuple[float, float, float, float]:
     """South, north, west and east of the area of use of a CRS's frame, with the margin; nothing lies in it without."""
-    area = geodetic_of(crs).area_of_use
+    area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)
     return (area.south - MARGIN_DEG, area.north + MARGIN_DEG, area.west - MARGIN_DEG, area.east + MARGIN_DEG)
@@ -341,8 +341,8 @@ def _in_plan(crs: str, frame: str) -> Transformer:
 
 
 @lru_cache(maxsize=32)
-def _frame_of(crs: str) -> str:
-    geodetic = geodetic_of(crs)
+def _find_frame(crs: str) -> str:
+    geodetic = get_geodetic_frame(crs)
     authority = geodetic.to_authority()
     return geodetic.to_wkt() if authority is None else ":".join(authority)
 
@@ -350,7 +350,7 @@ def _frame_of(crs: str) -> str:
 @lru_cache(maxsize=32)
 def _modern_frame(crs: str) -> tuple[str, float]:
     """Return the modern frame that PROJ reaches best (else WGS 84), and how well [m] (NaN without)."""
-    whole, source = CRS.from_user_input(crs), geodetic_of(crs).to_2d()
+    whole, source = CRS.from_user_input(crs), get_geodetic_frame(crs).to_2d()
     found = []
     for code in REGIONAL.values():
         target = CRS.from_user_input(code)
@@ -378,11 +378,11 @@ def older_datum_note(crs: str | None) -> tuple[str, ...]:
     if crs is None or kind_of_frame(crs) != "older datum":
         return ()
     code, accuracy = _modern_frame(crs)
-    name, to = geodetic_of(crs).name, CRS.from_user_input(code).name
+    name, to = get_geodetic_frame(crs).name, CRS.from_user_input(code).name
     size = f"with an accuracy of {accuracy:g} m" if np.isfinite(accuracy) else "with unknown accuracy"
     older = "is an older datum, transformed" if not accuracy <= MODERN_M else "is transformed"
     grid = ""
-    plan = geodetic_of(crs).to_2d(), CRS.from_user_input(code).to_2d()
+    plan = get_geodetic_frame(crs).to_2d(), CRS.from_user_input(code).to_2d()
     if not accuracy <= MODERN_M and operations_between(*plan).unavailable_operations:
         grid = "; a grid that PROJ knows of would be better and is not installed (projsync)"
     return (f"map: {name} {older} to {to} by PROJ {size}{grid}",)

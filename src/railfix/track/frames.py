@@ -33,12 +33,12 @@ from railfix.track.crs import (
     SAME,
     WORKING_FRAME,
     HeldFrame,
-    geodetic_of,
+    find_operation,
+    get_geodetic_frame,
+    get_vertical_datum,
     is_in_area,
     kind_of_frame,
-    operation_of,
     operations_between,
-    vertical_of,
 )
 from railfix.track.route import MapReading
 from railfix.track.track import UNNAMED, Track
@@ -105,7 +105,7 @@ def points_at(
 ) -> tuple[Floats, FrameShift]:
     """Move points of a map (n, 3) to the frame of the satellites at a time; return also the shift at the middle one."""
     epoch, plate, parameters = motion.get("epoch"), motion.get("plate"), motion.get("parameters")
-    kind, frame, year = kind_of_frame(crs), geodetic_of(crs), decimal_year(time)
+    kind, frame, year = kind_of_frame(crs), get_geodetic_frame(crs), decimal_year(time)
     used = f"ITRF2020 at {year:.2f}"
     if plate is not None and plate not in PLATES:
         raise SettingsError(f"plate {plate!r} is unknown; expected one of {', '.join(PLATES)}")
@@ -119,7 +119,7 @@ def points_at(
         notes = () if named else _doubt(middle, time)
         method = "used as it is" + ", taken as its latest realisation, which is ITRF2020" * (kind == "wgs84")
         return ecef_m, FrameShift(frame=frame.name, used=used, method=method, notes=notes)
-    operation = operation_of(crs)
+    operation = find_operation(crs)
     if parameters is not None:
         moved, method, notes = _by_parameters(ecef_m, parameters, year, epoch, plate or "EURA")
     elif kind == "dynamic":
@@ -160,7 +160,7 @@ def _from_dynamic(
     ecef_m: Floats, crs: str, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
     """Coordinates of an ITRF at an epoch, in the working frame at the log's."""
-    name = geodetic_of(crs).name
+    name = get_geodetic_frame(crs).name
     moved = _in_itrf2020(ecef_m, REALISATIONS[name], year if epoch is None else epoch)
     if epoch is None:
         note = (
@@ -378,7 +378,7 @@ def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | None]:
     """Height datum and geoid asked for, or those of a compound CRS; SettingsError when they contradict each other."""
-    vertical = vertical_of(crs)
+    vertical = get_vertical_datum(crs)
     if vertical is None:
         return height_datum, geoid
     if height_datum == "ellipsoidal":

@@ -213,10 +213,10 @@ def from_positions(
     left.
     """
     thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
-    return track_of(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
+    return create_track(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
 
 
-def track_of(
+def create_track(
     ecef_m: Floats,
     thinned: Thinned,
     *,
@@ -325,7 +325,7 @@ def from_position_log(
     thinned = thin(log.time, log.ecef_m, usable=usable, limits=limits)
     plan, height, accuracy = _accuracy(log, thinned.kept)
     try:
-        track = track_of(
+        track = create_track(
             log.ecef_m,
             thinned,
             name=name or "positions",

@@ -86,7 +86,7 @@ def read_mate_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     found = []
     for edge, rows in _rows(path, None).items():
         cell = rows[0].get("UTM_CELL", "")
-        of_edge = replace(reading, crs=choose_crs(path, reading.crs, _crs_of(cell)), height_datum="ellipsoidal")
+        of_edge = replace(reading, crs=choose_crs(path, reading.crs, _find_crs(cell)), height_datum="ellipsoidal")
         plan = _plan(str(path), edge, rows)
         profile = [_profile(str(path), row) for row in gradients.get(edge, [])]
         cant = [_cant(str(path), row, plan) for row in cants.get(edge, [])]
@@ -127,7 +127,7 @@ def _number(path: str, row: Row, name: str) -> float:
         ) from None
 
 
-def _crs_of(cell: str) -> str | None:
+def _find_crs(cell: str) -> str | None:
     """CRS of a UTM cell ("32T"), or of the Swiss grid."""
     if cell.strip().upper() == "LV95":
         return "EPSG:2056"

@@ -283,7 +283,7 @@ class Network:
             kilometrage[rows] = interpolate_kilometrage(chainage_m[rows], self.chainage_m[own], marking)
         return kilometrage
 
-    def index_of(self, name: str) -> int:
+    def find_index(self, name: str) -> int:
         """Number of the track of a name, of a way of OpenStreetMap also by its id alone; SettingsError without one."""
         drawn = [k for k, track in enumerate(self.tracks) if "origin" in track.metadata]
         by_id = [k for k in drawn if self.tracks[k].metadata.get("name", "").startswith(f"{name} ")]

@@ -61,7 +61,7 @@ class PlanLog:
         """Return some of the positions."""
         return take_rows(self, rows)
 
-    def in_frame_of(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
+    def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """Return the positions, in the frame of the satellites, in that of the network; else MismatchError."""
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]

@@ -33,10 +33,10 @@ def read_network(
     """Read a network from map files, connected as they state, else where ends, or an end and a track, meet."""
     of_file = replace(reading or MapReading(), duplicates="keep")
     tracks = [track for path in paths for track in read_segments(path, of_file)]
-    return network_of(tracks, paths, tolerance_m=tolerance_m)
+    return connect_network(tracks, paths, tolerance_m=tolerance_m)
 
 
-def network_of(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
+def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
     """Connect tracks to a network: as their files state it, else by their ends; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:

@@ -138,7 +138,7 @@ def _fill_legs(
     return np.array(numbers), np.array([from_m, *place[1::2]]), np.array([*place[0::2], to_m])
 
 
-def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
+def find_route(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
     """Return the tracks that a run passed in order of travel, each once, and those that no route joins to them."""
     seen = matched.track[matched.track >= 0]
     if not len(seen):
@@ -148,7 +148,7 @@ def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
     routes = [network.route_over(passed)]
     if routes[0] is None:
         # the train turned back, the map has a gap, or positions lay on a track that was not passed
-        routes = [*_legs(network, passed), *(_most_of(network, order, share) for order in (passed, passed[::-1]))]
+        routes = [*_legs(network, passed), *(_choose_route(network, order, share) for order in (passed, passed[::-1]))]
     once = [part for route in routes if route is not None for part in _once(network, route)]
     # `fsum` rounds the same in any order: there and back over the same tracks, the way there is the route
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
@@ -199,7 +199,7 @@ def _legs(network: Network, passed: list[int]) -> list[list[int]]:
     return legs
 
 
-def _most_of(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
+def _choose_route(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
     """A route over the most probable tracks, in the order in which each first comes: every part of one is a route."""
     rest, kept = sorted(share, key=lambda track: -share[track]), list[int]()
 

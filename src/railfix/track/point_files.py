@@ -21,9 +21,9 @@ from railfix.track.frames import HEIGHT_DATUMS, check_height_datum, ellipsoidal_
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment, make_segment
 from railfix.track.track import Track
 from railfix.track.vector_file import (
+    get_metadata,
+    get_name,
     is_of_openstreetmap,
-    metadata_of,
-    name_of,
     no_track,
     plan_segment,
     read_overpass,
@@ -92,7 +92,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
     """Name of one of several features: its id, where it has no name of its own."""
     properties, identity = feature.get("properties"), feature.get("id")
-    name = name_of(
+    name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
     )
     return {"name": name} if name else {}
@@ -202,7 +202,7 @@ def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> li
     segments = [
         plan_segment(way.points_deg, of_file, path=path, name=own["name"], stated=own)
         for way, why in ways
-        if not why and (own := metadata_of(way.row))
+        if not why and (own := get_metadata(way.row))
     ]
     return with_left_out(path, segments, Counter(why for _, why in ways if why))
 
@@ -218,7 +218,7 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
             "'railfix map check' lists them all"
         )
     degrees = _in_frame(line.source, crs, line.coordinates)
-    of_way = metadata_of(line.feature)
+    of_way = get_metadata(line.feature)
     return make_segment(
         degrees,
         _heights(line, crs, *degrees[:2], reading) if line.coordinates.shape[1] > 2 else None,

@@ -14,7 +14,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.settings import Settings
 from railfix.core.tables import plural
-from railfix.track.track import HEIGHTS_M, Geometry, Track, geometry_of, kilometrage_breaks, mean_gradients
+from railfix.track.track import HEIGHTS_M, Geometry, Track, compute_geometry, kilometrage_breaks, mean_gradients
 
 Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
@@ -84,7 +84,7 @@ class TrackQuality:
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
     """Check the quality of a map that was read with ``duplicates="keep"``: duplicates are findings and no error."""
     limits = limits or MapLimits()
-    geometry = geometry_of(track)
+    geometry = compute_geometry(track)
     findings = [
         *_spacing(track, geometry, limits),
         *_shape(track, geometry, limits),

@@ -142,7 +142,7 @@ def check_heights(
 
 def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of one map file in their order; a file without heights gives segments without."""
-    segments = _segments_of(file, reading)
+    segments = _read_segments(file, reading)
     if (given := reading.sigma_plan_m) is not None:
         return [_with_accuracy(segment, given) for segment in segments]
     return [s if "sigma_plan_m" in s.metadata else _with_usual_accuracy(s, Path(file).name) for s in segments]
@@ -161,7 +161,7 @@ def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
     return replace(segment, metadata=metadata, notes=(*segment.notes, *notes))
 
 
-def _segments_of(file: FilePath, reading: MapReading) -> list[Segment]:
+def _read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
     if mate_table(file) and (mate_table(file) == "S_DM_TRACKPOINT" or ending(file) == ".parquet"):
         from railfix.track.mate_file import read_edges
 

@@ -231,7 +231,7 @@ class Geometry:
     point_curvature: Floats
 
 
-def geometry_of(track: Track) -> Geometry:
+def compute_geometry(track: Track) -> Geometry:
     """Compute the geometry of a track; duplicate points are skipped."""
     spacing = np.diff(track.chainage_m)
     kept = np.concatenate([[0], np.flatnonzero(spacing > 0.0) + 1])

@@ -230,7 +230,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         right = np.cross(self.tangent, self.up)
         return read_only(right / np.linalg.norm(right, axis=1, keepdims=True))
 
-    def axes_of(self, segment: Indices) -> Floats:
+    def get_axes(self, segment: Indices) -> Floats:
         """Unit vectors along, across and up at some segments, shape (n, 3, 3)."""
         return np.stack([self.tangent[segment], self.across[segment], self.up[segment]], axis=1)
 
@@ -332,7 +332,7 @@ class Passes(NamedTuple):
     again: Masks  #: As near as the segment before: at the point between the two.
 
 
-def passes_of(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
+def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
     """Return the segments whose middle is within a reach and half the longest segment of each position (n, 3)."""
     length, tangent = trajectory.length_m, trajectory.tangent
     middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])

@@ -52,7 +52,7 @@ class Way:
     points_deg: np.ndarray[Any, np.dtype[np.float64]]
 
 
-def tags_of(row: Mapping[str, Any]) -> dict[str, Any]:
+def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
     """Tags of a feature, and its other columns."""
     tags = dict(row)
     for name in ("tags", "all_tags", "other_tags"):
@@ -82,16 +82,16 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
     """Why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
-    railway = tags_of(row).get("railway")
+    railway = get_tags(row).get("railway")
     railway = railway if isinstance(railway, str) and railway else None
     if railway in _RAILWAYS or not (of_openstreetmap or railway in _OTHERS):
         return ""
     return f"railway={railway}" if railway else "no railway"
 
 
-def metadata_of(row: Mapping[str, Any]) -> dict[str, str]:
+def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
     """Return `ORIGIN` and the name of an OpenStreetMap way ("way/7 Main Line"); empty for other features."""
-    tags = tags_of(row)
+    tags = get_tags(row)
     if not is_of_openstreetmap(row):
         return ORIGIN if tags.get("railway") in _RAILWAYS else {}
     found = next((m for key in _IDS if (m := _ID.fullmatch(str(tags.get(key) or "")))), None)
@@ -248,8 +248,8 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
             if why := no_track(row, of_openstreetmap=is_of_openstreetmap(row)):
                 left_out[why] += 1
                 continue
-            stated = metadata_of(row) | _accuracy(row)
-            own = stated.get("name") or name_of(row, fallback=f"line {len(segments) + 1}")
+            stated = get_metadata(row) | _accuracy(row)
+            own = stated.get("name") or get_name(row, fallback=f"line {len(segments) + 1}")
             for k, points in enumerate(lines):
                 name = own + (f", part {k + 1}" if k else "")
                 segments.append(plan_segment(points, of_layer, path=str(path), name=name, stated=stated))
@@ -304,7 +304,7 @@ def plan_segment(
     return make_segment(degrees, heights, source=source, file=path, crs=crs, metadata=metadata)
 
 
-def name_of(row: Mapping[str, Any], *, fallback: str) -> str:
+def get_name(row: Mapping[str, Any], *, fallback: str) -> str:
     """Name of a feature by the first of `_NAMES` that it has."""
     lower = {key.lower(): value for key, value in row.items()}
     for key in _NAMES:

@@ -5,7 +5,7 @@ from .filter import track
 from .limits import TrackingLimits
 from .line import Line
 from .result import Tracked, TrackStatus
-from .smoother import BackwardInformation, Smoothed, Step, smoothed
+from .smoother import BackwardInformation, Smoothed, Step, smooth_steps
 from .state import TrackState
 
 __all__ = [
@@ -22,6 +22,6 @@ __all__ = [
     "TrackStatus",
     "Tracked",
     "TrackingLimits",
-    "smoothed",
+    "smooth_steps",
     "track",
 ]

@@ -116,7 +116,7 @@ def budget(limits: TrackingLimits) -> Budget:
     )
 
 
-def kind_of(name: str) -> SourceKind:
+def classify_source(name: str) -> SourceKind:
     """Kind of a source: `G12` is a satellite, `G` a constellation, `wheel` a sensor."""
     if name in CLOCKS:
         return SourceKind.CONSTELLATION
@@ -127,6 +127,6 @@ def kind_of(name: str) -> SourceKind:
     return SourceKind.SENSOR if name in SENSORS.values() else SourceKind.SATELLITE
 
 
-def clock_of(satellite: str) -> str:
+def get_clock(satellite: str) -> str:
     """Letter of the clock of a satellite's codes."""
     return "G" if satellite[:1] in ("J", "S") else satellite[:1]

@@ -74,7 +74,7 @@ def fit_batch(epochs: GnssEpochs, trajectory: Trajectory, near_m: Floats | None 
     """
     count = len(epochs)
     arc, sigma, speed = np.full((3, count), np.nan)
-    starts = [_first_guess(epochs, trajectory)] + ([] if near_m is None else [_filled(near_m)])
+    starts = [_first_guess(epochs, trajectory)] + ([] if near_m is None else [_fill(near_m)])
     for begin in range(0, count, _PIECE):
         first, last = max(begin - _OVERLAP, 0), min(begin + _PIECE + _OVERLAP, count)
         own = slice(begin - first, min(begin + _PIECE, count) - first)
@@ -97,10 +97,10 @@ def _first_guess(epochs: GnssEpochs, trajectory: Trajectory) -> Floats:
     known = np.flatnonzero(np.isfinite(epochs.near_ecef_m).all(axis=1))
     arc = np.full(len(epochs), np.nan)
     arc[known] = trajectory.nearest(epochs.near_ecef_m[known])[0]
-    return _filled(arc)
+    return _fill(arc)
 
 
-def _filled(arc_m: Floats) -> Floats:
+def _fill(arc_m: Floats) -> Floats:
     known = np.flatnonzero(np.isfinite(arc_m))
     return np.interp(np.arange(len(arc_m)), known, arc_m[known]) if len(known) else arc_m
 

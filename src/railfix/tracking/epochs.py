@@ -125,7 +125,7 @@ class BaliseEpochs:
         place_m, sigma_m = np.full((2, epochs, 2), np.nan)
         return cls(time=np.zeros((epochs, 2), dtype="datetime64[ns]"), place_m=place_m, sigma_m=sigma_m)
 
-    def latest_of(self, interval: Indices, intervals: int) -> BaliseEpochs:
+    def find_latest(self, interval: Indices, intervals: int) -> BaliseEpochs:
         """Return the last balise of each turn in each interval; `interval` has that of each epoch, shape (T,)."""
         row = np.full((intervals, 2), -1, dtype=np.intp)
         epoch, turn = np.nonzero(np.isfinite(self.place_m))

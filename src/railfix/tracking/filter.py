@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, changed
+from railfix.core.arrays import Datetimes, Floats, copy_with
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import layout
 from railfix.tracking import bank
@@ -135,7 +135,7 @@ class Recursion:
     ) -> None:
         """Take an epoch back, and add what the smoother needs of it."""
         hypotheses = state.hypotheses
-        updated, cut = handed.updated(state, epoch)
+        updated, cut = handed.update_epoch(state, epoch)
         cut[:, SATELLITES + self.chunk.fresh[epoch].nonzero()[0]] = True
         handed.take_back(state, epoch, epoch + 1)
         step = Step(
@@ -234,7 +234,7 @@ def track(
         Epochs one by one with the state handed on give the same numbers as all at once.
     """
     limits, sensors = limits or TrackingLimits(), sensors or SensorEpochs()
-    state = TrackState.empty() if state is None else changed(state)
+    state = TrackState.empty() if state is None else copy_with(state)
     result = Tracked.empty(epochs.time, len(epochs.satellite))
     if len(epochs):
         chunk = prepare_chunk(epochs, state, limits)

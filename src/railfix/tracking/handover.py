@@ -183,7 +183,7 @@ class Handover:
         variance[OFFSETS:SATELLITES] += self.recursion.limits.offset_walk_m**2 * elapsed_s
         return mean, variance
 
-    def updated(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
+    def update_epoch(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
         """Return the update of an epoch, None where nothing was used, and the unknowns that have begun anew."""
         work, count, both = self.work, state.hypotheses, self.both
         cut = np.zeros(state.mean.shape, dtype=np.bool_)
@@ -250,7 +250,7 @@ def _subfilters(
         running[at], weak[at] = True, state.bank.weak_s[kept]
         mean[at] = state.bank.mean[kept][:, full]
         covariance[at] = state.bank.covariance[kept][:, full[:, None], full]
-    clock = [CLOCKS.index(bank.clock_of(name)) for name in state.satellite.tolist()] if names else []
+    clock = [CLOCKS.index(bank.get_clock(name)) for name in state.satellite.tolist()] if names else []
     return layout.Subfilters(
         running=running, mean=mean, covariance=covariance, weak_s=weak, **parameters, begun=begun,
         clock=np.array(clock, dtype=np.intp),
@@ -260,7 +260,7 @@ def _subfilters(
 @lru_cache(maxsize=64)
 def _source_parameters(names: tuple[str, ...], limits: TrackingLimits) -> dict[str, Floats]:
     """Prior and factors of sub-filters by their source, which the kernel only reads."""
-    given, kinds = bank.budget(limits), np.array([bank.kind_of(name) for name in names], dtype=np.intp)
+    given, kinds = bank.budget(limits), np.array([bank.classify_source(name) for name in names], dtype=np.intp)
     return {
         "prior": np.array(given.prior)[kinds],
         "k": np.array(given.k_fault)[kinds],

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, changed, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, copy_with, dataclass
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import SCALE_BOUND
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs
@@ -60,7 +60,7 @@ class AccumulatedIncrement:
     balises: BaliseEpochs | None = None
 
 
-def thinned(
+def thin_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
     """Return which epochs are taken, these with what was measured since the one before, and what to go on with.
@@ -95,7 +95,7 @@ def thinned(
     size = edges[1:] - edges[:-1]
     size[:1] += since.epochs - 1
     rest = slice(int(edges[-1]), None)
-    left = changed(
+    left = copy_with(
         since, start=start, number=int(before[-1]),
         epochs=len(total[rest]) if len(taken) else since.epochs + len(epochs),
         unbroken=_names(epochs, np.asarray(goes_on[rest].all(axis=0)), anew=len(taken) > 0 and not len(total[rest])),
@@ -104,7 +104,7 @@ def thinned(
     if not len(taken):
         return taken, None, SensorEpochs(), left
     end, first = int(edges[-1]), edges[:-1]
-    some = changed(
+    some = copy_with(
         epochs if len(taken) == len(epochs) else epochs.take(taken),
         phase_joined=np.logical_and.reduceat(goes_on[:end], first, axis=0) & joined[taken],
     )
@@ -134,7 +134,7 @@ def _balises(
     rows = BaliseEpochs(**{
         f.name: np.concatenate([getattr(before, f.name), getattr(own, f.name)]) for f in fields(BaliseEpochs)
     })  # fmt: skip
-    parts = rows.latest_of(np.concatenate([[0], interval]), taken + 1)
+    parts = rows.find_latest(np.concatenate([[0], interval]), taken + 1)
     found, left = (
         BaliseEpochs(**{f.name: getattr(parts, f.name)[part] for f in fields(BaliseEpochs)})
         for part in (slice(taken), slice(taken, None))
@@ -210,16 +210,16 @@ def track_with_levels(
 
     Where the filter with sub-filters takes every epoch its places are those of the filter, which then does not run.
     """
-    taken, some, sensed, since = thinned(epochs, sensors, state.since, limits.level_period_s)
+    taken, some, sensed, since = thin_epochs(epochs, sensors, state.since, limits.level_period_s)
     place, after = None, state.track
     if some is not None:
         place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
     every = state.every and len(taken) == len(epochs)
     if every and place is not None and after is not None:
-        tracked, track_state = place, changed(after, bank=None)
+        tracked, track_state = place, copy_with(after, bank=None)
     else:
         tracked, track_state = track(epochs, line, track_state, limits=limits, sensors=sensors)
-    state = changed(state, track=after, since=since, every=every)
+    state = copy_with(state, track=after, since=since, every=every)
     tracked, state = carried_levels(tracked, epochs, taken, place, line, state, limits)
     return tracked, track_state, state
 
@@ -278,13 +278,13 @@ def carried_levels(
     explained = np.where(is_bounded(told), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
-    tracked = changed(
+    tracked = copy_with(
         tracked, status=told, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=level,
         ground_level_m=widened(ground, straight), level_noise_m=np.where(known, noise, np.nan),
         level_speed_mps=np.where(known, of_speed, np.nan), separation_m=np.where(known, separation, np.nan),
         amount_m=np.where(known, amount, np.nan),
     )  # fmt: skip
-    return tracked, changed(state, time=times[-1], values=values[-1])
+    return tracked, copy_with(state, time=times[-1], values=values[-1])
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:

@@ -149,7 +149,7 @@ class Smoothed:
     speed_mps: Floats
 
 
-def smoothed(
+def smooth_steps(
     steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
 ) -> tuple[Smoothed, BackwardInformation]:
     """Smooth the epochs of a chunk.

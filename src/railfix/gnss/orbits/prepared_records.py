@@ -147,13 +147,13 @@ class _Issues:
 
 
 @lru_cache(maxsize=8)
-def _issues_of(navigation: Navigation) -> _Issues:
+def _index_issues(navigation: Navigation) -> _Issues:
     return _Issues(navigation.kepler)
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
     """Find the nearest valid row of `navigation.kepler` of an `issue` (T, M), sent or not; -1 without one."""
-    table = _issues_of(navigation)
+    table = _index_issues(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)
     issue = np.where(np.char.startswith(satellite, "E") | (issue < 0), issue, issue % 256)
     series = np.where((issue >= 0) & (number >= 0), number * _ISSUES + issue, -1)
@@ -280,28 +280,28 @@ def _beidou(records: KeplerRecords, signal: str, *, ionosphere_free: bool) -> Fl
     if signal[:1] == "6":
         delay = np.zeros(len(records))
     elif signal[:1] == "2":
-        delay = np.where(_is_of(records, "D1", "D2"), first, unknown)
+        delay = np.where(_has_message(records, "D1", "D2"), first, unknown)
     elif signal in ("7I", "7Q", "7X"):  # B2I; 7D, 7P and 7Z are B2b
-        delay = np.where(_is_of(records, "D1", "D2"), second, unknown)
+        delay = np.where(_has_message(records, "D1", "D2"), second, unknown)
     elif signal in ("7D", "7Z"):
-        delay = np.where(_is_of(records, "CNV3"), first, unknown)
+        delay = np.where(_has_message(records, "CNV3"), first, unknown)
     elif signal in ("1P", "1X"):
-        delay = np.where(_is_of(records, "CNV1", "CNV2"), first, unknown)
+        delay = np.where(_has_message(records, "CNV1", "CNV2"), first, unknown)
     elif signal in ("5P", "5X"):
-        delay = np.where(_is_of(records, "CNV1", "CNV2"), second, unknown)
+        delay = np.where(_has_message(records, "CNV1", "CNV2"), second, unknown)
     elif signal == "1D":
-        delay = np.where(_is_of(records, "CNV1"), first + records.inter_signal_s[:, 0], unknown)
+        delay = np.where(_has_message(records, "CNV1"), first + records.inter_signal_s[:, 0], unknown)
     elif signal == "5D":
-        delay = np.where(_is_of(records, "CNV2"), second + records.inter_signal_s[:, 1], unknown)
+        delay = np.where(_has_message(records, "CNV2"), second + records.inter_signal_s[:, 1], unknown)
     else:
         delay = unknown
     if not ionosphere_free:
         return delay
     f1, f3 = CARRIER_FREQUENCY["C"]["2"] ** 2, CARRIER_FREQUENCY["C"]["6"] ** 2
-    return np.where(_is_of(records, "D1", "D2"), delay - f1 / (f1 - f3) * first, unknown)
+    return np.where(_has_message(records, "D1", "D2"), delay - f1 / (f1 - f3) * first, unknown)
 
 
-def _is_of(records: KeplerRecords, *messages: str) -> Masks:
+def _has_message(records: KeplerRecords, *messages: str) -> Masks:
     return np.isin(records.message, messages)
 
 

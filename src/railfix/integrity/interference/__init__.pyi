@@ -9,7 +9,7 @@ from .limits import (
     Sign,
     Suspicion,
     cause_text,
-    held,
+    hold_signs,
     power_signs,
     suspicion,
 )
@@ -29,7 +29,7 @@ __all__ = [
     "WheelSigns",
     "WheelState",
     "cause_text",
-    "held",
+    "hold_signs",
     "motion_signs",
     "power_signs",
     "suspicion",

@@ -140,7 +140,7 @@ class HeldState:
     last: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
 
 
-def held(
+def hold_signs(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
     """Return which conditions have held for their time, which have within their time of release, and the state.

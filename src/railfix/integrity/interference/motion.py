@@ -124,7 +124,7 @@ class MotionFit(NamedTuple):
 def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
     """Return positions and velocities, and how far constellations are apart."""
     linear = _misfit(inputs)
-    return MotionFit(fixes_of(inputs, linear), _parts(inputs, linear, limits.least_satellites - 1))
+    return MotionFit(fit_motion_fixes(inputs, linear), _parts(inputs, linear, limits.least_satellites - 1))
 
 
 def motion_signs(
@@ -155,7 +155,7 @@ def motion_signs(
     return signs, after
 
 
-def fixes_of(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> Fix:
+def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> Fix:
     """Return positions and velocities by least squares from all ranges together, no satellite excluded."""
     near, sight, misfit = linear
     groups = np.arange(inputs.group.max(initial=-1) + 1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
-from railfix.integrity.interference.limits import HeldState, InterferenceLimits, held
+from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
 #: Least standard deviation of a position: errors of satellites and atmosphere that change over minutes [m].
 _LEAST_M: Final = 1.0
@@ -112,7 +112,7 @@ def wheel_signs(
     bounds = np.concatenate([[state.bound_m], bound])[latest]
     signs = np.concatenate([[state.beyond], beyond])[latest]
     hold, release = np.array([limits.hold_s]), np.array([limits.spoofing_release_s])
-    _, stays, held_state = held(time, signs[:, None], state.held, hold_s=hold, release_s=release)
+    _, stays, held_state = hold_signs(time, signs[:, None], state.held, hold_s=hold, release_s=release)
     window = samples.time >= time[-1] - timedelta(np.array(limits.wheel_window_s + 2.0))
     own = samples.part == after.part
     window[np.flatnonzero(own)[:1]] = True

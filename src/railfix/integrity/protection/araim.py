@@ -25,7 +25,7 @@ from scipy.special import ndtr
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.settings import Settings, read_toml, validated
+from railfix.core.settings import Settings, read_toml, validate
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
 #: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.
@@ -297,4 +297,4 @@ def read_integrity_support(path: FilePath) -> IntegritySupport:
     values = read_toml(path, what="an integrity support message")
     if values.get("format") != FORMAT:
         raise InputFileError(path, f"is not an integrity support message: format = '{FORMAT}' was expected")
-    return validated(IntegritySupport, values, source=str(path))
+    return validate(IntegritySupport, values, source=str(path))

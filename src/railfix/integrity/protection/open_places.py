@@ -125,7 +125,7 @@ def _around(
     """
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)
-    axes = line.axes_of(here)
+    axes = line.get_axes(here)
     lists = index.tree.query_ball_point(place, radius_m + line.length_m.max(), return_sorted=True)
     count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
     vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))

@@ -279,7 +279,7 @@ def _allocate(
     event_prior = nominal * ((members & used[:, None]).sum(axis=2) >= least)
     events = event_prior.any(axis=0).nonzero()[0].tolist()
     of_map = risk.map_prior if wrong_map else 0.0
-    shared, within = _sets_of(tuple(events), len(letters), wrong_map=of_map > 0.0)
+    shared, within = _fault_sets(tuple(events), len(letters), wrong_map=of_map > 0.0)
     each = np.stack([event_prior[:, s.events].prod(axis=1) * (of_map if s.wrong_map else 1.0) for s in shared], axis=1)
     likely = [prod(nominal[[*s.events]].tolist()) * (of_map if s.wrong_map else 1.0) for s in shared]
     further = np.zeros(len(used))
@@ -316,7 +316,7 @@ def _allocate(
 
 
 @lru_cache(maxsize=64)
-def _sets_of(events: tuple[int, ...], constellations: int, *, wrong_map: bool) -> tuple[tuple[Shared, ...], Masks]:
+def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool) -> tuple[tuple[Shared, ...], Masks]:
     """Return the B sets of up to three shared faults, smaller first, and which are those of one fault less (B, B)."""
     sets = []
     for size in range(_MOST_SHARED + 1):
@@ -340,7 +340,7 @@ class _Classes:
     further: Floats  # (T,) probability of more shared faults than may be hypotheses
     least: Sequence[int]  # length B, satellites left out with each whatever the probability; -1: no hypothesis
 
-    def _of(self, rows: Indices) -> _Classes:
+    def _take(self, rows: Indices) -> _Classes:
         return replace(self, each=self.each[rows], sums=self.sums[rows], further=self.further[rows])
 
     def rest(self, order: Indices) -> Floats:
@@ -372,5 +372,5 @@ class _Classes:
             here = (order[rows][:, which] == k - 1) & (self.each[rows][:, which] > 0.0) & feasible[rows, k, None]
             if here.any():
                 order[rows[:, None], which] += here
-                rows = rows[self._of(rows).rest(order[rows]) > share]
+                rows = rows[self._take(rows).rest(order[rows]) > share]
         return np.asarray(order, dtype=np.intp)

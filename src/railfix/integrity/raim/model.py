@@ -65,7 +65,7 @@ class LinearModel:
             freedom=self.freedom[epochs], interest=self.interest,
         )  # fmt: skip
 
-    def patched(self, epochs: Indices, part: LinearModel) -> LinearModel:
+    def patch(self, epochs: Indices, part: LinearModel) -> LinearModel:
         """The model with some epochs, by index, replaced by those of another."""
         if len(epochs) == len(self):
             return part
@@ -185,7 +185,7 @@ def constrained_model(
     the epochs without a position.
     """
     at = trajectory.segment_at(arc_m)[0] if section is None else section
-    place, axes = trajectory.at_arc(arc_m), trajectory.axes_of(at)
+    place, axes = trajectory.at_arc(arc_m), trajectory.get_axes(at)
     return model_on_line(ranges, place, axes, trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 
@@ -204,7 +204,7 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
     [1/m^2].
     """
     arrays = ranges.arrays
-    root, clocks, design, covariance, misfit = kernels.model.linearised(
+    root, clocks, design, covariance, misfit = kernels.model.linearise_ranges(
         arrays, kernel_array(place_ecef_m), kernel_array(axes), kernel_array(prior)
     )
     return LinearModel(

@@ -115,7 +115,7 @@ def _rtcm_record(kind: int, satellite: str, values: Values, time: np.datetime64)
     return gps_record(satellite, values, time)
 
 
-def navigation_of(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigation:
+def assemble_navigation(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigation:
     """Navigation data from assembled records."""
     return Navigation(
         kepler=kepler_records([r for r in parts.records if r.system != "R"]),

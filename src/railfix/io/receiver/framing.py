@@ -258,7 +258,7 @@ def is_receiver_log(head: bytes) -> bool:
     return bool(np.isin(frames.protocol, ["ubx", "rtcm3", "sbf"]).any())
 
 
-def head_of(path: FilePath) -> bytes:
+def read_head(path: FilePath) -> bytes:
     """First bytes of a file, unpacked."""
     with open_stream(path, content="bytes") as stream:
         return stream.read(_HEAD_BYTES)
@@ -271,7 +271,7 @@ Field = tuple[int | tuple[tuple[int, int], ...], int, float, str]
 _LONGEST: Final = 62
 
 
-def unsigned(bits: Bytes, first: int, length: int) -> Integers:
+def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
     """Unsigned integers from a bit field, shape (N,)."""
     if length > _LONGEST:
         raise ValueError(f"a field has at most {_LONGEST} bits, {length} were asked for")
@@ -281,15 +281,15 @@ def unsigned(bits: Bytes, first: int, length: int) -> Integers:
     return value
 
 
-def signed(bits: Bytes, first: int, length: int) -> Integers:
+def read_signed(bits: Bytes, first: int, length: int) -> Integers:
     """Integers in two's complement from a bit field, shape (N,)."""
-    value = unsigned(bits, first, length)
+    value = read_unsigned(bits, first, length)
     return np.where(value >> (length - 1) & 1, value - (1 << length), value)
 
 
 def sign_magnitude(bits: Bytes, first: int, length: int) -> Integers:
     """Integers as sign and magnitude (GLONASS), shape (N,)."""
-    value = unsigned(bits, first + 1, length - 1)
+    value = read_unsigned(bits, first + 1, length - 1)
     return np.where(bits[:, first] == 1, -value, value)
 
 
@@ -302,7 +302,7 @@ def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
             first = 0
         else:
             joined, first = bits, where
-        read = {"u": unsigned, "s": signed, "m": sign_magnitude}[coding]
+        read = {"u": read_unsigned, "s": read_signed, "m": sign_magnitude}[coding]
         values[name] = np.asarray(read(joined, first, length) * factor, dtype=np.float64)
     return values
 

@@ -24,13 +24,13 @@ from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import (
     Assembled,
     Unfinished,
+    assemble_navigation,
     assemble_records,
     assemble_rtcm,
     merge_records,
-    navigation_of,
 )
 from railfix.io.receiver.framing import Frames, SbasFrames, find_frames, join_subframes, sbas_frames
-from railfix.io.receiver.measurements import Measurements, Tracking, no_measurements, observations_of
+from railfix.io.receiver.measurements import Measurements, Tracking, join_observations, no_measurements
 
 MON_RF: Final = 0x0A38
 MON_HW: Final = 0x0A09
@@ -171,7 +171,7 @@ def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None
             block = stream.read(_BLOCK_BYTES)
             frames = find_frames(np.frombuffer(rest + block, dtype=np.uint8), at_end=not block)
             rest = frames.data[frames.consumed :].tobytes()
-            day = ubx.date_of(frames)
+            day = ubx.find_date(frames)
             near = near if np.isnat(day) else day
             of_ubx = ubx.positions(frames, near)
             undated += len(frames.of("ubx", ubx.NAV_HPPOSLLH, ubx.NAV_PVT)) if np.isnat(near) else 0
@@ -390,7 +390,7 @@ def scan_receiver_log(
     epochs = frames_seen = undated = 0
     old: Counter[str] = Counter()
     for piece in scan_pieces(path, date=date, progress=progress):
-        observations, tracking = observations_of(piece.measurements, tracking)
+        observations, tracking = join_observations(piece.measurements, tracking)
         frames_seen += piece.bytes - piece.skipped_bytes
         undated += piece.measurements.skipped.get(rtcm.UNDATED, 0)
         old.update({kind: n for kind, n in piece.measurements.skipped.items() if kind.startswith(("RTCM 1", "UBX"))})
@@ -422,5 +422,5 @@ def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 |
     if not whole.records:
         kinds = "UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046"
         raise InputFileError(", ".join(names), why or f"holds no whole ephemeris ({kinds})")
-    navigation = navigation_of(whole, sources=names)
+    navigation = assemble_navigation(whole, sources=names)
     return replace(navigation, notes=(f"{', '.join(names)}: left out: {why}",)) if undated else navigation

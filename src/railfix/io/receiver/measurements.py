@@ -15,7 +15,7 @@ from railfix.core.timescale import from_week, gpst_to_utc, nearest_day, nearest_
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
-from railfix.io.rinex.navigation_records import RawRecord, fields_of
+from railfix.io.rinex.navigation_records import RawRecord, list_fields
 
 _SLIP, _HALF_CYCLE = 1, 2  #: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
 
@@ -54,7 +54,7 @@ class Tracking:
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def observations_of(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
+def join_observations(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
     """Return observations by epoch and sorted channel, and the state after; epochs that do not rise are counted."""
     tracking = tracking or Tracking()
     rising = rising_epochs(measurements.time, None if np.isnat(tracking.last) else tracking.last)
@@ -310,7 +310,7 @@ def _issue(values: Values, *names: str) -> tuple[float, ...]:
 
 def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers: Mapping[str, float]) -> RawRecord:
     """A record in the order of numbers that RINEX has; what the message lacks is NaN."""
-    values = [float(numbers.get(name, np.nan)) for name in fields_of(satellite[0], message)]
+    values = [float(numbers.get(name, np.nan)) for name in list_fields(satellite[0], message)]
     return RawRecord(
         satellite[0], satellite, message, np.asarray(epoch, dtype="datetime64[ns]").reshape(1)[0], values, 3.0
     )

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Integers, Masks
-from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, crc24q, fields, unpack_words, unsigned
+from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, crc24q, fields, read_unsigned, unpack_words
 
 _PI: Final = np.pi
 Coding = tuple[int, float, str]  #: Number of bits, factor, and how it is coded, of a field (as in `Field`).
@@ -364,7 +364,7 @@ def _with_crc(
         return bits, here
     valid = here & has_crc(bits, checked)
     if preamble is not None:
-        valid &= unsigned(bits, 0, 8) == preamble
+        valid &= read_unsigned(bits, 0, 8) == preamble
     counts[fault] += int(np.count_nonzero(here & ~valid))
     return bits, valid
 
@@ -376,11 +376,11 @@ def _lnav(part: Subframes, counts: Counter[str]) -> Pages:
     counts[f"{letter} pages of other messages"] += int(np.count_nonzero(~cnav & ~civil))
     checked, fault = CNAV_CHECKED, f"{letter} CNAV without valid CRC"
     bits, valid = _with_crc(part, cnav, checked, counts, fault, _PREAMBLE)
-    kind = unsigned(bits, 14, 6)
+    kind = read_unsigned(bits, 14, 6)
     kind = np.where((kind == 61) & (letter == "J"), 30, kind)  # a message of type 61 of QZSS is one of type 30
     yield from _of_kinds(bits, valid, kind, CNAV, CNAV_FROM)
     bits = unpack_words(part.words, drop=6, keep=24)
-    yield from _of_kinds(bits, civil & (unsigned(bits, 0, 8) == _PREAMBLE), unsigned(bits, 43, 3), LNAV)
+    yield from _of_kinds(bits, civil & (read_unsigned(bits, 0, 8) == _PREAMBLE), read_unsigned(bits, 43, 3), LNAV)
 
 
 def _galileo(part: Subframes, counts: Counter[str]) -> Pages:
@@ -389,10 +389,10 @@ def _galileo(part: Subframes, counts: Counter[str]) -> Pages:
     inav, fault = (part.signal == 1) | e5b, "E pages without valid CRC"
     counts["E pages of other messages"] += int(np.count_nonzero(~inav & ~fnav))
     bits, valid = _with_crc(part, fnav, FNAV_CHECKED, counts, fault)
-    yield from _of_kinds(bits, valid, unsigned(bits, 0, 6), FNAV, FNAV_FROM)
+    yield from _of_kinds(bits, valid, read_unsigned(bits, 0, 6), FNAV, FNAV_FROM)
     bits, valid = inav_words(part.words)
     counts[fault] += int(np.count_nonzero(inav & ~valid))
-    for row, k, values in _of_kinds(bits, inav & valid, unsigned(bits, 0, 6), INAV):
+    for row, k, values in _of_kinds(bits, inav & valid, read_unsigned(bits, 0, 6), INAV):
         yield row, k, {**values, "source": float(E5B_SOURCE if e5b[row] else E1B_SOURCE)}
 
 
@@ -403,16 +403,16 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
     counts["C pages of B-CNAV1 of UBX (that of SBF is read)"] += int(np.count_nonzero(first))
     counts["C pages of other messages"] += int(np.count_nonzero(~legacy & ~first & ~b2a & ~frame))
     bits, valid = _with_crc(part, b2a, BCNAV2_CHECKED, counts, "C B-CNAV2 without valid CRC")
-    yield from _of_kinds(bits, valid, unsigned(bits, 6, 6), BCNAV2, CNAV_FROM)
-    yield from _of_kinds(bits, frame, unsigned(bits, 6, 2), BCNAV1, BCNAV1_FROM)
+    yield from _of_kinds(bits, valid, read_unsigned(bits, 6, 6), BCNAV2, CNAV_FROM)
+    yield from _of_kinds(bits, frame, read_unsigned(bits, 6, 2), BCNAV1, BCNAV1_FROM)
     bits = unpack_words(part.words, drop=0, keep=30)
     number = np.array([int(name[1:]) for name in part.satellite.tolist()])
     geo = (number <= 5) | (number >= 59)
-    subframe = unsigned(bits, 15, 3)
-    valid = legacy & (unsigned(bits, 0, 11) == 0x712)
+    subframe = read_unsigned(bits, 15, 3)
+    valid = legacy & (read_unsigned(bits, 0, 11) == 0x712)
     yield from _of_kinds(bits, valid & ~geo, subframe, D1)
     heads = dict.fromkeys(range(1, 11), BDS_HEAD)
-    for row, k, head in _of_kinds(bits, valid & geo & (subframe == 1), unsigned(bits, 42, 4), heads, 100):
+    for row, k, head in _of_kinds(bits, valid & geo & (subframe == 1), read_unsigned(bits, 42, 4), heads, 100):
         packed = int("".join(map(str, bits[row].tolist())), 2)
         yield row, k, {**head, "page": packed}  # the page whole: its fields go over page ends
 
@@ -421,5 +421,5 @@ def _glonass(part: Subframes, counts: Counter[str]) -> Pages:
     bits = unpack_words(part.words[:, :3], drop=0, keep=32)[:, :85]
     valid = glonass_hamming(bits)
     counts["R strings without valid code"] += int(np.count_nonzero(~valid))
-    for row, k, values in _of_kinds(bits, valid, unsigned(bits, 1, 4), GLONASS):
+    for row, k, values in _of_kinds(bits, valid, read_unsigned(bits, 1, 4), GLONASS):
         yield row, k, {**values, "channel": float(part.glonass_channel[row])}

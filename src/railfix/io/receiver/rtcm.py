@@ -16,7 +16,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_to_utc, nearest_week, utc_to_gpst
 from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver import nav_messages
-from railfix.io.receiver.framing import Field, Frames, fields, signed, unsigned
+from railfix.io.receiver.framing import Field, Frames, fields, read_signed, read_unsigned
 from railfix.io.receiver.measurements import Measurements, join_measurements, no_measurements
 from railfix.io.receiver.nav_messages import Coding, layout
 
@@ -84,9 +84,9 @@ class ChannelNews(NamedTuple):
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
     """Channels of 1020 messages after those known before; MSM4 and MSM6 carry none themselves."""
     chosen = frames.of("rtcm3", 1020)
-    bits = bits_of(frames, chosen, 23)
+    bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
-    new = (frames.frame_start[chosen], unsigned(bits, 12, 6), unsigned(bits, 18, 5) - 7)
+    new = (frames.frame_start[chosen], read_unsigned(bits, 12, 6), read_unsigned(bits, 18, 5) - 7)
     return ChannelNews(*(np.concatenate(parts) for parts in zip(known, new, strict=True)))
 
 
@@ -125,7 +125,7 @@ def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int
     """Counts of multiple signal messages without measurements: empty, or with masks or a length that do not fit."""
     if len(messages) == used:
         return {}
-    empty = int(np.count_nonzero(~bits_of(frames, messages, 137)[:, 73:137].any(axis=1)))
+    empty = int(np.count_nonzero(~take_bits(frames, messages, 137)[:, 73:137].any(axis=1)))
     counts = {"MSM without satellites": empty, "broken MSM": len(messages) - used - empty}
     return {what: number for what, number in counts.items() if number}
 
@@ -150,7 +150,7 @@ def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
     return np.asarray(time + np.rint((time[at] - time) / day).astype(np.int64) * day)
 
 
-def bits_of(frames: Frames, chosen: Indices, length: int) -> Bytes:
+def take_bits(frames: Frames, chosen: Indices, length: int) -> Bytes:
     """First bits of some payloads, 0 beyond their ends, shape (N, at least `length`)."""
     octets = np.arange((length + 7) // 8)
     place = frames.start[chosen][:, None] + octets
@@ -164,14 +164,14 @@ def station_ecef_m(frames: Frames) -> tuple[float, float, float] | None:
     chosen = frames.of("rtcm3", 1005, 1006)
     if not len(chosen):
         return None
-    bits = bits_of(frames, chosen[-1:], 152)
-    x, y, z = (float(signed(bits, first, 38)[0]) * 1e-4 for first in (34, 74, 114))
+    bits = take_bits(frames, chosen[-1:], 152)
+    x, y, z = (float(read_signed(bits, first, 38)[0]) * 1e-4 for first in (34, 74, 114))
     return x, y, z
 
 
 def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
     """Whether multiple signal messages are the last ones of their epoch (DF393 is 0), shape (len(chosen),)."""
-    return np.asarray(bits_of(frames, chosen, 56)[:, 54] == 0)
+    return np.asarray(take_bits(frames, chosen, 56)[:, 54] == 0)
 
 
 def find_unfinished_epoch(frames: Frames) -> int | None:
@@ -181,7 +181,7 @@ def find_unfinished_epoch(frames: Frames) -> int | None:
         return None
     after = np.flatnonzero(completes_epoch(frames, chosen))
     tail = chosen[after[-1] + 1 :] if len(after) else chosen
-    times = unsigned(bits_of(frames, tail, 56), 24, 30).tolist()
+    times = read_unsigned(take_bits(frames, tail, 56), 24, 30).tolist()
     first, seen = None, dict[int, int]()
     for index, time in zip(tail[::-1].tolist(), times[::-1], strict=True):
         if seen.setdefault(int(frames.kind[index]), time) != time:
@@ -197,13 +197,13 @@ def _of_number(
     chosen = frames.of("rtcm3", number)
     if not len(chosen):
         return
-    head = bits_of(frames, chosen, _HEADER_BITS + 64)
+    head = take_bits(frames, chosen, _HEADER_BITS + 64)
     n_satellites = head[:, 73:137].sum(axis=1).astype(np.int64)
     n_signals = head[:, 137:169].sum(axis=1).astype(np.int64)
     cells = n_satellites * n_signals
     plausible = (cells > 0) & (cells <= 64)
     if SYSTEMS[number // 10] != "R":  # an encoder was met that writes 2^30 - 14 000 ms for BeiDou as a week begins
-        plausible &= unsigned(head, 24, 30) < 604_800_000
+        plausible &= read_unsigned(head, 24, 30) < 604_800_000
     used = np.where(np.arange(64) < cells[:, None], head[:, 169:233], 0)
     keys = np.packbits(np.concatenate([head[:, 73:169], used], axis=1), axis=1)
     length = (frames.end - frames.start)[chosen] * 8
@@ -215,7 +215,7 @@ def _of_number(
     _, group, inverse = np.unique(keys[rows], axis=0, return_index=True, return_inverse=True)
     for k in range(len(group)):
         members = rows[inverse.reshape(-1) == k]
-        bits = bits_of(frames, chosen[members], int(needed[members[0]]))
+        bits = take_bits(frames, chosen[members], int(needed[members[0]]))
         satellites = np.flatnonzero(head[members[0], 73:137]) + 1
         signals = np.flatnonzero(head[members[0], 137:169]) + 1
         mask = used[members[0], : len(satellites) * len(signals)].reshape(len(satellites), len(signals)) == 1
@@ -243,7 +243,7 @@ def _decode(
         nonlocal cursor
         part = bits[:, cursor : cursor + count * length].reshape(-1, length)
         cursor += count * length
-        read = signed if two_complement else unsigned
+        read = read_signed if two_complement else read_unsigned
         return read(part, 0, length).reshape(len(bits), count)
 
     whole_ms = block(n_satellites, 8)
@@ -287,10 +287,10 @@ def _decode(
 def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
     """Epoch times of messages, GPS time."""
     if system == "R":
-        day, of_day = unsigned(bits, 24, 3), unsigned(bits, 27, 27) * 1e-3
+        day, of_day = read_unsigned(bits, 24, 3), read_unsigned(bits, 27, 27) * 1e-3
         utc_s = day * 86_400.0 + of_day - _MOSCOW_S
         return utc_to_gpst(nearest_week(utc_s, np.full(len(bits), gpst_to_utc(near))))
-    of_week = unsigned(bits, 24, 30) * 1e-3
+    of_week = read_unsigned(bits, 24, 30) * 1e-3
     time = nearest_week(of_week, np.full(len(bits), near))
     return bdt_to_gpst(time) if system == "C" else time
 
@@ -338,6 +338,6 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
         chosen = chosen[(frames.end - frames.start)[chosen] * 8 >= needed]
         if not len(chosen):
             continue
-        table = fields(bits_of(frames, chosen, needed), sent)
+        table = fields(take_bits(frames, chosen, needed), sent)
         for k, place in enumerate(frames.frame_start[chosen].tolist()):
             yield place, number, {name: float(values[k]) for name, values in table.items()}

@@ -18,7 +18,15 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.gnss.observations import frequency_by_name_hz
-from railfix.io.receiver.framing import BCNAV1_PAGE, SBAS_L5, Frames, Subframes, join_subframes, unpack_words, unsigned
+from railfix.io.receiver.framing import (
+    BCNAV1_PAGE,
+    SBAS_L5,
+    Frames,
+    Subframes,
+    join_subframes,
+    read_unsigned,
+    unpack_words,
+)
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.nav_messages import BCNAV1_PARTS, has_crc
 from railfix.io.receiver.ubx import gather_structures
@@ -251,7 +259,7 @@ def navigation_subframes(frames: Frames) -> Subframes:
             signal[this], known = ours, known | this
     galileo, beidou = kind == GAL_RAW_INAV, kind == BDS_RAW
     words[galileo] = _inav_words(words[galileo])
-    words[beidou] = _words_of(unpack_words(words[beidou], drop=0, keep=32)[:, :_BDS_BITS], 30)
+    words[beidou] = _align_words(unpack_words(words[beidou], drop=0, keep=32)[:, :_BDS_BITS], 30)
     passed = rows["passed"] != 0
     counts = {
         "SBF navigation pages without valid CRC": int(np.count_nonzero(known & ~passed)),
@@ -287,7 +295,7 @@ def _bcnav1_pages(frames: Frames) -> Subframes:
         satellite=_NAMES[rows["sv"]][row],
         signal=np.full(len(row), BCNAV1_PAGE),
         glonass_channel=np.zeros(len(row), dtype=np.int64),
-        words=_words_of(pages[valid], 32),
+        words=_align_words(pages[valid], 32),
         order=frames.frame_start[chosen][row],
         skipped={"C B-CNAV1 without valid CRC": int(np.count_nonzero(~valid))} if not valid.all() else {},
     )
@@ -303,9 +311,9 @@ def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
     return frames.frame_start[chosen[dated]], times
 
 
-def _words_of(bits: Bytes, length: int) -> Words:
+def _align_words(bits: Bytes, length: int) -> Words:
     """Ten words of a number of bits, right-aligned, from bits put after each other, shape (..., 10 * length)."""
-    return unsigned(bits.reshape(-1, length), 0, length).reshape(-1, 10).astype(np.uint32)
+    return read_unsigned(bits.reshape(-1, length), 0, length).reshape(-1, 10).astype(np.uint32)
 
 
 def _inav_words(words: Words) -> Words:
@@ -314,7 +322,7 @@ def _inav_words(words: Words) -> Words:
     pages = np.zeros((len(words), 320), dtype=np.uint8)
     pages[:, :_EVEN_BITS] = bits[:, :_EVEN_BITS]
     pages[:, 128:248] = bits[:, _EVEN_BITS : _EVEN_BITS + 120]
-    return _words_of(pages, 32)
+    return _align_words(pages, 32)
 
 
 def positions(frames: Frames) -> dict[str, np.ndarray]:

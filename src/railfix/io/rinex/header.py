@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import ByteStream, FilePath
 from railfix.gnss.observations import ObservationHeader
-from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, columns_of
+from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_columns
 
 #: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
@@ -50,13 +50,13 @@ class RinexHeader:
     #: The part that becomes `Observations.header`.
     public: ObservationHeader = field(default_factory=ObservationHeader)
 
-    def types_of(self, system: str) -> tuple[str, ...] | None:
+    def get_types(self, system: str) -> tuple[str, ...] | None:
         """Return the declared types of a constellation, None for an undeclared one."""
         return self.types.get(ALL if self.version < 3.0 else system)
 
     def columns(self, system: str) -> tuple[SignalColumn, ...]:
         """Return the columns of the satellite lines of a constellation."""
-        return columns_of(self.types_of(system) or (), system=system, version=self.version, scale=self.scale)
+        return assign_columns(self.get_types(system) or (), system=system, version=self.version, scale=self.scale)
 
 
 def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:

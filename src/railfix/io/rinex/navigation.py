@@ -18,10 +18,10 @@ from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.header import read_version
 from railfix.io.rinex.navigation_records import (
     RawRecord,
-    fields_of,
     first_fault,
     glonass_records,
     kepler_records,
+    list_fields,
     number,
 )
 
@@ -274,7 +274,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
 
 def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> list[float]:
     """Parse the numbers of a record in the order of the file; blank is NaN."""
-    names = fields_of(satellite[0], block.message)
+    names = list_fields(satellite[0], block.message)
     numbers: list[float] = []
     for k, name in enumerate(names):
         # Three numbers stand on the first line, after satellite and time; four on each of the others.

@@ -96,10 +96,10 @@ class RawRecord:
     @property
     def fields(self) -> Sequence[str]:
         """Names of the numbers."""
-        return fields_of(self.system, self.message)
+        return list_fields(self.system, self.message)
 
 
-def fields_of(system: str, message: str) -> Sequence[str]:
+def list_fields(system: str, message: str) -> Sequence[str]:
     """Return the names of the numbers of a message in the order of the file."""
     return FIELDS.get(f"{system} {message}", FIELDS[system])
 

@@ -50,7 +50,7 @@ class Fields:
     bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is no digit.
 
 
-def joined(parts: Sequence[Fields]) -> Fields:
+def join_fields(parts: Sequence[Fields]) -> Fields:
     """Return the fields of the same satellites side by side."""
     arrays = ([getattr(part, name) for part in parts] for name in ("value", "lock", "bad"))
     return Fields(*(np.concatenate(some, axis=1) for some in arrays))
@@ -75,7 +75,7 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
 
 def read_fields(data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats) -> Fields:
     """Read fields `index` of lines, divided by `divisor` (SYS / SCALE FACTOR), both shape (k,); rest as `gather`."""
-    value, lock, odd = kernels.reading.decoded_fields(data, start, length, index, divisor)
+    value, lock, odd = kernels.reading.decode_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)
     row, column = np.nonzero(odd)
     if len(row):
@@ -129,7 +129,7 @@ class DecodedRows:
 
 def lines_per_satellite(header: RinexHeader) -> int:
     """Return the number of observation lines of a satellite: several in RINEX 2, else one."""
-    return max(-(-len(header.types_of("G") or ()) // FIELDS_PER_LINE), 1) if header.version < 3.0 else 1
+    return max(-(-len(header.get_types("G") or ()) // FIELDS_PER_LINE), 1) if header.version < 3.0 else 1
 
 
 def decode(
@@ -182,15 +182,15 @@ def _select(
         lines.number[rows.line[broken]],
         lambda i: f"no satellite name can be read ('{lines.text(int(rows.line[broken][i]))[:20]}')",
     )
-    known = _is_one_of(rows.letter, SYSTEMS)
+    known = _is_any(rows.letter, SYSTEMS)
     log.count(UNKNOWN_SYSTEMS, int((~known & ~broken).sum()))
     kept = known & ~broken
     if systems is not None:
-        in_selection = _is_one_of(rows.letter, systems)
+        in_selection = _is_any(rows.letter, systems)
         log.count(NOT_SELECTED, int((kept & ~in_selection).sum()))
         kept &= in_selection
-    declared = [s for s in SYSTEMS if header.types_of(s) is not None]
-    undeclared = kept & ~_is_one_of(rows.letter, declared)
+    declared = [s for s in SYSTEMS if header.get_types(s) is not None]
+    undeclared = kept & ~_is_any(rows.letter, declared)
     log.faults(
         SATELLITES,
         lines.number[rows.line[undeclared]],
@@ -200,7 +200,7 @@ def _select(
     return rows if kept.all() else rows[kept]
 
 
-def _is_one_of(letter: Bytes, letters: Iterable[str]) -> Masks:
+def _is_any(letter: Bytes, letters: Iterable[str]) -> Masks:
     table = np.zeros(256, dtype=np.bool_)
     table[[ord(each) for each in letters]] = True
     return np.asarray(table[letter])
@@ -241,7 +241,7 @@ def _values(
     lines: Lines, rows: DecodedRows, system: str, columns: tuple[SignalColumn, ...], header: RinexHeader, log: FaultLog
 ) -> tuple[DecodedRows, Fields]:
     """Parse the selected columns of the satellite lines; rows with faults are dropped and recorded."""
-    count = len(header.types_of(system) or ())
+    count = len(header.get_types(system) or ())
     width, before = (count, 3) if header.version >= 3.0 else (FIELDS_PER_LINE, 0)
     too_long = np.zeros(len(rows.line), dtype=np.bool_)
     parts = []
@@ -253,7 +253,7 @@ def _values(
         if here:
             index, divisor = np.array([c.index - first for c in here]), np.array([c.divisor for c in here])
             parts.append(read_fields(lines.data, start, length, index, divisor))
-    fields = parts[0] if len(parts) == 1 else joined(parts)
+    fields = parts[0] if len(parts) == 1 else join_fields(parts)
     log.faults(
         SATELLITES,
         lines.number[rows.line[too_long]],
@@ -302,7 +302,7 @@ def _scatter(parts: list[tuple[str, DecodedRows, Fields, tuple[SignalColumn, ...
     for base, rows, fields, columns, names in placed:
         cell = rows.epoch * shape[1] + base
         kind, signal = np.array([c.kind for c in columns]), np.array([names.index(c.signal) for c in columns])
-        kernels.reading.placed_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
+        kernels.reading.place_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
     used = channels_with_data(kinds, lock)
     keep = np.flatnonzero(used) if not used.all() else slice(None)
     names_of = {"satellite": np.array(satellites, dtype="<U3")[keep], "signal": np.array(signals, dtype="<U2")[keep]}

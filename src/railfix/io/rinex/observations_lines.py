@@ -229,7 +229,7 @@ class SignalColumn:
     divisor: float
 
 
-def signal_of(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
+def find_signal(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
     """Return the signal of an observation type ("C1C", "P2") among all declared; None for X1, T1, I1."""
     if version >= 3.0:
         if name[0] not in KINDS:
@@ -250,13 +250,13 @@ def signal_of(name: str, *, system: str, version: float, declared: Sequence[str]
     return codes.get(_OWNERS_2.get(band, ("C" + band,))[0])
 
 
-def columns_of(
+def assign_columns(
     declared: Sequence[str], *, system: str, version: float, scale: Mapping[tuple[str, str], float]
 ) -> tuple[SignalColumn, ...]:
     """Return the columns of a constellation; of two types with the same meaning the first."""
     columns: dict[tuple[int, str], SignalColumn] = {}
     for index, name in enumerate(declared):
-        signal = signal_of(name, system=system, version=version, declared=declared)
+        signal = find_signal(name, system=system, version=version, declared=declared)
         if signal is None:
             continue
         kind = [*KINDS].index("C" if version < 3.0 and name[0] == "P" else name[0])

@@ -29,7 +29,7 @@ _HATANAKA_NAME: Final = re.compile(r"\.(crx|\d\dd)$", re.IGNORECASE)
 _CRX_HEADER_BYTES: Final = 162
 
 
-def packing_of(path: FilePath) -> Packing:
+def detect_packing(path: FilePath) -> Packing:
     """Return the packing by file name: ``front.crx.gz``, ``log.26d``, ``nav.rnx.gz``, ``log.rnx``."""
     name = Path(path).name
     inner = name.removesuffix(".gz")
@@ -40,7 +40,7 @@ def packing_of(path: FilePath) -> Packing:
 @contextmanager
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
     """Open a stream packed as asked, or by the file name; the file appears where the block ends without error."""
-    kind = packing_of(path) if packing is None else packing
+    kind = detect_packing(path) if packing is None else packing
     if kind not in get_args(Packing):
         raise ValueError(f"packing {kind!r} is unknown; expected one of {', '.join(get_args(Packing))}")
     with stage_file(path) as temporary, temporary.open("xb") as raw, ExitStack() as held:

@@ -18,7 +18,7 @@ from railfix.kernels.tracking.constants import (
 )
 from railfix.kernels.tracking.course import point_at
 from railfix.kernels.tracking.layout import ARC, BRANCH_M, BRANCH_S, KernelState, LineArrays, Parameters, Rows, Work
-from railfix.kernels.tracking.update import evidence_of, motion_evidence
+from railfix.kernels.tracking.update import compute_log_evidence, motion_evidence
 
 
 @borrowing
@@ -28,7 +28,7 @@ def reweigh(
     """Update the probabilities of hypotheses by the evidence of an epoch."""
     counts, other = rows.counts, work.mean.shape[0] - 1
     for h in range(count):
-        joint = evidence_of(rows, work.variance, parameters.degrees, work.log_after[h], work, h, h)
+        joint = compute_log_evidence(rows, work.variance, parameters.degrees, work.log_after[h], work, h, h)
         work.evidence[h] = motion_evidence(rows, parameters, work, h, other)
         work.code_evidence[h] = joint - work.evidence[h] if counts[0] >= MOTION_SATELLITES else 0.0
         if max(counts[1], counts[2]) < MOTION_SATELLITES and counts[3] == 0:

@@ -36,7 +36,7 @@ from railfix.kernels.tracking.layout import (
 
 
 @borrowing
-def weight_of(square: float, late: bool, degrees: tuple[float, float]) -> float:
+def compute_weight(square: float, late: bool, degrees: tuple[float, float]) -> float:
     """Weight of a measurement by its square over its variance: `railfix.tracking.limits.Tails`."""
     own = degrees[1] if late else degrees[0]
     return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
@@ -81,7 +81,7 @@ def first_weights(
                         spread += part[c] * own[h, base + c, base + e] * part[e]
                 spread += design[h, i, 0] ** 2 * freedom_place if kind == 1 else design[h, i, 2] ** 2 * freedom_speed
             away = value[h, i] - middle
-            weight[to, i] = weight_of(away * away / (spread + variance[i]), away > 0.0 and kind == 0, degrees)
+            weight[to, i] = compute_weight(away * away / (spread + variance[i]), away > 0.0 and kind == 0, degrees)
         first += size
     for j in range(counts[3]):
         i = gnss + j
@@ -90,7 +90,7 @@ def first_weights(
             + sensed[h, j, 0] ** 2 * freedom_place
             + sensed[h, j, 2] ** 2 * freedom_speed
         )
-        weight[to, i] = weight_of(value[h, i] * value[h, i] / (spread + variance[i]), False, degrees)
+        weight[to, i] = compute_weight(value[h, i] * value[h, i] / (spread + variance[i]), False, degrees)
 
 
 @borrowing
@@ -206,7 +206,7 @@ def weigh_residuals(rows: Rows, variance: Floats, degrees: tuple[float, float], 
     weight, residual, nc = work.weight, work.residual, rows.counts[0]
     for i in range(nc + rows.counts[1] + rows.counts[2] + rows.counts[3]):
         relative = (residual[to, i] ** 2 + work.fitted[to, i]) / variance[i]
-        weight[to, i] = weight_of(relative, residual[to, i] > 0.0 and i < nc, degrees)
+        weight[to, i] = compute_weight(relative, residual[to, i] > 0.0 and i < nc, degrees)
 
 
 @borrowing
@@ -224,7 +224,7 @@ def reweight(
 
 
 @borrowing
-def evidence_of(
+def compute_log_evidence(
     rows: Rows, variance: Floats, degrees: tuple[float, float], log_after: float, work: Work, h: int, to: int
 ) -> float:
     """Logarithm of the evidence of the measurements of finite variance, for the fit in row `to`."""
@@ -253,7 +253,7 @@ def motion_evidence(rows: Rows, parameters: Parameters, work: Work, h: int, othe
         work.masked[i] = math.inf if i < nc else work.variance[i]
         work.weight[other, i] = work.weight[h, i]
     log_after = reweight(rows, work.masked, parameters.degrees, parameters.passes, work, h, h, other)
-    return evidence_of(rows, work.masked, parameters.degrees, log_after, work, h, other)
+    return compute_log_evidence(rows, work.masked, parameters.degrees, log_after, work, h, other)
 
 
 @borrowing
@@ -300,8 +300,8 @@ def second_start(parameters: Parameters, rows: Rows, work: Work, h: int, other: 
     log_after = 0.0
     for by in (other, h):
         log_after = reweight(rows, work.variance, parameters.degrees, parameters.passes, work, h, by, other)
-    first = evidence_of(rows, work.variance, parameters.degrees, work.log_after[h], work, h, h)
-    if evidence_of(rows, work.variance, parameters.degrees, log_after, work, h, other) > first:
+    first = compute_log_evidence(rows, work.variance, parameters.degrees, work.log_after[h], work, h, h)
+    if compute_log_evidence(rows, work.variance, parameters.degrees, log_after, work, h, other) > first:
         work.log_after[h] = log_after
         for i in range(size):
             work.change[h, i] = work.change[other, i]

@@ -1,6 +1,6 @@
 # The names of `railfix.positioning.carrier`, imported at their first use (lazy-loader).
 
-from .ambiguities import ArcAmbiguities, Fixed, PhaseLimits, PhasePositions, fix_integers, repeats_of
+from .ambiguities import ArcAmbiguities, Fixed, PhaseLimits, PhasePositions, count_repeats, fix_integers
 from .continuity import (
     ArcState,
     ContinuityLimits,
@@ -44,12 +44,12 @@ __all__ = [
     "TrackJumps",
     "TrackedPhases",
     "corrected_phase_m",
+    "count_repeats",
     "find_slips",
     "fix_integers",
     "last_arcs",
     "number_arcs",
     "phase_positions",
-    "repeats_of",
     "smooth_codes",
     "track_jumps",
 ]

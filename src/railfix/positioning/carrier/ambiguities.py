@@ -49,13 +49,13 @@ class PhaseLimits(Settings):
     largest_sigma_m: float = Field(default=1e3, gt=0)  #: Epochs with more noise along the line have no position.
 
 
-def hop_of(time: Datetimes, limits: PhaseLimits) -> Integers:
+def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
     """Number of the hop that each time lies in."""
     nanoseconds = (time.astype("datetime64[ns]") - GPS_EPOCH).astype(np.int64)
     return np.asarray(nanoseconds // round(limits.hop_s * 1e9), dtype=np.int64)
 
 
-def repeats_of(time: Datetimes, limits: PhaseLimits) -> Floats:
+def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
     """Return the number of correlated epochs for each epoch, shape (T,); 1 for the first."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):

@@ -85,7 +85,7 @@ def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> In
     return np.array([(code << COUNT_BITS) + count[code] if code in count else NO_ARC for code in codes], dtype=np.int64)
 
 
-def channel_of(arc_id: Integers) -> Integers:
+def decode_channel(arc_id: Integers) -> Integers:
     """Channel code of each arc."""
     return np.asarray(arc_id >> COUNT_BITS)
 
@@ -183,7 +183,7 @@ def track_jumps(
     section, along = trajectory.segment_at(np.where(np.isfinite(arc), arc, 0.0))
     where = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
     distance, los = range_with_rotation(sats, where[:, None, :])
-    axes = trajectory.axes_of(section)
+    axes = trajectory.get_axes(section)
     change = np.diff(phase - distance, axis=0)
     way = np.diff(arc)
     design = np.concatenate([-np.matmul(los[1:], axes[1:].swapaxes(1, 2)), np.ones((*change.shape, 1))], axis=-1)

@@ -21,13 +21,13 @@ from railfix.positioning.carrier.ambiguities import (
     PhaseLimits,
     PhasePositions,
     assemble_positions,
+    count_repeats,
     fix_integers,
-    hop_of,
     inverse_of_arcs,
+    number_hops,
     prepare_start,
-    repeats_of,
 )
-from railfix.positioning.carrier.continuity import channel_of
+from railfix.positioning.carrier.continuity import decode_channel
 from railfix.positioning.carrier.observation_model import (
     IntegerChannels,
     Linearised,
@@ -102,7 +102,7 @@ def phase_positions(
         raise ValueError(f"the state has {len(memories)} passes, the limits ask for {limits.passes}")
     started = np.isfinite(arc_m_start)
     ranges, phases, arc = prepare_start(ranges, phases, trajectory, arc_m_start)
-    cuts = _cuts(hop_of(time, limits), phases)
+    cuts = _cuts(number_hops(time, limits), phases)
     integers, phases = phases.integers, replace(phases, integers=None)  # the last pass fixes
     after: list[Memory] = []
     pieces: list[PhasePositions] = []
@@ -177,7 +177,7 @@ def _segment(
     fixes = _fix_epochs((base, value, covariance), index, phases, trajectory, limits)
     among = covariance[row[:, None], index[:, :, None], index[:, None, :]]
     before = np.asarray([memory.time], dtype="datetime64[ns]")
-    repeats = repeats_of(np.concatenate([before, time]), limits)[1:]
+    repeats = count_repeats(np.concatenate([before, time]), limits)[1:]
     own = own_unknowns(lin, value[row, index], among, trajectory, repeats=repeats)
     arc = np.clip(arc_m + own.step_m, 0.0, trajectory.arc_m[-1])
     seen = memory.seen.copy()
@@ -186,7 +186,7 @@ def _segment(
         np.maximum.at(last_row, column, np.nonzero(used)[0])
         seen[place] = time[last_row]
     now = time[-1] if len(time) else memory.time
-    channel = channel_of(memory.arc_id)
+    channel = decode_channel(memory.arc_id)
     older = np.append(channel[1:] == channel[:-1], False)[:count]  # sorted: the newest of a channel comes last
     left = _without(replace(kept, time=now, seen=seen), older)
     last, end = floats
@@ -270,7 +270,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     """The memory at a later hop: arcs not seen for long forgotten, the others a little less certain."""
     if not len(time) or not len(memory.arc_id):
         return memory
-    before, now = hop_of(np.array([memory.time, time[0]]), limits)
+    before, now = number_hops(np.array([memory.time, time[0]]), limits)
     if now == before:
         return memory
     begin = GPS_EPOCH + np.timedelta64(int(now) * round(limits.hop_s * 1e9), "ns")

@@ -103,7 +103,7 @@ def linearise(
     section, along = trajectory.segment_at(arc_m)
     place = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
     distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
-    axes = trajectory.axes_of(section)
+    axes = trajectory.get_axes(section)
     groups = len(ranges.groups)
     unknowns = PLACE + groups + (clocks == "own")
     for_code = np.zeros((*ranges.code_m.shape, unknowns))

@@ -102,7 +102,7 @@ class SbasCorrections:
         """Corrections from recorded messages, of the PRN asked for or of `best_prn`; ValueError: there is no message of
         it.
         """
-        prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.choice_of(prn))
+        prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.describe_choice(prn))
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
         corrections.notes += tuple(corrections._leave_out(messages.of(prn)))
         return corrections
@@ -250,9 +250,9 @@ class SbasState:
     ::
 
         state = SbasState(prn=137)
-        state = state.received(messages)  # whenever some arrive
+        state = state.add_messages(messages)  # whenever some arrive
         fixes = state.corrections.satellites(time, satellite, navigation)
-        state = state.kept_from(time[-1])  # what later epochs need
+        state = state.drop_before(time[-1])  # what later epochs need
     """
 
     prn: int  #: Chosen beforehand: which GEO is best is known only after all messages were received.
@@ -260,9 +260,9 @@ class SbasState:
     messages: SbasMessages = field(default_factory=SbasMessages.none)  #: Of that PRN, in the order of reception.
     band: Band = "L1"  #: Frequency of the messages.
 
-    def received(self, messages: SbasMessages) -> SbasState:
+    def add_messages(self, messages: SbasMessages) -> SbasState:
         """The state after more messages; those of other PRNs, and repeated ones of a second receiver, are left out."""
-        joined = self.messages.joined(messages.of(self.prn))
+        joined = self.messages.merge(messages.of(self.prn))
         return replace(self, messages=joined.take(~joined.repeated()))
 
     @cached_property
@@ -272,7 +272,7 @@ class SbasState:
             return DfmcService(self.messages, prn=self.prn)
         return SbasCorrections(self.messages, prn=self.prn, limits=self.limits)
 
-    def kept_from(self, time: np.datetime64) -> SbasState:
+    def drop_before(self, time: np.datetime64) -> SbasState:
         """The state without the messages that no epoch from `time` on can use."""
         kind, age = self.messages.type, seconds(time - self.messages.time)
         if self.band == "L5":  # the newest of each type, and corrections with all indicators since

@@ -174,14 +174,14 @@ def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
     return {name: read(field) for name, field in layout.items()}
 
 
-def rows_of(messages: SbasMessages, *types: int) -> Integers:
+def find_rows(messages: SbasMessages, *types: int) -> Integers:
     """Rows of some message types."""
     return np.flatnonzero(np.isin(messages.type, types)).astype(np.int64)
 
 
 def decode(messages: SbasMessages, kind: int) -> Decoded:
     """Fields of all messages of a type, as its layout has them."""
-    row = rows_of(messages, kind)
+    row = find_rows(messages, kind)
     return {"row": row, **read_fields(messages.bits[row], LAYOUTS[f"type {kind}"])}
 
 
@@ -205,9 +205,9 @@ def prn_masks(messages: SbasMessages) -> Decoded:
 
 def fast_corrections(messages: SbasMessages, *, type0: Literal["stop", "as_type2"]) -> Decoded:
     """Types 2 to 5, 24, and 0 for 2, one row a slot: `slot`, `prc_m`, `udrei`, `iodf`, `iodp`, all (n,)."""
-    row = rows_of(messages, 2, 3, 4, 5)
+    row = find_rows(messages, 2, 3, 4, 5)
     if type0 == "as_type2":
-        zero = rows_of(messages, 0)
+        zero = find_rows(messages, 0)
         row = np.concatenate([row, zero[has_data(messages.bits[zero])]])
     parts = [
         _by_slot(row, BLOCK * np.maximum(messages.type[row] - 2, 0), read_fields(messages.bits[row], LAYOUTS["type 2"]))
@@ -245,7 +245,7 @@ def long_term(messages: SbasMessages) -> Decoded:
     """Both halves of type 25 and that of type 24, one row a satellite; `reference` is NaT without velocity."""
     parts: list[Decoded] = []
     for kind, start in ((25, 14), (25, 120), (24, 120)):
-        row = rows_of(messages, kind)
+        row = find_rows(messages, kind)
         half = read_fields(messages.bits[row], LAYOUTS["half of type 25"], start)
         moves = half["velocity_code"] == 1
         still, moving = row[~moves], row[moves]

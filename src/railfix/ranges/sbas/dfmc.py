@@ -181,7 +181,7 @@ class DfmcService:
             prn = int(numbers[np.argmax(count)]) if len(numbers) else messages.prns[0]
             choice = f"best SBAS PRN by corrections on L5: {prn} (the log has {', '.join(map(str, messages.prns))})"
         else:
-            choice = messages.choice_of(prn)
+            choice = messages.describe_choice(prn)
         notes = (*messages.notes, choice)
         if zeros := int(np.sum(messages.of(prn).type == 0)):
             notes += (f"PRN {prn} sent {zeros} messages of type 0 (do not use for safety): each stopped it for 60 s",)

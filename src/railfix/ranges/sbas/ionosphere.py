@@ -166,7 +166,7 @@ def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indi
     return first, which
 
 
-def looked_up(
+def look_up(
     answer: Callable[[Integers, Datetimes], NDArray[Answer]],
     span: Integers,
     point: Integers,
@@ -255,7 +255,7 @@ def _choose(
         corners = np.stack(
             [point_number(s, w), point_number(s + h, w), point_number(s, w + b), point_number(s + h, w + b)], axis=1
         )
-        inside = looked_up(
+        inside = look_up(
             lambda points, when: grid.in_mask(points, when[:, None]), span[at], corners, time[at], ROWS * COLUMNS
         )
         u, v = (longitude[at] - w) / b, (latitude[at] - s) / h
@@ -321,7 +321,7 @@ def ionosphere(
     polar_weights = np.full((len(when), 4), np.nan)
     if len(polar):
         point[polar], polar_weights[polar] = _choose_polar(grid, when[polar], at_latitude[polar], at_longitude[polar])
-    judged = looked_up(
+    judged = look_up(
         lambda points, then: np.stack(_judge(grid, limits, tables, then, points), axis=-1),
         span, point, when, ROWS * COLUMNS,
     )  # fmt: skip

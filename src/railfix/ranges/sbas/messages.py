@@ -100,7 +100,7 @@ class SbasMessages:
     def _arrays(self) -> dict[str, Any]:
         return {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
 
-    def choice_of(self, prn: int) -> str:
+    def describe_choice(self, prn: int) -> str:
         """A sentence on a PRN that was asked for; ValueError where none of the messages is of it."""
         known = ", ".join(map(str, self.prns))
         if prn not in self.prns:
@@ -118,7 +118,7 @@ class SbasMessages:
         bits = np.zeros((0, ROW_BYTES), dtype=np.uint8)
         return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
 
-    def joined(self, later: SbasMessages) -> SbasMessages:
+    def merge(self, later: SbasMessages) -> SbasMessages:
         """These messages and others, in the order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self

@@ -70,7 +70,7 @@ class Series:
         """Column of that name."""
         return self.columns[name]
 
-    def extended(self, **columns: NDArray[Any]) -> Series:
+    def add_columns(self, **columns: NDArray[Any]) -> Series:
         """The same rows with more columns."""
         return replace(self, columns={**self.columns, **columns})
 
@@ -227,7 +227,7 @@ def _with_fresh(fast: Series) -> Series:
     """A row after one that was not monitored, or the first of its satellite, begins anew."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
-    return fast.extended(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
+    return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
 
 
 def _with_other(table: Series) -> Series:
@@ -237,4 +237,4 @@ def _with_other(table: Series) -> Series:
     changed[1:] = (number[1:] != number[:-1]) | (iode[1:] != iode[:-1])
     run = np.maximum.accumulate(np.where(changed, np.arange(len(number)), 0))
     same = (run > 0) & (number[run - 1] == number)
-    return table.extended(other=np.where(same, run - 1, -1))
+    return table.add_columns(other=np.where(same, run - 1, -1))

@@ -213,7 +213,7 @@ def _draw(layer: Layer) -> bool:
     return bool((np.isfinite(layer.x) & np.isfinite(layer.y)).any())
 
 
-__all__ = ["floats", "nice_step", "points", "since", "start_of", "words"]
+__all__ = ["find_start", "floats", "nice_step", "points", "since", "words"]
 
 
 def points(table: pl.DataFrame, *names: str) -> Floats:
@@ -226,7 +226,7 @@ def words(table: pl.DataFrame, name: str) -> Strings:
     return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
 
 
-def start_of(table: pl.DataFrame) -> np.datetime64:
+def find_start(table: pl.DataFrame) -> np.datetime64:
     """Earliest time of a table; ValueError where it is empty."""
     if not len(table):
         raise ValueError("the table has no rows")

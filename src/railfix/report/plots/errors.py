@@ -38,11 +38,11 @@ from railfix.report.plots.chart import (
     Points,
     RangeBars,
     counts_sentence,
+    find_start,
     floats,
     nice_step,
     since,
     spread,
-    start_of,
     words,
 )
 
@@ -61,7 +61,7 @@ def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = Non
 
     Both tables are of one antenna, in order of time; `filtered` is of the filter along the track.
     """
-    return _errors(errors, filtered, start_of(errors))
+    return _errors(errors, filtered, find_start(errors))
 
 
 def error_over_chainage(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
@@ -102,7 +102,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
         series.append(("filtered along the track", "error_m", FILTERED, "dot", filtered))
     shown = total = 0
     for label, column, colour, shape, table in series:
-        x, y, epoch = axis(table), good_errors(table, column), since(table, start_of(errors))
+        x, y, epoch = axis(table), good_errors(table, column), since(table, find_start(errors))
         rows = spread(x, y)
         shown, total = shown + len(rows), total + int(np.isfinite(x + y).sum())
         layers.append(
@@ -278,7 +278,7 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
 
 def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
     """Protection level of one antenna and its parts over time; empty where the run has no levels."""
-    return _levels(positions, alarm_limit_m, start_of(positions))
+    return _levels(positions, alarm_limit_m, find_start(positions))
 
 
 def levels_over_chainage(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
@@ -291,7 +291,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     layers: list[Layer] = []
     shown = total = 0
     largest = alarm_limit_m
-    epoch = since(positions, start_of(positions))
+    epoch = since(positions, find_start(positions))
     x = floats(positions, "chainage_m") if start is None else epoch
     for (label, column), colour in zip(_PARTS, (*CYCLE[2:6], BLUE), strict=True):
         level = floats(positions, column)

@@ -27,13 +27,13 @@ from railfix.report.plots.chart import (
     Marks,
     Points,
     counts_sentence,
+    find_start,
     floats,
     nice_step,
     one_per_cell,
     points,
     since,
     spread,
-    start_of,
     words,
 )
 from railfix.track import Track
@@ -84,7 +84,7 @@ def plan(
     if len(kept):
         layers.append(Points(label="conventional", colour=GREY, shape="cross", x=there[kept, 0], y=there[kept, 1]))
     shown, total = len(kept), int(np.isfinite(there[:, 0]).sum())
-    epoch = since(positions, start_of(positions))
+    epoch = since(positions, find_start(positions))
     classes, coloured = _classes(positions, error_m, level_m)
     for label, colour, mask in classes:
         rows = np.flatnonzero(has & mask)
@@ -96,7 +96,7 @@ def plan(
                 Points(label=f"{label} ({len(rows):,})", colour=colour, x=x, y=y, size=4.0, epoch_s=epoch[kept])
             )
     if filtered is not None:
-        layers += _filter(positions.filter(pl.Series(has)), filtered, frame, cell, start_of(positions))
+        layers += _filter(positions.filter(pl.Series(has)), filtered, frame, cell, find_start(positions))
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
     thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
@@ -151,7 +151,7 @@ class LocalFrame:
         """East and north of points, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
-    def plane_of(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
+    def to_plane(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
         """East and north of points of the height of the origin, shape (P, 2) [m]."""
         return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
@@ -161,7 +161,7 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
     parts: list[Floats] = []
     gap = np.full((1, 2), np.nan)
     for line in lines:
-        plane = frame.plane_of(line[:, 1], line[:, 0])
+        plane = frame.to_plane(line[:, 1], line[:, 0])
         inside = np.asarray(((plane > low) & (plane < high)).all(axis=1))
         # neighbours outside stay, so that lines reach the edge
         kept = inside | np.append(inside[1:], False) | np.append(False, inside[:-1])
@@ -316,7 +316,7 @@ def _by(table: pl.DataFrame) -> str:
 
 def satellites_over_time(positions: pl.DataFrame) -> Chart:
     """Satellites used and rejected at each epoch of one antenna."""
-    start = start_of(positions)
+    start = find_start(positions)
     x = since(positions, start)
     layers: list[Layer] = []
     shown = total = 0

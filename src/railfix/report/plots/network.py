@@ -52,7 +52,7 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
     frame = LocalFrame.at(float(np.median(latitude)), float(np.median(longitude)))
     nth = max(1, len(latitude) // _DRAWN)
     rows, breaks = _thin(network, nth)
-    east, north = np.insert(frame.plane_of(latitude[rows], longitude[rows]), breaks, np.nan, axis=0).T
+    east, north = np.insert(frame.to_plane(latitude[rows], longitude[rows]), breaks, np.nan, axis=0).T
     layers: list[Layer] = [Curve(label="tracks", colour=BLUE, x=east, y=north, width=1.2)]
     ends, _ = end_points(network)
     stems = _switches(network)
@@ -63,7 +63,7 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
         found = [f for f in quality.findings if f.kind == kind] if quality is not None else []
         if found:
             degrees = np.array([(f.latitude_deg, f.longitude_deg) for f in found])
-            east, north = frame.plane_of(*degrees.T).T
+            east, north = frame.to_plane(*degrees.T).T
             layers.append(Points(label=kind, colour=colour, x=east, y=north, shape="cross", size=7.0))
     if run is not None:
         layers += _positions(frame, *run)
@@ -72,7 +72,7 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
         layers.append(_names_beside(network, frame, run[1], view))
     elif len(network.tracks) <= _NAMED:
         middle = (network.first_point[:-1] + network.first_point[1:]) // 2
-        east, north = frame.plane_of(latitude[middle], longitude[middle]).T
+        east, north = frame.to_plane(latitude[middle], longitude[middle]).T
         layers.append(Marks(label="names", colour=BLACK, x=east, y=north, words=network.names, place="on"))
     caption = f"Plan about {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}."
     if nth > 1:
@@ -88,7 +88,7 @@ def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[f
     known = np.isfinite(log.latitude_deg)
     if not known.any():
         return None
-    place = frame.plane_of(log.latitude_deg[known], log.longitude_deg[known])
+    place = frame.to_plane(log.latitude_deg[known], log.longitude_deg[known])
     low, high = place.min(axis=0), place.max(axis=0)
     margin = max(_MARGIN * float((high - low).max()), _LEAST_VIEW_M)
     ranges = [(float(a - margin), float(b + margin)) for a, b in zip(low, high, strict=True)]
@@ -129,7 +129,7 @@ def _switches(network: Network) -> Indices:
 
 def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]:
     """Positions in classes of the probability of their track, and those on none."""
-    east, north = frame.plane_of(log.latitude_deg, log.longitude_deg).T
+    east, north = frame.to_plane(log.latitude_deg, log.longitude_deg).T
     on, layers, above = matched.track >= 0, [], np.inf
     for low, colour in _CLASSES:
         rows = on & (matched.probability >= low) & (matched.probability < above)

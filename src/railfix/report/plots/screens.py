@@ -214,7 +214,7 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
         raise OutputError(f"{out}: the folder cannot be created ({error.strerror})") from None
     return [
         draw_screen(out / f"{screen.antenna}_{screen.name}.png", screen.picture, screen.time, screen.chainage_m)
-        for screen in screens_of(reported.config, reported.folder.positions, reported.observations)
+        for screen in list_screens(reported.config, reported.folder.positions, reported.observations)
     ]
 
 
@@ -249,7 +249,7 @@ class RunScreen:
         return self.epoch_chainage_m if self.epoch is None else self.epoch_chainage_m[self.epoch]
 
 
-def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
+def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
     """Every screen of a run that tested anything, antenna by antenna, with the settings that were used."""
     antennas = positions["antenna"].unique(maintain_order=True).to_list()
     for antenna in antennas:

@@ -23,9 +23,9 @@ from railfix.report.plots.chart import (
     Layer,
     Points,
     SkyEpochs,
+    find_start,
     floats,
     since,
-    start_of,
     words,
 )
 from railfix.screens import Cn0Limits
@@ -113,7 +113,7 @@ def _lines(
     mask_deg: float | None,
 ) -> Iterator[Layer]:
     mean = next((m for m in curve.means if (m.kind, m.signal) == (kind, signal)), None) if curve else None
-    yield from _mean_of(cells) if mean is None else _open_sky(mean, limits)
+    yield from _compute_mean(cells) if mean is None else _open_sky(mean, limits)
     yield from _floor(limits)
     if mask_deg is not None:
         edge = np.full(2, mask_deg)
@@ -136,7 +136,7 @@ def _floor(limits: Cn0Limits | None) -> Iterator[Layer]:
         yield Curve(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
 
 
-def _mean_of(cells: pl.DataFrame) -> Iterator[Layer]:
+def _compute_mean(cells: pl.DataFrame) -> Iterator[Layer]:
     piece = np.minimum(cells["across"].to_numpy() // 5, 17)
     count = np.bincount(piece, weights=cells["count"].to_numpy(), minlength=18)
     total = np.bincount(piece, weights=cells["total"].to_numpy(), minlength=18)
@@ -174,7 +174,7 @@ def sky_epochs(
         .sort("time_gpst", "satellite", "aside", maintain_order=True)
         .unique(["time_gpst", "satellite"], keep="first", maintain_order=True)
     )
-    start = start_of(known) if len(known) else np.datetime64(0, "ns")
+    start = find_start(known) if len(known) else np.datetime64(0, "ns")
     seconds = since(known, start)
     epoch, first = np.unique(seconds, return_index=True)
     names = reason_names() | {0: "used"}
