@@ -107,7 +107,7 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
 
 
 def _judge(row: Mapping[str, Any]) -> str:
-    """One run and antenna in a sentence."""
+    """Return one run and antenna in a sentence."""
     from railfix.evaluate.figures import WRONG_PLACE_M
 
     name = f"{row['run']}, {row['antenna']}"
@@ -230,7 +230,7 @@ def show_files(console: Console, paths: Iterable[Path]) -> None:
 
 @contextmanager
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
-    """A bar on the standard error output, with the rate and the time left; silent where that is no terminal."""
+    """Yield a bar on the standard error output, with the rate and the time left; silent where that is no terminal."""
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),

@@ -150,7 +150,7 @@ def evaluate(
 
 
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:
-    """Each run with its reference and label."""
+    """Return each run with its reference and label."""
     references = reference * len(runs) if len(reference) == 1 else reference
     if len(references) != len(runs):
         raise SettingsError(

@@ -188,7 +188,7 @@ def route(
 def _route_tracks(
     net: Network, choice: RouteChoice, columns: ColumnNames, connecting: Connecting, reading: TrackReading
 ) -> tuple[list[int], list[str]]:
-    """Tracks of the route asked for, and notes on it."""
+    """Return the tracks of the route asked for, and notes on it."""
     if choice.tracks:
         return net.shortest_route([net.find_index(name.strip()) for name in choice.tracks.split(",")]), []
     if choice.via:
@@ -210,7 +210,7 @@ def _route_tracks(
 def _positions(
     path: Path, net: Network, columns: ColumnNames, connecting: Connecting, reading: TrackReading
 ) -> tuple[PlanLog, list[str]]:
-    """Positions of a log in the frame of the network, and a note on their shift."""
+    """Return the positions of a log in the frame of the network, and a note on their shift."""
     log = read_plan_positions(path, columns=columns.names)
     if connecting.same_frame == "yes":
         return log, []

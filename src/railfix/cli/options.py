@@ -42,7 +42,7 @@ LenientOption = Annotated[
 
 
 def overwriting(asked: bool) -> Overwrite:
-    """What `OverwriteOption` asks for."""
+    """Return what `OverwriteOption` asks for."""
     return "replace" if asked else "refuse"
 
 
@@ -279,7 +279,7 @@ def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
 
 
 def _screens(option: str, text: str) -> list[str]:
-    """Names of screens, with commas between them."""
+    """Return the names of screens, with commas between them."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in SCREEN_NAMES:

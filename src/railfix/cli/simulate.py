@@ -141,7 +141,7 @@ def _simulate(
 
 
 def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
-    """Numbers of the runs to make, from 0."""
+    """Return the numbers of the runs to make, from 0."""
     if not only:
         return list(range(len(recipe.names)))
     if not recipe.names[0]:
@@ -228,7 +228,7 @@ def show_levels(evaluation: Evaluation, console: Console) -> None:
 
 
 def median_level(evaluation: Evaluation, kind: str, antenna: str) -> float | None:
-    """Median of the finite levels of the positions of status ok [m]; None where there is none."""
+    """Return the median of the finite levels of the positions of status ok [m]; None where there is none."""
     if evaluation.levels is None:
         return None
     wanted = {"antenna": antenna, "position": "constrained_ok", "level": f"{kind}_protection_level_m"}

@@ -117,14 +117,14 @@ else:
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """A read-only view of an array; the caller's own array stays writable."""
+    """Return a read-only view of an array; the caller's own array stays writable."""
     view = array.view()
     view.flags.writeable = False
     return view
 
 
 def kernel_array(array: NDArray[Any]) -> Floats:
-    """A read-only view of numbers in C order: kernels are compiled once for all callers."""
+    """Return a read-only view of numbers in C order: kernels are compiled once for all callers."""
     flags = array.flags
     if flags.c_contiguous and not flags.writeable and array.dtype == np.float64:
         return array

@@ -122,7 +122,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """One or several paths as a list of texts; ValueError where there is none."""
+    """Return one or several paths as a list of texts; ValueError where there is none."""
     names = [paths] if isinstance(paths, str | PathLike) else list(paths)
     if not names:
         raise ValueError("no file was given")

@@ -17,7 +17,7 @@ from railfix.core.files import FilePath, write_whole
 
 
 def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
-    """Names that are close to a known one but not it, with that one.
+    """Return names that are close to a known one but not it, with that one.
 
     Examples
     --------

@@ -31,24 +31,24 @@ def reading_table(
 
 
 def number(value: float | None, digits: int = 2, unit: str = "", *, sign: str = "") -> str:
-    """A number with thousands separators; an en dash for NaN or None."""
+    """Return a number with thousands separators; an en dash for NaN or None."""
     if value is None or value != value:
         return "–"
     return f"{round(value, digits) + 0.0:{sign},.{digits}f}{unit}".replace("-", "−")
 
 
 def digits(places: int, value: float | None) -> str:
-    """A number without separators; blank for None."""
+    """Return a number without separators; blank for None."""
     return "" if value is None else f"{value:.{places}f}"
 
 
 def share(part: float | None, digits: int = 2) -> str:
-    """A share in per cent."""
+    """Return a share in per cent."""
     return "–" if part is None or part != part else f"{100.0 * part:.{digits}f} %"
 
 
 def percent(part: float | None) -> str:
-    """A share in per cent, for a column whose head has the sign."""
+    """Return a share in per cent, for a column whose head has the sign."""
     return share(part).removesuffix(" %")
 
 
@@ -77,7 +77,7 @@ class Table:
 def plain_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", *, texts: int = 1, boxed: bool = False
 ) -> Table:
-    """A table that is printed alone; all columns but the first `texts` are numbers."""
+    """Return a table that is printed alone; all columns but the first `texts` are numbers."""
     return Table(name="", head=head, rows=rows, caption=caption, numeric=range(texts, len(head)), boxed=boxed)
 
 
@@ -87,7 +87,7 @@ Column = tuple[str, str, Callable[[Any], str]]  #: Head, column and format of a 
 def listing(
     name: str, rows: pl.DataFrame, columns: Sequence[Column], caption: str = "", *, marked: Sequence[int] = ()
 ) -> Table:
-    """A table of rows of a frame; columns of other formats than `str` are numbers."""
+    """Return a table of rows of a frame; columns of other formats than `str` are numbers."""
     return Table(
         name=name,
         head=[head for head, _, _ in columns],
@@ -128,13 +128,13 @@ def html_list(lines: Sequence[str]) -> str:
 
 
 def median_text(values: Floats) -> str:
-    """Median of the finite values with two decimals; a dash without any."""
+    """Return the median of the finite values with two decimals; a dash without any."""
     finite = values[np.isfinite(values)]
     return f"{np.median(finite):.2f}" if finite.size else "-"
 
 
 def value_text(value: Any) -> str:
-    """One line about a value: arrays by shape, type and range, containers by length.
+    """Return one line about a value: arrays by shape, type and range, containers by length.
 
     >>> value_text(np.array([1.0, np.nan, 3.0]))
     'float64 (3), 1 to 3, 33 % NaN'
@@ -150,7 +150,7 @@ def value_text(value: Any) -> str:
 
 
 def time_span_text(time: Datetimes) -> str:
-    """First and last of times in order: ``2024-03-05 03:10:00 to 03:16:40``; empty without any."""
+    """Return the first and last of times in order: ``2024-03-05 03:10:00 to 03:16:40``; empty without any."""
     known = time[~np.isnat(time)]
     if not known.size:
         return ""
@@ -159,7 +159,7 @@ def time_span_text(time: Datetimes) -> str:
 
 
 def plural(number: int | Sized, noun: str) -> str:
-    """A count with its noun: ``1 epoch``, ``2,000 epochs``."""
+    """Return a count with its noun: ``1 epoch``, ``2,000 epochs``."""
     count = number if isinstance(number, int) else len(number)
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 

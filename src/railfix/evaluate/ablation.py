@@ -74,7 +74,7 @@ class Effect:
     normalised_p95: float = float("nan")
 
     def as_row(self) -> dict[str, Any]:
-        """Plain values for one row of a table, NaN as None."""
+        """Return the plain values for one row of a table, NaN as None."""
         row: dict[str, Any] = {name: getattr(self, name) for name in _OF_EFFECT}
         row["screens"], row["sources"] = " ".join(self.screens), " ".join(self.sources)
         for name in ("coordinates", "ok", "conventional", "outage"):
@@ -101,7 +101,7 @@ class Ablation:
 
 
 def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Choices of screens by name: all, none, each alone, all but each; equal choices once."""
+    """Return the choices of screens by name: all, none, each alone, all but each; equal choices once."""
     named = {ALL: tuple(screens), NONE: ()}
     named |= {f"only {name}": (name,) for name in screens}
     named |= {f"without {name}": tuple(other for other in screens if other != name) for name in screens}
@@ -110,7 +110,7 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Choices of the filter's sources by name: all that are there, all but each; codes are always used."""
+    """Return the choices of the filter's sources by name: all that are there, all but each; codes are always used."""
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {
@@ -119,7 +119,7 @@ def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[s
 
 
 def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Active screens that can work in this run, and one sentence on each that cannot."""
+    """Return the active screens that can work in this run, and one sentence on each that cannot."""
     setup = ScreenSetup(
         antennas=len(trajectories),
         spacing_known=all(t.body_chainage_m is not None for t in trajectories.values()),
@@ -217,7 +217,7 @@ def ablate_files(
 def _columns(
     result: AntennaResult, track: AlongTrack | None, reference: AntennaReference | None, trajectory: Trajectory
 ) -> dict[str, Floats]:
-    """Columns of one chunk of one antenna from which the effect is computed: of the filter where it runs."""
+    """Return the columns of one chunk of one antenna from which the effect is computed: of the filter where it runs."""
     counted = result.status != Status.NO_OBSERVATION
     without = ~counted
     if track is None:

@@ -294,7 +294,7 @@ def _row(evaluation: Evaluation, run: EvaluatedRun, name: str, kind: str) -> dic
 
 
 def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
-    """Time from the first epoch with observations to the first with a position [s]; None where there is none."""
+    """Return time from the first epoch with observations to the first with a position [s]; None where there is none."""
     observed, placed = (
         epochs.filter(mask)["time_gpst"].to_numpy() for mask in (pl.col("observed"), has_position(kind))
     )
@@ -302,12 +302,12 @@ def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
 
 
 def heads() -> tuple[list[str], list[str]]:
-    """Heads of the table that people read, and the performance feature of EN 16803-1 of each column."""
+    """Return the heads of the table that people read, and the performance feature of EN 16803-1 of each column."""
     return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
 
 
 def shown_rows(table: pl.DataFrame) -> list[list[str]]:
-    """Rows of the table that people read; "-" where a column has no value."""
+    """Return the rows of the table that people read; "-" where a column has no value."""
     return [
         [
             f"{row['case']}{' (held out)' if row['held_out'] else ''}",

@@ -62,7 +62,7 @@ class CaseFile(Settings):
     evaluation: EvaluationOptions = EvaluationOptions()
 
     def every_file(self) -> Iterator[Path]:
-        """Every file, as written."""
+        """Yield every file, as written."""
         yield from self.files.paths
         yield from (other.file for other in self.positions.values())
 

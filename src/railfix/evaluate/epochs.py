@@ -73,12 +73,12 @@ class AntennaEpochs:
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
-    """Names of the columns of protection levels."""
+    """Return the names of the columns of protection levels."""
     return [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
 
 
 def protection_columns(table: pl.DataFrame) -> list[str]:
-    """Names of the columns of protection levels, then of their parts, causes and statuses."""
+    """Return the names of the columns of protection levels, then of their parts, causes and statuses."""
     levels = level_columns(table)
     endings = [f"_protection_{name}" for name in (*PARTS, *STATED)]
     return levels + [name for name in table.columns if name.endswith(tuple(endings))]
@@ -226,19 +226,19 @@ def antenna_epochs(
 
 
 def _texts(table: pl.DataFrame, name: str, rows: Indices) -> pl.Series:
-    """A text column, null where the log has no epoch."""
+    """Return a text column, null where the log has no epoch."""
     texts = table[name].cast(pl.String)
     return pl.concat([texts, pl.Series([None], dtype=pl.String)])[rows]
 
 
 def _steps(values: Floats, known: Masks) -> Floats:
-    """Lengths of the steps between known positions: differences of chainage, or straight distances."""
+    """Return the lengths of the steps between known positions: differences of chainage, or straight distances."""
     step = np.diff(values[known], axis=0)
     return np.abs(step) if step.ndim == 1 else np.asarray(np.linalg.norm(step, axis=1))
 
 
 def _own_speed(time: Datetimes, step_m: Floats, known: Masks) -> Floats:
-    """Mean speed over the steps before and after each known position, shape (T,) [m/s]; NaN elsewhere."""
+    """Return the mean speed over the steps before and after each known position, shape (T,) [m/s]; NaN elsewhere."""
     speed = np.full(len(time), np.nan)
     at = np.flatnonzero(known)
     if len(at) < 2:
@@ -252,6 +252,6 @@ def _own_speed(time: Datetimes, step_m: Floats, known: Masks) -> Floats:
 
 
 def _environment(stated: Strings, sections: Sections | None, chainage_m: Floats) -> Strings:
-    """Environment that the reference states, else that of the sections."""
+    """Return the environment that the reference states, else that of the sections."""
     names = stated if sections is None else np.where(stated == "", sections.at(chainage_m), stated)
     return np.where(names == "", UNKNOWN, names)

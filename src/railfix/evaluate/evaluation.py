@@ -270,7 +270,7 @@ def reference_beside(run: RunFolder) -> Path:
 
 
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) -> list[str]:
-    """A name for the settings of each run: its preset and the settings that differ between the runs."""
+    """Return a name for the settings of each run: its preset and the settings that differ between the runs."""
     keys = dict.fromkeys(key for run_settings in settings for key in run_settings)
     differ = [
         key for key in keys if key != "preset" and len({str(run_settings.get(key)) for run_settings in settings}) > 1
@@ -297,7 +297,7 @@ def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
-    """Names of folders, with as many parent folders as are needed to tell different ones apart."""
+    """Return the names of folders, with as many parent folders as are needed to tell different ones apart."""
     parts = [path.resolve().parts for path in paths]
     depth = 1
     while len({part[-depth:] for part in parts}) < len(set(parts)):
@@ -318,7 +318,7 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Rows of each value of a column, then the same with both antennas as one; columns `as_one` have `ALL`."""
+    """Yield rows of each value of a column, then the same with both antennas as one; columns `as_one` have `ALL`."""
     for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
         for value in epochs[by].unique(maintain_order=True):
             yield epochs.filter(pl.col(by) == value).with_columns(pl.lit(ALL).alias(key) for key in keys)

@@ -246,12 +246,12 @@ def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.Data
 
 
 def edges_reached(value: pl.Expr, edges: Sequence[float]) -> pl.Expr:
-    """How many of the edges a value has reached."""
+    """Return how many of the edges a value has reached."""
     return pl.sum_horizontal((value >= float(edge)).cast(pl.Int64) for edge in edges)
 
 
 def _plain(value: pl.Expr) -> pl.Expr:
-    """A whole number without its decimals."""
+    """Return a whole number without its decimals."""
     return pl.when(value == value.round()).then(value.cast(pl.Int64).cast(pl.String)).otherwise(value.cast(pl.String))
 
 
@@ -268,7 +268,7 @@ def _satellite_names() -> list[str]:
 
 
 def has_position(position: str) -> pl.Expr:
-    """Whether an epoch has a position of one kind of `POSITIONS`."""
+    """Return whether an epoch has a position of one kind of `POSITIONS`."""
     if position == "conventional":
         return pl.col("conventional_positioned")
     if position == "constrained_ok":
@@ -277,7 +277,7 @@ def has_position(position: str) -> pl.Expr:
 
 
 def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
-    """Epochs with the columns ``has`` (a position) and ``error`` (where the reference is good) of one kind."""
+    """Return epochs with the columns ``has`` (a position) and ``error`` (where the reference is good) of one kind."""
     conventional = position == "conventional"
     column = "conventional_error_m" if conventional else "error_m"
     has = has_position(position)
@@ -315,7 +315,7 @@ def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options:
 
 
 def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
-    """The table of one grouping in the order of its groups, with the columns of `FIGURE_COLUMNS`."""
+    """Return the table of one grouping in the order of its groups, with the columns of `FIGURE_COLUMNS`."""
     rank, group = f"{grouping}_rank", f"{grouping}_group"
     words = [pl.col(name).cast(pl.String) for name in KEYS]
     named = table.with_columns(*words, grouping=pl.lit(grouping), group=pl.col(group).cast(pl.String))
@@ -323,12 +323,12 @@ def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
 
 
 def at_largest(column: str, by: str) -> pl.Expr:
-    """Value of a column where another is largest, the first of equals; null where that is null throughout."""
+    """Return value of a column where another is largest, the first of equals; null where that is null throughout."""
     return pl.col(column).get(pl.col(by).arg_max())
 
 
 def _figures() -> list[pl.Expr]:
-    """Every figure of a group of rows of `series`."""
+    """Return every figure of a group of rows of `series`."""
     error, size, has = pl.col("error"), pl.col("size"), pl.col("has")
     good = error.is_not_null()
     observed, positions = pl.col("observed").sum(), has.sum()
@@ -368,7 +368,7 @@ def _figures() -> list[pl.Expr]:
 def _with_limits(
     table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
 ) -> pl.DataFrame:
-    """The table with confidence limits, null where there are none."""
+    """Return the table with confidence limits, null where there are none."""
     schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
     if part is None:
         return table.with_columns(pl.lit(None, kind).alias(name) for name, kind in schema.items())

@@ -129,7 +129,7 @@ class RunFolder(RunRecord):
         return float(limit)
 
     def prefix_column(self, name: str) -> str:
-        """Name of a column of the positions in tables of several runs: levels are prefixed with their kind."""
+        """Return name of a column of the positions in tables of several runs: levels are prefixed with their kind."""
         return f"{self.level_kind}_{name}" if name.startswith("protection_") and self.level_kind else name
 
     @property
@@ -138,7 +138,7 @@ class RunFolder(RunRecord):
 
 
 def flat_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted name; lists as text."""
+    """Return the nested settings by dotted name; lists as text."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
@@ -150,7 +150,7 @@ def flat_settings(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
 
 
 def list_position_tables(path: Path) -> list[str]:
-    """Names of the tables of positions in the folder of a run, the single-epoch positions first."""
+    """Return the names of the tables of positions in the folder of a run, the single-epoch positions first."""
     return [name for name in TABLES if any((path / f"{name}{end}").is_file() for end in _ENDINGS)]
 
 
@@ -227,7 +227,7 @@ def _table(file: Path, columns: cs.Selector | None) -> pl.DataFrame:
 
 
 def floats(table: pl.DataFrame, name: str) -> Floats:
-    """A column as numbers, NaN where it is null or the table has no such column."""
+    """Return a column as numbers, NaN where it is null or the table has no such column."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     return table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
@@ -242,7 +242,7 @@ WINDOWS_S: Final = (15.0, 60.0)
 
 
 def _rising(edges: tuple[float, ...]) -> tuple[float, ...]:
-    """The edges themselves; ValueError where they do not rise."""
+    """Return the edges themselves; ValueError where they do not rise."""
     if any(high <= low for low, high in pairwise(edges)):
         raise ValueError("rising numbers expected")
     return edges
@@ -339,7 +339,7 @@ class Sections:
     environment: tuple[str, ...]
 
     def at(self, chainage_m: Floats) -> Strings:
-        """Environment at chainages, shape (T,); blank outside every section and for NaN."""
+        """Return the environment at chainages, shape (T,); blank outside every section and for NaN."""
         words = np.array([*self.environment, ""])
         index = np.searchsorted(self.from_m, chainage_m, side="right") - 1
         safe = np.maximum(index, 0)

@@ -100,7 +100,7 @@ class Integrity:
 
 
 def level_name(kind: str) -> str:
-    """Column of the levels of a kind in the table of epochs."""
+    """Return the column of the levels of a kind in the table of epochs."""
     return f"{kind}_protection_level_m"
 
 
@@ -132,7 +132,7 @@ def epochs_diagram(
 
 
 def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
-    """Errors and levels as counted of epochs inside the reference, NaN where there is none."""
+    """Return the errors and levels as counted of epochs inside the reference, NaN where there is none."""
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
     level = effective_levels(
@@ -192,7 +192,7 @@ def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: Evalu
 def _count(
     part: pl.DataFrame, of_run: Level, limits: Sequence[float], options: EvaluationOptions
 ) -> Iterator[dict[str, Any]]:
-    """Counts of one antenna of a run: all epochs, then by environment."""
+    """Yield the counts of one antenna of a run: all epochs, then by environment."""
     kind, own_limit = of_run
     keys = dict(zip(KEYS, part.select(KEYS).row(0), strict=True))
     part = part.filter("in_reference")
@@ -231,7 +231,7 @@ def _count(
 
 
 def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
-    """Rows with their sums over both antennas and over all runs of a configuration; with shares."""
+    """Return rows with their sums over both antennas and over all runs of a configuration; with shares."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:
         parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))
@@ -256,7 +256,7 @@ def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
 
 
 def _beyond(epochs: pl.DataFrame, runs: Sequence[str], kind: str) -> pl.DataFrame:
-    """Epochs of some runs whose error exceeds a finite level, the largest excess first."""
+    """Return the epochs of some runs whose error exceeds a finite level, the largest excess first."""
     level = pl.col(level_name(kind))
     columns = {name: f"{kind}_protection_{name}" for name in (*PARTS, *STATED)}
     absent = [name for name in columns.values() if name not in epochs.columns]

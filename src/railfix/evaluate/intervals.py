@@ -167,7 +167,7 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
 
 
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Stated probability against the share of right places, by class; None without a table of the filter."""
+    """Return the stated probability against the share of right places, by class; None without a table of the filter."""
     filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None
@@ -306,7 +306,7 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
 
 
 def _epochs(folder: Path, run: RunFolder, number: int) -> pl.DataFrame:
-    """Epochs of one run with their chainage, of its single epochs and of the filter where it has one."""
+    """Return the epochs of one run with their chainage, of its single epochs and of the filter where it has one."""
     single = run.positions.select(
         "time_gpst", "antenna", "chainage_m", pl.col("status").cast(pl.String),
         *(pl.col(name).cast(pl.Float64) for name in _POSITION_COLUMNS),

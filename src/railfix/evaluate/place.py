@@ -37,7 +37,7 @@ class Bracket:
     inside: Masks  #: False before the first, after the last, and in gaps of the reference; shape (T,).
 
     def of(self, values: Floats) -> Floats:
-        """Values of the reference, shape (R,) or (R, n), interpolated linearly; NaN where not inside."""
+        """Return the values of the reference, shape (R,) or (R, n), interpolated linearly; NaN where not inside."""
         across = (-1, *(1,) * (values.ndim - 1))
         between = values[self.left] + self.share.reshape(across) * (values[self.right] - values[self.left])
         return np.where(self.inside.reshape(across), between, np.nan)
@@ -71,7 +71,7 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
 def interpolate_reference(
     time: Datetimes, reference_time: Datetimes, reference_ecef_m: Floats, *, largest_gap_s: float = LARGEST_GAP_S
 ) -> Floats:
-    """Reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
+    """Return the reference positions, shape (R, 3), linearly at other times, shape (T, 3) [m]; NaN outside and in gaps.
 
     Times of the reference rise; steps longer than `largest_gap_s` are not bridged.
     """
@@ -276,7 +276,7 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
 
 
 def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
-    """Arc lengths at chainages, tolerating rounding at the ends of the line."""
+    """Return the arc lengths at chainages, tolerating rounding at the ends of the line."""
     first, last = trajectory.chainage_m[0], trajectory.chainage_m[-1]
     near = (chainage_m > first - _ROUNDING_M) & (chainage_m < last + _ROUNDING_M)
     return trajectory.arc_at_chainage(np.where(near, np.clip(chainage_m, first, last), chainage_m))
@@ -319,7 +319,7 @@ def find_trajectory(
 
 
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
-    """Options for reading the track: those given; else those of the file, then those in ``run.json``."""
+    """Return options for reading the track: those given; else those of the file, then those in ``run.json``."""
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(given):
         return [given]

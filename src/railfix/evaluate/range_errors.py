@@ -84,7 +84,7 @@ class StationErrors:
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
-        """Errors at other times, interpolated linearly, shape (T, K) [m]; NaN where the station sees nothing."""
+        """Return errors at other times, interpolated linearly, shape (T, K) [m]; NaN where the station sees nothing."""
         column = {name: i for i, name in enumerate(self.satellite.tolist())}
         known = [k for k, name in enumerate(satellite.tolist()) if name in column]
         result = np.full((len(time), len(satellite)), np.nan)
@@ -160,7 +160,7 @@ def range_errors(
     *,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Pseudorange errors of one antenna over one chunk of T epochs, in blocks of `block_s`.
+    """Return the pseudorange errors of one antenna over one chunk of T epochs, in blocks of `block_s`.
 
     The clock of each constellation is the robust mean of the ranges that passed the screens. Each range contributes to
     its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An error common to all
@@ -219,7 +219,7 @@ def range_errors(
 
 
 def _level_sigma_m(result: AntennaResult) -> Floats:
-    """Standard deviation of each range in the protection level of the run, shape (T, K) [m]."""
+    """Return the standard deviation of each range in the protection level of the run, shape (T, K) [m]."""
     columns = result.columns
     stated = result.sigma_m[:, columns] * np.maximum(result.noise_scale, 1.0)[:, None]
     return np.asarray(np.fmax(stated, result.bound_sigma_m[:, columns]))
@@ -266,7 +266,7 @@ class _RunErrors:
 def error_model_from_runs(
     inputs: Sequence[ModelInputs], *, fit: ErrorModelFit | None = None
 ) -> tuple[ErrorModel, ErrorSamples]:
-    """Error model of the pseudoranges of several runs, before and after the screens, and its samples.
+    """Return the error model of the pseudoranges of several runs, before and after the screens, and its samples.
 
     Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the verdict of
     every screen. All runs have a reference station, or none has.
@@ -312,7 +312,7 @@ def error_model_from_runs(
 
 
 def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
-    """Range errors of one run, chunk by chunk."""
+    """Return the range errors of one run, chunk by chunk."""
     past = read_record(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)

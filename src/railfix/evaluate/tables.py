@@ -47,7 +47,7 @@ _AVAILABLE: Final = (
 
 
 def _text(value: str) -> str:
-    """A text of numbers, in a column of numbers."""
+    """Return a text of numbers, in a column of numbers."""
     return value
 
 
@@ -150,7 +150,7 @@ def select_evaluation(evaluation: Evaluation, name: str) -> Evaluation:
 
 
 def error_tables(evaluation: Evaluation) -> list[Table]:
-    """Tables of errors: overall, confidence limits, intervals, outages and stated probabilities."""
+    """Return the tables of errors: overall, confidence limits, intervals, outages and stated probabilities."""
     overall, options = _together(evaluation.figures.filter(grouping="all")), evaluation.options
     paths = [run.path for run in evaluation.runs]
     again = [run.name for k, run in enumerate(evaluation.runs) if run.path in paths[:k]]
@@ -179,7 +179,7 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def group_tables(evaluation: Evaluation) -> list[Table]:
-    """Errors by configuration, line, environment, speed and so on, on the map beside conventional."""
+    """Return errors by configuration, line, environment, speed and so on, on the map beside conventional."""
     tables, runs = [], evaluation.runs
     apart = len({run.configuration for run in runs}) == len(runs)
     for grouping, caption in _GROUPINGS.items():
@@ -215,7 +215,7 @@ def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
 
 
 def outages(rows: pl.DataFrame) -> Table:
-    """Table of stretches without satellites."""
+    """Return the table of stretches without satellites."""
     shown = rows.with_columns(
         _OF,
         pl.col("begin_gpst").dt.strftime("%H:%M:%S"),
@@ -227,7 +227,7 @@ def outages(rows: pl.DataFrame) -> Table:
 
 
 def _where(rows: pl.DataFrame) -> list[Column]:
-    """Columns of the run and antenna; rows of one run do not name it."""
+    """Return the columns of the run and antenna; rows of one run do not name it."""
     antenna: Column = ("antenna", "antenna", str)
     return [antenna] if rows["run"].n_unique() == 1 and "all" not in rows["run"] else [("run", "of", str), antenna]
 
@@ -246,7 +246,7 @@ def _together(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
-    """Rows of each run and antenna, those on common epochs only where they are not every one's own."""
+    """Return the rows of each run and antenna, those on common epochs only where they are not every one's own."""
     order = {name: number for number, name in enumerate(_NAMES)}
     parts: Iterator[pl.DataFrame] = (
         mine.filter(epochs_of="own")
@@ -268,7 +268,7 @@ def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _range(low: str, high: str, scale: float = 1.0) -> pl.Expr:
-    """Both ends of an interval as a text."""
+    """Return both ends of an interval as a text."""
     ends = (pl.col(name).mul(scale).map_elements(number, return_dtype=pl.String) for name in (low, high))
     return pl.concat_str(*ends, separator=" to ")
 
@@ -290,7 +290,7 @@ def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
 
 
 def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Table:
-    """Epochs of each region of the Stanford diagram; rows at the run's own alarm limit are marked."""
+    """Return the epochs of each region of the Stanford diagram; rows at the run's own alarm limit are marked."""
     own = rows["own_limit"].to_list()
     limits = [f"{limit:g}{' (own)' if its else ''}" for limit, its in zip(rows["alarm_limit_m"], own, strict=True)]
     shown = rows.with_columns(_OF, pl.Series("limit", limits, dtype=pl.String))
@@ -301,7 +301,7 @@ def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Ta
 
 
 def _beyond(found: Integrity, kind: str, worst: int) -> Table:
-    """The epochs whose error exceeds the level most."""
+    """Return the epochs whose error exceeds the level most."""
     beyond, usable = found.beyond, int(found.beyond["usable"].sum())
     parts = [pl.col(f"{kind}_{part}").map_elements(partial(number, digits=1), return_dtype=pl.String, skip_nulls=False)
              for part in ("fault_free_m", "one_fault_m", "two_faults_m")]  # fmt: skip
@@ -361,7 +361,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
 
 
 def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str, str]]]:
-    """All tables but that of epochs, by name, with the meaning of their columns."""
+    """Return all tables but that of epochs, by name, with the meaning of their columns."""
     tables: dict[str, tuple[pl.DataFrame | None, Mapping[str, str]]] = {
         "figures": (evaluation.figures, FIGURE_COLUMNS),
         "intervals": (evaluation.intervals, INTERVAL_COLUMNS),
@@ -400,7 +400,7 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _rows(table: pl.DataFrame) -> list[dict[str, Any]]:
-    """Rows as plain values, times as ISO text to the nanosecond."""
+    """Return rows as plain values, times as ISO text to the nanosecond."""
     times = [name for name, kind in table.schema.items() if kind == pl.Datetime("ns")]
     numbers = [name for name, kind in table.schema.items() if kind == pl.Float64]
     plain = table.with_columns(pl.col(times).dt.to_string("%Y-%m-%dT%H:%M:%S%.9f"), pl.col(numbers).fill_nan(None))

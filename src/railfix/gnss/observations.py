@@ -25,7 +25,7 @@ from railfix.core.timescale import gps_time
 def carrier_frequency_hz(
     satellite: Strings, signal: Strings, glonass_channel: Mapping[str, int] | None = None
 ) -> Floats:
-    """Carrier frequency of each channel, shape (M,) [Hz].
+    """Return the carrier frequency of each channel, shape (M,) [Hz].
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def carrier_frequency_hz(
 
 
 def frequency_by_name_hz(name: Strings, glonass_channel: Floats) -> Floats:
-    """Carrier frequency [Hz] of signals ("G1C") and GLONASS channels, shape (..., M); NaN where unknown."""
+    """Return the carrier frequency [Hz] of signals ("G1C") and GLONASS channels, shape (..., M); NaN where unknown."""
     frequency = np.full(glonass_channel.shape, np.nan)
     for text in np.unique(name).tolist():
         letter, band = text[:1], text[1:2]

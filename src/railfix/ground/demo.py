@@ -125,7 +125,7 @@ TIME = np.datetime64("2024-03-05T00:00:00", "ns")
 
 
 def points_ecef_m() -> Floats:
-    """Known points of the receivers, shape (3, 3) [m]."""
+    """Return the known points of the receivers, shape (3, 3) [m]."""
     return ecef_from_geodetic(35.7, 139.7, 100.0) + PLAN_M @ enu_axes(35.7, 139.7)[:2]
 
 
@@ -307,7 +307,7 @@ async def run_demo(
 
 
 async def _relays(centre: CentreLinks, seed: int) -> dict[tuple[int, LinkName], Relay]:
-    """Disturbed ways to the centre, by train and bearer."""
+    """Return the disturbed ways to the centre, by train and bearer."""
     relays = {}
     for number in (1, 2):
         for k, bearer in enumerate(BEARERS):

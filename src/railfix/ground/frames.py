@@ -110,7 +110,7 @@ class _Seen:
     ahead: int = -1
 
     def is_alone(self, sequence: int, jump: int) -> bool:
-        """Whether a number is far ahead of the newest, and does not go on from one that was."""
+        """Return whether a number is far ahead of the newest, and does not go on from one that was."""
         if self.newest < 0 or sequence <= self.newest + jump:
             self.ahead = -1
             return False

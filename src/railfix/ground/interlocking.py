@@ -81,11 +81,11 @@ class TrainInterval:
         return low, high
 
     def overlaps(self, low_m: float, high_m: float) -> bool:
-        """Whether some chainage between two is occupied."""
+        """Return whether some chainage between two is occupied."""
         return self.span_m[0] < high_m and low_m < self.span_m[1]
 
     def has_passed(self, low_m: float, high_m: float) -> bool:
-        """Whether the rear end is beyond what lies between two chainages, in running direction."""
+        """Return whether the rear end is beyond what lies between two chainages, in running direction."""
         return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
 
 

@@ -88,23 +88,23 @@ class Layout(Settings):
         return {name: 2 * k + 1 for k, name in enumerate(names)} | between
 
     def block_m(self, block: int) -> tuple[float, float]:
-        """Chainages of a block of `sections`, lower first [m]."""
+        """Return the chainages of a block of `sections`, lower first [m]."""
         return self._borders_m[block - 1], self._borders_m[block]
 
     def zone_m(self, point: PointName) -> tuple[float, float]:
-        """Chainages of points, lower first [m]."""
+        """Return the chainages of points, lower first [m]."""
         station = self.stations[point[0]]
         if point[1] < 0:
             return station.begin_m, station.inner_m[0]
         return station.inner_m[1], station.end_m
 
     def track_end_m(self, station: int, direction: int) -> float:
-        """Chainage where the tracks of a station end for a train that runs in a direction [m]."""
+        """Return the chainage where the tracks of a station end for a train that runs in a direction [m]."""
         first, last = self.stations[station].inner_m
         return last if direction > 0 else first
 
     def points(self) -> Iterator[PointName]:
-        """All points; the outer ones of the first and the last station do not exist."""
+        """Return all points; the outer ones of the first and the last station do not exist."""
         return self.points_between(-math.inf, math.inf)
 
     def pieces(self, from_m: float, to_m: float, tracks: Mapping[int, int]) -> list[Piece]:
@@ -206,7 +206,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
 
 
 def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats], begin_m: float) -> LoopStation:
-    """The station of two tracks, track 1 first, from a chainage on."""
+    """Return the station of two tracks, track 1 first, from a chainage on."""
     if abs(lengths_m[0] - lengths_m[1]) > LENGTHS_M:
         raise MismatchError(
             f"tracks {names[0]} and {names[1]} are {lengths_m[0]:.0f} and {lengths_m[1]:.0f} m long; at most "

@@ -80,7 +80,7 @@ class TriangleInputs(Settings):
     limits: TriangleLimits = TriangleLimits()
 
     def points_ecef_m(self) -> Floats:
-        """Known points, shape (3, 3) [m]."""
+        """Return the known points, shape (3, 3) [m]."""
         return ecef_from_geodetic(*np.array(self.points).T)
 
 
@@ -269,7 +269,7 @@ async def run_centre(
 def _centre(
     settings: CentreFile, keys: Path, store: Store, points: SimulatedPoints
 ) -> tuple[ControlCentre, CentreLinks]:
-    """The centre as its store has it, and its links, each of which hands over to the other."""
+    """Return the centre as its store has it, and its links, each of which hands over to the other."""
     supervision = Supervision(
         layout=settings.layout,
         state=at_start(settings.layout, settings.intervals()),
@@ -298,7 +298,7 @@ def _centre(
 
 
 def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
-    """When each train was heard last over each bearer, as the page shows it."""
+    """Return when each train was heard last over each bearer, as the page shows it."""
     now = time.monotonic()
     return [
         {"train": n, "bearer": bearer, "rate": None, "misses": None, "round_trip_ms": None,

@@ -224,7 +224,7 @@ class StationStreams:
 async def stream_fixes(
     sources: Sequence[str], points_ecef_m: Floats, *, navigation: Navigation | None = None
 ) -> AsyncIterator[StationFixes]:
-    """Fixes of one epoch at a time, until every source has ended.
+    """Yield the fixes of one epoch at a time, until every source has ended.
 
     The sources are as of ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files), and RINEX
     files too. InputFileError: when a source cannot be opened, or breaks and is not opened again.

@@ -48,7 +48,7 @@ WRONG_PLACE: Final = ("the bounds of the place are wider", "the train has moved"
 
 
 def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
-    """Whether the safe rear end may follow a report: the train is complete and has its configured length."""
+    """Return whether the safe rear end may follow a report: the train is complete and has its configured length."""
     return message.complete and abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M
 
 

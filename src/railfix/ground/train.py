@@ -165,7 +165,7 @@ class OnBoard:
         return True
 
     def acknowledgement(self) -> dict[str, int]:
-        """What a report says of the authority that the train holds: nothing before the first."""
+        """Return what a report says of the authority that the train holds: nothing before the first."""
         if self.number < 0:
             return {}
         end_cm = self.direction * math.ceil(self.direction * self.end_m * 100.0)
@@ -238,7 +238,7 @@ async def run_train(
 
 
 def is_complete(path: Path) -> bool:
-    """Whether the train's integrity device has written "complete" in the last `INTEGRITY_S`.
+    """Return whether the train's integrity device has written "complete" in the last `INTEGRITY_S`.
 
     A file that is absent, unreadable, older, from the future or says anything else is no confirmation.
     """
@@ -325,7 +325,7 @@ class _Desk:
 
 
 async def _standard_input() -> AsyncIterator[str]:
-    """Lines as they come; a reader that waits does not hold the end of the program up."""
+    """Yield lines as they come; a reader that waits does not hold the end of the program up."""
     kind = os.fstat(sys.stdin.fileno()).st_mode
     if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # a file has all its lines
         for line in sys.stdin:

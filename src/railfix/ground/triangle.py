@@ -75,7 +75,7 @@ class TriangleLimits(Settings):
 def limits_for_false_stops(
     sigma_m: float, own_sigma_m: float, *, stops_per_year: float, independent_s: float = 100.0
 ) -> TriangleLimits:
-    """Limits that give a rate of false stops a year.
+    """Return the limits that give a rate of false stops a year.
 
     The length of a horizontal error of standard deviation sigma an axis is Rayleigh distributed:
     ``P(e > R) = exp(-R^2 / (2 sigma^2))``. Half of the false stops are allotted to the three circles, half to the
@@ -316,7 +316,7 @@ class MonitoredLog:
     orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:
-        """One row an epoch: verdict, receiver, errors of the fixes and of the sides."""
+        """Return one row an epoch: verdict, receiver, errors of the fixes and of the sides."""
         triangle = self.triangle
         columns: dict[str, object] = {
             "time_gpst": self.fixes.time,

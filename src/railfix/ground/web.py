@@ -79,7 +79,7 @@ class Sessions:
         self._ends.pop(token, None)
 
     def valid(self, token: str) -> bool:
-        """Whether a session is open; it is prolonged."""
+        """Return whether a session is open; it is prolonged."""
         now = self.clock()
         if self._ends.get(token, -1.0) <= now:
             return False
@@ -96,7 +96,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     newest: tuple[float, str, bool] | None = None
 
     def snapshot_text() -> tuple[str, bool]:
-        """The snapshot as JSON, and whether it is the last: made once for all who read within `EVENT_S`."""
+        """Return the snapshot as JSON, and whether it is the last: made once for all who read within `EVENT_S`."""
         nonlocal newest
         now = time.monotonic()
         if newest is None or now - newest[0] >= 0.9 * EVENT_S:

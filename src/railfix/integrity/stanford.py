@@ -141,7 +141,7 @@ def _nanoseconds(value_s: float) -> np.timedelta64:
 
 
 def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuity:
-    """Windows ``[t, t + window]`` from each available epoch; a gap in the times breaks one."""
+    """Return windows ``[t, t + window]`` from each available epoch; a gap in the times breaks one."""
     if len(time) < 2:
         return Continuity(window_s=window_s, windows=0, kept=0, probability=np.nan)
     step = np.diff(time)

@@ -61,7 +61,7 @@ _UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not know
 
 
 def observations_to_xarray(observations: Observations) -> xr.Dataset:
-    """Observations as a dataset in the layout of georinex.
+    """Return observations as a dataset in the layout of georinex.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
 
 
 def observations_from_xarray(data: xr.Dataset) -> Observations:
-    """Observations of a dataset in the layout of georinex.
+    """Return the observations of a dataset in the layout of georinex.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
 
 
 def _gps_time(data: xr.Dataset) -> Datetimes:
-    """Times of an observation dataset in GPS time."""
+    """Return the times of an observation dataset in GPS time."""
     time: Datetimes = np.asarray(data["time"].values, dtype="datetime64[ns]")
     system = str(data.attrs.get("time_system", "GPS"))
     if system in ("GLO", "UTC"):
@@ -209,7 +209,7 @@ def _observation_header(data: xr.Dataset, satellite: Strings, signal: Strings, v
 
 
 def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
-    """Navigation records as a dataset in the layout of georinex.
+    """Return the navigation records as a dataset in the layout of georinex.
 
     Parameters
     ----------
@@ -260,7 +260,7 @@ def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
 
 
 def navigation_from_xarray(data: xr.Dataset) -> Navigation:
-    """Navigation records of a dataset in the layout of georinex.
+    """Return the navigation records of a dataset in the layout of georinex.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ def navigation_from_xarray(data: xr.Dataset) -> Navigation:
 
 
 def _number(values: dict[str, Floats], name: str, row: int, column: int) -> float:
-    """One number of a record in the unit of the file; NaN where absent or written as unknown."""
+    """Return one number of a record in the unit of the file; NaN where absent or written as unknown."""
     value = float(values[name][row, column]) if name in values else np.nan
     value = np.nan if _UNKNOWN < abs(value) < 1.01e9 else value
     return value / 1e3 if name in _KILOMETRES else value

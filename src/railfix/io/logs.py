@@ -146,7 +146,7 @@ def _mate_pieces(
     limits: tuple[np.datetime64 | None, np.datetime64 | None],
     epochs: int,
 ) -> Iterator[Observations]:
-    """Tables S_GNSS_SAT of EGNSS MATE in order of time, in pieces."""
+    """Return the tables S_GNSS_SAT of EGNSS MATE in order of time, in pieces."""
     if others := [path for path in paths if mate_table(path) != "S_GNSS_SAT"]:
         raise MismatchError(f"{others[0]} is no table S_GNSS_SAT as the others; give files of one kind for one antenna")
     tables = sorted((read_mate_observations(path) for path in paths), key=lambda part: part.time[0])
@@ -166,7 +166,7 @@ def _receiver_runs(
     limits: tuple[np.datetime64 | None, np.datetime64 | None, np.datetime64 | None],
     progress: Callable[[float], None] | None,
 ) -> Iterator[Observations]:
-    """Blocks of all receiver logs in order of time, cut to constellations and times wanted."""
+    """Yield the blocks of all receiver logs in order of time, cut to constellations and times wanted."""
     from railfix.io.receiver.log import scan_receiver_log
 
     start, end, date = limits
@@ -202,12 +202,12 @@ def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
 
 
 def _of_systems(run: Observations, letters: list[str] | None) -> Observations:
-    """Observations of some constellations, of all for None."""
+    """Return the observations of some constellations, of all for None."""
     return run if letters is None else without_empty_channels(of_channels(run, np.isin(run.system, letters)))
 
 
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:
-    """Navigation records from RINEX navigation files and receiver logs, mixed at will.
+    """Return the navigation records from RINEX navigation files and receiver logs, mixed at will.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
 
 def _join(parts: list[Navigation]) -> Navigation:
-    """Records of several sources; ionosphere and leap seconds of the first that has them."""
+    """Return the records of several sources; ionosphere and leap seconds of the first that has them."""
     return Navigation(
         kepler=join_rows([part.kepler for part in parts]),
         glonass=join_rows([part.glonass for part in parts]),

@@ -177,7 +177,7 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
 def _as_arrays(
     table: pl.DataFrame, time_ns: np.ndarray, problems: tuple[str, ...], skipped: Counter[str]
 ) -> Observations:
-    """Arrays of epochs by channels; of two rows of one signal at one epoch the last."""
+    """Return the arrays of epochs by channels; of two rows of one signal at one epoch the last."""
     times, row = np.unique(time_ns, return_inverse=True)
     names = table["SAT_ID"] + table["code"]
     channels, column = np.unique(names.to_numpy().astype(np.str_), return_inverse=True)

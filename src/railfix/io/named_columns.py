@@ -67,7 +67,7 @@ class NamedColumns:
 
 
 def fails(parse: Callable[[Any], object], text: object) -> bool:
-    """Whether parsing a text raises ValueError."""
+    """Return whether parsing a text raises ValueError."""
     try:
         parse(text)
     except ValueError:
@@ -126,7 +126,7 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
 
 
 def _compact(rows: list[list[str]], width: int) -> pl.DataFrame:
-    """Rows of cells as columns of text."""
+    """Return the rows of cells as columns of text."""
     return pl.DataFrame([pl.Series(str(i), [row[i] for row in rows], dtype=pl.String) for i in range(width)])
 
 

@@ -114,7 +114,7 @@ class MessageError(InputFileError):
 
 
 def encode(message: TrainMessage) -> bytes:
-    """CBOR of a message, always the same bytes for the same message; absent fields are left out."""
+    """Return CBOR of a message, always the same bytes for the same message; absent fields are left out."""
     import cbor2
 
     values = {KEYS[name]: value for name, value in message.model_dump(mode="json").items() if value is not None}
@@ -147,7 +147,7 @@ def decode(data: bytes) -> TrainMessage:
 
 
 def _entries(data: bytes) -> int:
-    """Number of entries in the head of a CBOR map (RFC 8949, 3.1); -1 without a length."""
+    """Return the number of entries in the head of a CBOR map (RFC 8949, 3.1); -1 without a length."""
     size = data[0] & 0x1F
     return size if size < 24 else int.from_bytes(data[1 : 1 + (1 << (size - 24))], "big") if size < 28 else -1
 
@@ -163,7 +163,7 @@ def validate_message(kind: type[Model], values: dict[str, Any]) -> Model:
 
 
 def to_json(message: TrainMessage) -> str:
-    """One line of JSON with the names of the fields; statuses and sources in words."""
+    """Return one line of JSON with the names of the fields; statuses and sources in words."""
     values = message.model_dump()
     values["status"] = message.status.name.lower()
     values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]
@@ -173,7 +173,7 @@ def to_json(message: TrainMessage) -> str:
 
 
 def from_json(line: str) -> TrainMessage:
-    """A message from its line of JSON; MessageError as `decode`."""
+    """Return a message from its line of JSON; MessageError as `decode`."""
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):

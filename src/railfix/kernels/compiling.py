@@ -255,7 +255,7 @@ class _CodeOnDisk(FunctionCache):
 
 
 def _is_left(function: Callable[..., Any]) -> bool:
-    """Whether a function stays plain Python, in the process that compiles the filter alone."""
+    """Return whether a function stays plain Python, in the process that compiles the filter alone."""
     shared = ("railfix.kernels.tracking", "railfix.kernels.sight")
     return FILTER_ALONE in os.environ and not function.__module__.startswith(shared)
 

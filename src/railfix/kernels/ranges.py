@@ -317,7 +317,7 @@ def _form(system: Floats, a: Floats, b: Floats) -> float:
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
 ) -> tuple[float, float, float, float]:
-    """Step, sigma, sigma of an exact map and least WSSE along a section, map error allowed for.
+    """Return the step, sigma, sigma of an exact map and least WSSE along a section, map error allowed for.
 
     The Schur complement of the map error leaves what depends on the distance along the line alone.
     """

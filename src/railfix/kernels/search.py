@@ -176,7 +176,7 @@ def points_in_balls(
 
 @inner
 def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
-    """Least q on the two sections that meet at a point, by its quadratic form."""
+    """Return the least q on the two sections that meet at a point, by its quadratic form."""
     floor = q
     for side in range(2):
         section, sign = vertex - side, 1.0 - 2.0 * side

@@ -36,7 +36,7 @@ STAGES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
-    """Digests of the stages and the message of each output."""
+    """Return the digests of the stages and the message of each output."""
     return [
         {
             **{
@@ -84,7 +84,7 @@ def _second_channel(
 
 
 def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
-    """The method of the engine, carried out in this channel and then in the second."""
+    """Return the method of the engine, carried out in this channel and then in the second."""
 
     @wraps(method)
     def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:

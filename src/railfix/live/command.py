@@ -88,7 +88,7 @@ _REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
 def _files_read(inputs: LiveInputs) -> list[Path]:
-    """Every file that the session reads."""
+    """Return every file that the session reads."""
     sources = [*inputs.sources.values(), *inputs.sensors.values()]
     logs = [Path(source.removeprefix("file:")) for source in sources if is_file(source)]
     parameters = [] if inputs.reading.jgd_parameters is None else [inputs.reading.jgd_parameters]
@@ -254,7 +254,7 @@ def _close(outlet: Outlet[Any], log: SessionLog) -> None:
 
 
 def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:
-    """The line, and the epoch processor with everything known from the start."""
+    """Return the line, and the epoch processor with everything known from the start."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
         raise SettingsError(

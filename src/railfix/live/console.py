@@ -195,7 +195,7 @@ class Metrics:
             self._sent = now
 
     def text(self) -> str:
-        """The metrics in the text format of Prometheus (version 0.0.4)."""
+        """Return the metrics in the text format of Prometheus (version 0.0.4)."""
         lines = _counter("railfix_messages_total", "status", {s.name.lower(): self.messages[s] for s in MessageStatus})
         lines += _counter("railfix_epochs_total", "fate", self.epochs)
         lines += _counter("railfix_skipped_total", "what", self.skipped)
@@ -214,7 +214,7 @@ class Metrics:
         return "\n".join(lines) + "\n"
 
     def summary(self) -> list[str]:
-        """What happened, a line each, for the end of the session."""
+        """Return what happened, a line each, for the end of the session."""
         lines = [f"{sum(self.messages.values()):,} messages"]
         lines += [f"  {status.name.lower()}: {number:,}" for status, number in sorted(self.messages.items())]
         lines += [f"epochs {fate}: {number:,}" for fate, number in sorted(self.epochs.items())]
@@ -375,7 +375,7 @@ def _times(time_ns: list[int]) -> Datetimes:
 
 
 def _join(parts: list[SensorSamples]) -> SensorSamples:
-    """All parts as one, neighbours first: each sample is copied a few times, not once a part."""
+    """Return all parts as one, neighbours first: each sample is copied a few times, not once a part."""
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [early.merge(late) for early, late in pairs] + parts[len(parts) // 2 * 2 :]

@@ -68,7 +68,7 @@ class _FromSatellites:
     base: Observations | None = None
 
     def with_later(self, later: _FromSatellites) -> _FromSatellites:
-        """Both together."""
+        """Return both together."""
         navigation, messages = self.navigation, self.messages
         if later.navigation is not None:
             navigation = later.navigation if navigation is None else merge_navigation(navigation, later.navigation)
@@ -160,7 +160,7 @@ class LiveEngine:
             self._samples = self._samples.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
-        """Sensors that have not been heard up to an epoch."""
+        """Return sensors that have not been heard up to an epoch."""
         time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
         return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
 
@@ -182,7 +182,7 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """What a restarted session continues from; `reserved` numbers of messages are left out for a crash."""
+        """Return what a restarted session continues from; `reserved` numbers of messages are left out for a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has come to continue from it
             return replace(self._saved, sequence=sequence)
@@ -279,7 +279,7 @@ class LiveEngine:
             self._waiting[name].clear()
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Messages that are due: of complete pairs, of epochs that waited long enough, of periods without input.
+        """Return messages that are due: of complete pairs, of epochs that waited long enough, of periods without input.
 
         `now_ns` is of the clock that `push` was given, `sent_ns` the GPS time of sending for the message; then one
         message goes out a period, that of the newest epoch. Without it (recorded epochs, the clock is that of their
@@ -304,7 +304,7 @@ class LiveEngine:
         return numbered
 
     def _patience_ns(self) -> int:
-        """Longest time without a message: half a period more than one after an epoch, then one period."""
+        """Return the longest time without a message: half a period more than one after an epoch, then one period."""
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
@@ -331,18 +331,18 @@ class LiveEngine:
         return [replace(self._send(newest, sent_ns), part="message")]
 
     def _send(self, output: LiveOutput, sent_ns: int) -> LiveOutput:
-        """An output with the next sequence number and the time of sending."""
+        """Return an output with the next sequence number and the time of sending."""
         self._sequence += 1
         return replace(output, message=output.message.replaced(sequence=self._sequence, sent_ns=sent_ns))
 
     @staticmethod
     def _get_tag(output: LiveOutput) -> int:
-        """Time tag of the newest epoch of an output."""
+        """Return the time tag of the newest epoch of an output."""
         assert output.result is not None
         return max(int((a.time[-1] - GPS_EPOCH).astype(np.int64)) for a in output.result.antennas.values())
 
     def wait_s(self, *, now_ns: int) -> float:
-        """Time after which `poll` has to be called again, if nothing arrives before [s]."""
+        """Return the time after which `poll` has to be called again, if nothing arrives before [s]."""
         times = [self.settings.period_s]
         if self._due_ns is not None:
             longest = self._patience_ns() if self._pending is None else self._period_ns
@@ -355,7 +355,7 @@ class LiveEngine:
         return max(0.0, min(times))
 
     def _pairs(self, now_ns: int) -> Iterator[dict[str, _Waiting]]:
-        """Epochs that can be processed, in order of their tags."""
+        """Yield epochs that can be processed, in order of their tags."""
         while True:
             heads = {name: queue[0] for name, queue in self._waiting.items() if queue}
             if not heads:
@@ -393,7 +393,7 @@ class LiveEngine:
         return LiveOutput(message=create_message(result, self.settings), result=result)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
-        """Samples since the epoch before up to an epoch; later ones wait."""
+        """Return samples since the epoch before up to an epoch; later ones wait."""
         time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._late_sensors(tag_ns)
         self.counts.update(f"{name} silent" for name in silent)
         samples = self._samples.between(np.datetime64("NaT", "ns"), time)

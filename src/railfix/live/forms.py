@@ -30,18 +30,18 @@ _LONGEST_DOUBT_CM: Final = 32_700_000
 
 
 def json_bytes(output: LiveOutput) -> bytes:
-    """One line of JSON."""
+    """Return one line of JSON."""
     return to_json(output.message).encode() + b"\n"
 
 
 def cbor_bytes(output: LiveOutput) -> bytes:
-    """CBOR preceded by its length in two bytes."""
+    """Return CBOR preceded by its length in two bytes."""
     data = encode(output.message)
     return len(data).to_bytes(2, "big") + data
 
 
 def nmea_bytes(output: LiveOutput) -> bytes:
-    """NMEA 0183 sentences GGA, RMC and GST of the place of the message's antenna; nothing without input."""
+    """Return NMEA 0183 sentences GGA, RMC and GST of the place of the message's antenna; nothing without input."""
     place = _geodetic(output)
     if output.result is None:
         return b""
@@ -75,7 +75,7 @@ def gga_sentence(output: LiveOutput) -> bytes:
 
 
 def tpv_bytes(output: LiveOutput) -> bytes:
-    """A report of gpsd's class TPV as a line of JSON; heights are above the ellipsoid (altHAE)."""
+    """Return a report of gpsd's class TPV as a line of JSON; heights are above the ellipsoid (altHAE)."""
     place = _geodetic(output)
     report: dict[str, Any] = {"class": "TPV", "device": "railfix", "mode": 1, "time": _utc(output.message)[:23] + "Z"}
     if place is not None:
@@ -112,7 +112,7 @@ TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
 
 
 def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
-    """Rows of a table, a line of JSON each; nothing without input or rows."""
+    """Return the rows of a table, a line of JSON each; nothing without input or rows."""
 
     def rows_bytes(output: LiveOutput) -> bytes:
         table = None if output.result is None else table_of(output.result)
@@ -126,7 +126,7 @@ ROW_FORMS: Final = {name: _rows_form(table_of) for name, table_of in TABLES.item
 
 
 def _json_rows(table: pl.DataFrame) -> bytes:
-    """Rows as lines of JSON, all digits; null where there is no number, infinities as words."""
+    """Return the rows as lines of JSON, all digits; null where there is no number, infinities as words."""
     texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
     lines = []
     for row in texts.iter_rows(named=True):
@@ -139,7 +139,7 @@ def _json_rows(table: pl.DataFrame) -> bytes:
 
 
 def forms(settings: LiveSettings) -> dict[str, Form]:
-    """The forms by name."""
+    """Return the forms by name."""
     return {
         "json": json_bytes,
         "cbor": cbor_bytes,
@@ -151,7 +151,7 @@ def forms(settings: LiveSettings) -> dict[str, Form]:
 
 
 def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
-    """Latitude, longitude [deg], ellipsoidal height and along-track sigma [m] of the antenna of the message."""
+    """Return latitude, longitude [deg], ellipsoidal height and along-track sigma [m] of the antenna of the message."""
     if output.result is None:
         return None
     name = choose_antenna(output.result)
@@ -166,13 +166,13 @@ def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
 
 
 def _utc(message: TrainMessage) -> str:
-    """UTC of a message, ISO 8601 to the microsecond."""
+    """Return UTC of a message, ISO 8601 to the microsecond."""
     gpst = GPS_EPOCH + np.timedelta64(message.time_ns, "ns")
     return str((gpst - gpst_minus_utc(gpst).astype("timedelta64[s]")).astype("datetime64[us]"))
 
 
 def _angle(value: float, digits: int) -> str:
-    """Degrees and minutes as NMEA writes them, ddmm.mmmmmmm."""
+    """Return degrees and minutes as NMEA writes them, ddmm.mmmmmmm."""
     minutes = round(abs(value) * 60.0, 7)
     return f"{int(minutes // 60):0{digits}d}{minutes % 60:010.7f}"
 
@@ -185,11 +185,11 @@ def _sentence(body: str) -> bytes:
 
 
 def wants(form: Form, output: LiveOutput) -> bool:
-    """Whether a form takes an output: rows of tables those with rows, all others those with a message."""
+    """Return whether a form takes an output: rows of tables those with rows, all others those with a message."""
     return output.part != ("message" if form in ROW_FORMS.values() else "rows")
 
 
 def whole_message(form: Form, output: LiveOutput) -> bytes:
-    """A message for a target that keeps messages apart: without the length that streams need."""
+    """Return a message for a target that keeps messages apart: without the length that streams need."""
     data = form(output)
     return data[2:] if form is cbor_bytes else data

@@ -29,7 +29,7 @@ _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIV
 
 
 def no_input_message(settings: LiveSettings, time_ns: int) -> TrainMessage:
-    """The message of a period in which nothing was received; the sender numbers it."""
+    """Return the message of a period in which nothing was received; the sender numbers it."""
     return TrainMessage(
         train=settings.train,
         sequence=0,
@@ -108,13 +108,13 @@ def create_message(result: Result, settings: LiveSettings) -> TrainMessage:
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """The worst interference of the antennas at the last epoch; None where it is not looked for."""
+    """Return the worst interference of the antennas at the last epoch; None where it is not looked for."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max(found)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:
-    """What the filter measured the last epoch with, beside codes."""
+    """Return what the filter measured the last epoch with, beside codes."""
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
         sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))
@@ -137,7 +137,7 @@ def choose_antenna(result: Result) -> str:
 
 
 def _filter(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
-    """Whether the filter along the track has a place."""
+    """Return whether the filter along the track has a place."""
     return track is not None and len(track) > 0 and math.isfinite(float(track.chainage_m[-1]))
 
 
@@ -159,13 +159,13 @@ def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple
 
 
 def _has_passed(antenna: AntennaResult) -> bool:
-    """Whether the last single epoch passed every check and raises no alarm."""
+    """Return whether the last single epoch passed every check and raises no alarm."""
     alarm = antenna.protection is not None and antenna.protection.status[-1] == LevelStatus.ALARM
     return int(antenna.status[-1]) in (Status.OK, Status.JAMMING_SUSPECTED) and not alarm
 
 
 def _level_m(antenna: AntennaResult) -> float:
-    """Protection level of the last epoch; infinite where there is none."""
+    """Return the protection level of the last epoch; infinite where there is none."""
     if antenna.protection is None:
         return math.inf
     level = float(antenna.protection.level.level_m[-1])
@@ -173,5 +173,5 @@ def _level_m(antenna: AntennaResult) -> float:
 
 
 def _up_cm(value_m: float) -> int:
-    """Metres as centimetres, rounded up."""
+    """Return metres as centimetres, rounded up."""
     return max(0, math.ceil(value_m * 100.0 - 1e-9))

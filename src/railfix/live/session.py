@@ -216,7 +216,7 @@ class _Session:
         await queue.put(Sensed(sensor=sensor, until=FOREVER))
 
     async def received(self, name: str, source: str) -> AsyncIterator[ReceivedData]:
-        """What a source's data complete, item by item; breaks of its connection are logged and counted."""
+        """Yield what a source's data complete, item by item; breaks of its connection are logged and counted."""
         place = (lambda: self.place) if name == BASE else None
         async for item in arrivals(source, self.streams[name], self.engine.settings, place):
             if isinstance(item, ReceivedData):
@@ -350,7 +350,7 @@ class _InTurn:
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:
-    """The status line: time, status, place, speed, satellites, processing time, what was lost."""
+    """Return the status line: time, status, place, speed, satellites, processing time, what was lost."""
     message = output.message
     at = GPS_EPOCH + np.timedelta64(message.time_ns, "ns")
     words = [f"{np.datetime_as_string(at, unit='ms')[11:]} GPST", message.status.name.lower()]
@@ -372,6 +372,6 @@ def status_text(output: LiveOutput, metrics: Metrics) -> str:
 
 
 def _gps_now_ns() -> int:
-    """The computer's clock as GPS time since 1980 [ns]."""
+    """Return the computer's clock as GPS time since 1980 [ns]."""
     now = np.datetime64(time.time_ns(), "ns")
     return int((utc_to_gpst(now) - GPS_EPOCH).astype(np.int64))

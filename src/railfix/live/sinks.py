@@ -140,7 +140,7 @@ class ByteTarget:
 
 
 def standard_output() -> IO[bytes]:
-    """The standard output without a buffer, where there is one below it."""
+    """Return the standard output without a buffer, where there is one below it."""
     out: IO[bytes] = getattr(sys.stdout.buffer, "raw", sys.stdout.buffer)
     return out
 
@@ -288,7 +288,7 @@ class TcpServerSink:
 
 
 def parse_file_target(text: str) -> Path | None:
-    """The file that a text ``FORM@TARGET`` names; None for another target."""
+    """Return the file that a text ``FORM@TARGET`` names; None for another target."""
     target = text.partition("@")[2]
     other = target in ("", "-") or urlsplit(target).scheme in ("udp", "tcp-server", "mqtt")
     return None if other else Path(target)

@@ -76,12 +76,12 @@ def check_source(source: str) -> None:
 
 
 def is_file(source: str) -> bool:
-    """Whether a source is a recorded file."""
+    """Return whether a source is a recorded file."""
     return source != "-" and urlsplit(source).scheme not in ("tcp", "serial", *_NTRIP)
 
 
 def hidden(source: str) -> str:
-    """A source as it may be shown: without the password."""
+    """Return a source as it may be shown: without the password."""
     parts = urlsplit(source)
     return source if parts.password is None else source.replace(f":{parts.password}@", ":***@", 1)
 
@@ -89,7 +89,7 @@ def hidden(source: str) -> str:
 async def read_source(
     source: str, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Bytes of a source as they arrive; connections that break are opened again, see `LiveSettings.reconnect`.
+    """Yield bytes of a source as they arrive; connections that break are opened again, see `LiveSettings.reconnect`.
 
     `place` gives the present GGA sentence, which a caster is sent every `LiveSettings.gga_s`; none while it is empty.
     InputFileError: when the source cannot be opened, or breaks and is not opened again.
@@ -115,7 +115,7 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Bytes of a connection, opened again with growing waits where it breaks; empty bytes say that it is open."""
+    """Yield bytes of a connection, opened again with growing waits where it breaks; empty bytes say that it is open."""
     broken, wait_s, ever_open = 0, settings.reconnect_first_s, False
     while True:
         reason = "the other end has closed the connection"
@@ -147,7 +147,7 @@ async def _file(path: str) -> AsyncIterator[bytes]:
 
 
 async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
-    """What a call waits for, or TimeoutError.
+    """Return what a call waits for, or TimeoutError.
 
     It is asked once more at the end: what came while this program itself was busy counts. (`asyncio.wait_for` may lose
     a cancellation that comes at the same moment.)
@@ -162,7 +162,7 @@ async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
 async def _tcp(
     source: str, request: bytes, silence_s: float, *, tls: ssl.SSLContext | None = None, said: Said | None = None
 ) -> AsyncIterator[bytes]:
-    """Empty bytes once connected, then what arrives; `said` goes on saying things to the other end meanwhile."""
+    """Yield empty bytes once connected, then what arrives; `said` goes on saying things to the other end meanwhile."""
     parts = urlsplit(source)
     try:
         async with asyncio.timeout(_CONNECT_S):
@@ -196,7 +196,7 @@ async def _tcp(
 
 
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
-    """A mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
+    """Yield a mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
 
     With `LiveSettings.gga_s` it is told where the train is: in the request where that is known (NTRIP 2), and as lines
     from then on, for the virtual station that it makes there.
@@ -260,7 +260,7 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
-    """TLS with the certificates that the system trusts, and those of a file."""
+    """Return TLS with the certificates that the system trusts, and those of a file."""
     context = ssl.create_default_context()
     if certificates is not None:
         try:

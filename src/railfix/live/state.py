@@ -137,7 +137,7 @@ class _Plain(pickle.Unpickler):
     """Reads values, arrays and classes of this package; nothing else is imported or called."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """A class of this package or one of `_PLAIN`."""
+        """Return a class of this package or one of `_PLAIN`."""
         if (module.split(".")[0] == "railfix" and "." not in name) or (module, name) in _PLAIN:
             found = super().find_class(module, name)
             if isinstance(found, type) or (module, name) in _PLAIN:

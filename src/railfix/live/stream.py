@@ -40,7 +40,7 @@ class ReceiverState:
     tracking: Tracking = field(default_factory=Tracking)
 
     def after_break(self) -> ReceiverState:
-        """The state after a break of the connection: the start of a frame whose end never comes is dropped."""
+        """Return the state after a break of the connection: the start of a frame whose end never comes is dropped."""
         return replace(self, stream=replace(self.stream, rest=b""))
 
 
@@ -74,7 +74,7 @@ def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
 
 
 def epoch_ends(buffer: Bytes) -> Indices:
-    """Places after the messages that complete an epoch: RXM-RAWX, MeasEpoch, and the last MSM of an epoch."""
+    """Return places after the messages that complete an epoch: RXM-RAWX, MeasEpoch, and the last MSM of an epoch."""
     frames = find_frames(buffer, at_end=False)
     raw, msm = frames.of("ubx", ubx.RXM_RAWX), frames.of("rtcm3", *rtcm.MSM_NUMBERS)
     last = msm[rtcm.completes_epoch(frames, msm)]
@@ -101,7 +101,7 @@ def _receive(data: bytes, state: ReceiverState) -> ReceivedData:
 
 
 def single_epochs(observations: Observations) -> tuple[Observations, ...]:
-    """Observations epoch by epoch, each with the channels that have a value in it."""
+    """Return observations epoch by epoch, each with the channels that have a value in it."""
     epochs = []
     for k in range(len(observations)):
         part = observations[k : k + 1]
@@ -122,7 +122,7 @@ Item = TypeVar("Item")
 
 
 def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState:
-    """State of a stream before its first byte; `date` as for `railfix.live.run_session`."""
+    """Return the state of a stream before its first byte; `date` as for `railfix.live.run_session`."""
     if date is None and not is_file(source):
         date = np.datetime64(time.time_ns(), "ns")  # leap seconds do not matter here
     return ReceiverState() if date is None else ReceiverState(stream=StreamState(time=date.astype("datetime64[ns]")))
@@ -153,7 +153,7 @@ async def arrivals(
 async def next_arrival(
     queue: asyncio.Queue[Item], pumps: Sequence[asyncio.Task[Any]], *, wait_s: float | None = None
 ) -> Item | None:
-    """The next item that the pumps have put; None after `wait_s`, or when one has ended by an error."""
+    """Return the next item that the pumps have put; None after `wait_s`, or when one has ended by an error."""
     if not queue.empty():
         await asyncio.sleep(0)  # signals act also where data come faster than they are processed
         return queue.get_nowait()
@@ -245,7 +245,7 @@ class SensorLines:
         return tuple(cells)
 
     def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float | str]] | None:
-        """Time and values of a row, none of them where the time stands alone; None for what is no row."""
+        """Return the time and values of a row, none of them where the time stands alone; None for what is no row."""
         if len(cells) != len(self.columns):
             return None
         given = dict(zip(self.columns, cells, strict=True))
@@ -300,7 +300,7 @@ class Lag:
         self._shortest_ns, self.skipped = None, 0
 
     def skips(self, tag_ns: int, now_ns: int) -> bool:
-        """Whether an epoch that is taken now is too old to be processed."""
+        """Return whether an epoch that is taken now is too old to be processed."""
         delay_ns = now_ns - tag_ns
         shortest = float(delay_ns) if self._shortest_ns is None else self._shortest_ns
         shortest = min(float(delay_ns), shortest + DRIFT * (now_ns - self._at_ns))

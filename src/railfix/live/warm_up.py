@@ -137,5 +137,5 @@ def _first_epochs(log: Path, count: int) -> Observations:
 
 
 def _faulty(log: Observations, satellite: str) -> Observations:
-    """The log with the codes of a satellite 300 m too long: RAIM looks for it."""
+    """Return the log with the codes of a satellite 300 m too long: RAIM looks for it."""
     return replace(log, code_m=log.code_m + np.where(log.satellite == satellite, 300.0, 0.0))

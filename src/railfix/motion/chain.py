@@ -25,7 +25,7 @@ class Chain:
 
     @classmethod
     def empty(cls, instants: int, unknowns: int) -> Chain:
-        """Chain without information."""
+        """Return the chain without information."""
         square = (unknowns, unknowns)
         return cls(
             diagonal=np.zeros((instants, *square)),
@@ -64,7 +64,7 @@ class Chain:
 
 
 def _reduce(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Floats, Floats]:
-    """Values, covariances, and covariances of neighbours."""
+    """Return the values, covariances, and covariances of neighbours."""
     count = len(diagonal)
     if count == 1:
         covariance = np.asarray(np.linalg.inv(diagonal), dtype=np.float64)

@@ -40,7 +40,7 @@ class LineSeries:
     curvature_1pm: Floats  #: + to the right in rising arc length, shape (N,).
 
     def of(self, quantity: Quantity) -> Floats:
-        """Values of one quantity."""
+        """Return the values of one quantity."""
         return self.gradient if quantity == "gradient" else self.curvature_1pm
 
 
@@ -168,7 +168,7 @@ def _unplaced(verdict: Literal["ambiguous", "none"], sigma_m: float, reason: str
 
 
 def _vertex(values: Floats, best: int) -> float:
-    """Offset in steps of the vertex of the parabola through a maximum and its neighbours."""
+    """Return the offset in steps of the vertex of the parabola through a maximum and its neighbours."""
     if best in (0, len(values) - 1):
         return 0.0
     left, middle, right = values[best - 1 : best + 2]

@@ -193,13 +193,13 @@ class _Automaton:
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
 
     def copy(self, limits: SlipLimits) -> _Automaton:
-        """The same with numbers of its own: states handed on stay as they are."""
+        """Return the same with numbers of its own: states handed on stay as they are."""
         other = copy.copy(self)
         other.limits, other._past = limits, self._past.copy()
         return other
 
     def row(self) -> tuple[float, ...]:
-        """Values of `SlipResult` at the last sample."""
+        """Return the values of `SlipResult` at the last sample."""
         return self.state, self.speed, self.way, self.metric, self._smooth, self.pitch, self.bias
 
     def step(

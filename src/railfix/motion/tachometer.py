@@ -225,7 +225,7 @@ class Wheel:
 
 
 def _cumulate(run: Floats, step: Floats) -> Floats:
-    """Sum of signed steps; NaN where an unknown step separates an instant from the next."""
+    """Return the sum of signed steps; NaN where an unknown step separates an instant from the next."""
     known = np.isfinite(step)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
     open_ = np.isnan(run)
@@ -254,7 +254,7 @@ def _direction(run: Floats, hint: Floats) -> Floats:
 
 
 def _turn(step: Floats, before: float, after: float) -> Floats:
-    """Direction within a stretch in which it changes: at the longest stop, or open."""
+    """Return the direction within a stretch in which it changes: at the longest stop, or open."""
     standing = np.abs(np.nan_to_num(step, nan=1.0)) < 1e-9
     if not standing.any():
         # Neighbours that see both directions need no stop between them.

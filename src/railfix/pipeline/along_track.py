@@ -192,7 +192,7 @@ def _run_filter(
     surroundings: LineReferences | None,
     alone: tuple[Floats, Floats],
 ) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
-    """Places of the filter, motion by the sensors, and the state to pass on.
+    """Return the places of the filter, motion by the sensors, and the state to pass on.
 
     With sensors the epochs are taken in stretches of `_STRETCH_NS` of GPS time, however the log is cut: the place by
     the wheel, for the gradient there, begins each from the place of the filter.
@@ -245,7 +245,7 @@ def _gate(
     state: FilterState,
     config: Config,
 ) -> tuple[GnssEpochs, ReturnState]:
-    """Epochs without the codes that an outage makes doubtful."""
+    """Return epochs without the codes that an outage makes doubtful."""
     way = np.full(len(epochs), np.nan)
     for other in (sensors.radar_m, sensors.wheel_m):
         if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
@@ -258,7 +258,7 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Ranges that fit the place of the filter: echoes come late, a unit surveyed wrongly fits nowhere (P2 3.3).
+    """Return ranges that fit the place of the filter: echoes come late, a unit surveyed wrongly fits nowhere (P2 3.3).
 
     The place goes on at the filter's speed since the stretch began, so that the gate opens with the square of time.
     """
@@ -283,7 +283,7 @@ def _stretch(time: np.datetime64) -> int:
 
 
 def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
-    """State at the beginning of a stretch: what the sensors carry begins from the place of the filter."""
+    """Return the state at the beginning of a stretch: what the sensors carry begins from the place of the filter."""
     sensors = state.sensors
     if sensors.motion.tick:
         motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
@@ -300,7 +300,7 @@ def _find_fix(tracked: Tracked) -> FilterFix:
 
 
 def _join(parts: list[Tracked]) -> Tracked:
-    """Places of one stretch after the other."""
+    """Return the places of one stretch after the other."""
     if len(parts) == 1:
         return parts[0]
     return Tracked(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Tracked)})

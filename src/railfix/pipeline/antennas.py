@@ -217,7 +217,7 @@ class AntennaOrder:
         return len(self._stretches) > seen
 
     def measure(self) -> tuple[float, float]:
-        """Mean distance of the front antenna ahead of the rear one, and its sigma [m]; NaN before a verdict.
+        """Return the mean distance of the front antenna ahead of the rear one, and its sigma [m]; NaN before a verdict.
 
         A stretch has the mean of its distances with the variance of a single pair, as what disturbs the positions there
         does not average out; where the stretches scatter more than that, the sigma grows.

@@ -139,7 +139,7 @@ class PassingState:
 
     @classmethod
     def empty(cls, places: int) -> PassingState:
-        """State before the first epoch."""
+        """Return the state before the first epoch."""
         since, over, read = np.full((3, places), _NEVER)
         return cls(
             time=np.empty(0, dtype="datetime64[ns]"), values=np.empty((0, len(_VALUES))),
@@ -224,7 +224,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Confidence of an odometer at a place since the balise before it that was read [m]; NaN without one."""
+    """Return the confidence of an odometer at a place since the balise before it that was read [m]; NaN without one."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 

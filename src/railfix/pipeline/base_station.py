@@ -99,7 +99,7 @@ class BaseStation:
         return replace(state, errors=state.errors.drop_before(began - kept))
 
     def _rows(self, ecef_m: Floats) -> AntennaRows:
-        """A short line through the station."""
+        """Return a short line through the station."""
         if self._antenna is None or np.any(self._antenna[0] != ecef_m):
             latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
             ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)

@@ -276,7 +276,7 @@ class FilterState(NotebookTable):
         return f"<FilterState: {plural(self.track.hypotheses, 'place')}, the most probable at {self._place()} m>"
 
     def _place(self) -> str:
-        """The most probable place with its standard deviation."""
+        """Return the most probable place with its standard deviation."""
         track = self.track
         if track is None:
             return ""
@@ -331,10 +331,10 @@ class AlongTrack(NotebookTable, OnDemand):
         return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """How many epochs have a place with a bound: ``1,890 of 2,000 epochs tracking or coasting``."""
+        """Return how many epochs have a place with a bound: ``1,890 of 2,000 epochs tracking or coasting``."""
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:
-        """Medians of sigma and level in metres, as texts."""
+        """Return the medians of sigma and level in metres, as texts."""
         tracked = self.tracked
         return {"median sigma [m]": median_text(tracked.sigma_m), "median level [m]": median_text(tracked.level_m)}

@@ -413,7 +413,7 @@ class EpochProcessor:
                 yield from (f"{name}: {note}" for note in curve.notes_for(own.header))
 
     def _line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
-        """Ground units, balises, and the features of the line: made when there is an inertial unit."""
+        """Return the ground units, balises, and the features of the line: made when there is an inertial unit."""
         wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
         if wanted and self._track is not None and name not in self._features:
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name])

@@ -243,11 +243,11 @@ class AntennaResult(NotebookTable, OnDemand):
         return f"<AntennaResult: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """How many epochs have the status OK: ``1,827 of 2,000 epochs ok``."""
+        """Return how many epochs have the status OK: ``1,827 of 2,000 epochs ok``."""
         return f"{int((self.status == Status.OK).sum()):,} of {plural(self, 'epoch')} ok"
 
     def summary(self) -> dict[str, str]:
-        """Medians of sigma and level in metres, as texts."""
+        """Return the medians of sigma and level in metres, as texts."""
         level = np.empty(0) if self.protection is None else self.protection.level.level_m
         return {"median sigma [m]": median_text(self.along_sigma_m), "median level [m]": median_text(level)}
 

@@ -58,7 +58,7 @@ class LineFeatures:
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
-        """Features of a track for the body that carries an antenna."""
+        """Return the features of a track for the body that carries an antenna."""
         line = Trajectory.from_track(track)
         series = line_series(line)
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
@@ -96,7 +96,7 @@ class RateSeries:
     rolls: Masks  #: The wheel rolls, shape (K,).
 
     def arc_at(self, time: Datetimes) -> Floats:
-        """Places at times after the first tick, on from the tick before each [m]."""
+        """Return places at times after the first tick, on from the tick before each [m]."""
         last = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
         since = seconds(time - self.time[last])
         return np.asarray(self.arc_m[last] + np.nan_to_num(self.speed_mps[last]) * since)
@@ -217,7 +217,7 @@ def feature_fixes(
 
 
 def _whole_metres(way_m: Floats) -> Integers:
-    """Whole metres between the first value and the last, in the order of travel."""
+    """Return the whole metres between the first value and the last, in the order of travel."""
     first, last = float(way_m[0]), float(way_m[-1])
     if last >= first:
         return np.arange(np.floor(first) + 1, np.floor(last) + 1).astype(np.int64)
@@ -316,7 +316,7 @@ class SensedState:
 
 
 def nothing_sensed(intervals: int) -> SensedMotion:
-    """Motion without a sensor."""
+    """Return the motion without a sensor."""
     way, gradient, curvature, cant, under = np.full((5, intervals), np.nan)
     doubt, swing = np.zeros((2, intervals))
     return SensedMotion(
@@ -410,7 +410,7 @@ def sensed_motion(
 
 
 def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Floats:
-    """Mean force and rate between instants, shape (N, 6)."""
+    """Return the mean force and rate between instants, shape (N, 6)."""
     values = np.concatenate([inertial.force_mps2, inertial.rate_radps], axis=1)
     total = np.concatenate([np.zeros((1, 6)), np.cumsum(values, axis=0)])
     first, last = (np.searchsorted(inertial.time, at, side="right") for at in (begin, end))
@@ -421,7 +421,7 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 def _by_interval(
     state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Samples brought together by interval: `at` is the first sample after each instant, 0 after the first.
+    """Return samples brought together by interval: `at` is the first sample after each instant, 0 after the first.
 
     `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """

@@ -113,7 +113,7 @@ class SensorState:
 
     @classmethod
     def empty(cls) -> SensorState:
-        """State before the first epoch."""
+        """Return the state before the first epoch."""
         return cls(time=np.datetime64("NaT", "ns"), samples=SensorSamples())
 
 
@@ -231,7 +231,7 @@ def sensor_epochs(
 
 
 def _with_map(trajectory: Trajectory) -> tuple[float, float]:
-    """Noise of gradient and curvature in one metre, the errors of the map in it.
+    """Return the noise of gradient and curvature in one metre, the errors of the map in it.
 
     A map off by sigma across the track over a length L has curvatures off by ``sqrt(3) sigma / L^2`` for about L: as
     white noise in one metre times ``sqrt(L)``. Its gradients are off by ``sigma / L`` likewise.
@@ -242,7 +242,7 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
 
 
 def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes) -> dict[str, Floats]:
-    """Places of the antenna by the accepted features, at the first epoch after each."""
+    """Return the places of the antenna by the accepted features, at the first epoch after each."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
     for fix in fixes:
@@ -262,7 +262,7 @@ def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
 
 
 def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_m: Floats) -> RangeEpochs:
-    """Ranges by the epoch that comes after each."""
+    """Return ranges by the epoch that comes after each."""
     index = {str(name): k for k, name in enumerate(units.name)}
     unit = np.array([index.get(str(name), -1) for name in ranging.station], dtype=np.intp)
     epoch = np.searchsorted(edges, ranging.time, side="left") - 1
@@ -281,7 +281,7 @@ def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_
 
 
 def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:
-    """First pulse that speeds after an instant may need."""
+    """Return the first pulse that speeds after an instant may need."""
     last = int(np.searchsorted(pulses.time, end, side="right")) - 1
     if last < 1:
         return 0
@@ -290,7 +290,7 @@ def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: Sen
 
 
 def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Floats, Floats]:
-    """Mean of the samples in each interval after its first edge, and the share of them that is finite."""
+    """Return the mean of the samples in each interval after its first edge, and the share of them that is finite."""
     known = np.isfinite(values)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
     count = np.concatenate([[0], np.cumsum(known)])
@@ -301,12 +301,12 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Intervals of which a sensor has not been heard to the end: the last one, or none."""
+    """Return the intervals of which a sensor has not been heard to the end: the last one, or none."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 
 
 def _latest(samples: Samples, first: int) -> Samples:
-    """Samples from an index on."""
+    """Return samples from an index on."""
     start = max(int(first), 0)
     return type(samples)(**{f.name: getattr(samples, f.name)[start:] for f in fields(samples)})

@@ -57,7 +57,7 @@ class AntennaRows:
 
     @classmethod
     def of(cls, index: SearchIndex) -> AntennaRows:
-        """Rows of one antenna."""
+        """Return the rows of one antenna."""
         return cls((index,), (EVERY,))
 
     @property
@@ -104,15 +104,15 @@ class AntennaRows:
         return np.repeat(_lines(self.indices).first, [part.stop - part.start for part in self.parts])
 
     def at_arc(self, arc_m: Floats) -> Floats:
-        """Points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
+        """Return the points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
         return self._interpolate(arc_m, _lines(self.indices).ecef_m)
 
     def chainage_at(self, arc_m: Floats) -> Floats:
-        """Chainages at arc lengths, shape (T,) [m]; NaN for NaN."""
+        """Return chainages at arc lengths, shape (T,) [m]; NaN for NaN."""
         return self._interpolate(arc_m, _lines(self.indices).chainage_m)
 
     def segment_at(self, arc_m: Floats) -> Indices:
-        """Section of each arc length on its line, shape (T,), as `Trajectory.segment_at`."""
+        """Return the section of each arc length on its line, shape (T,), as `Trajectory.segment_at`."""
         section = np.empty(len(arc_m), dtype=np.intp)
         for index, rows in zip(self.indices, self.parts, strict=True):
             of_line = index.trajectory.arc_m
@@ -121,7 +121,7 @@ class AntennaRows:
         return section
 
     def get_axes(self, section: Indices) -> Floats:
-        """Unit vectors along, across and up at sections of the lines, shape (T, 3, 3)."""
+        """Return the unit vectors along, across and up at sections of the lines, shape (T, 3, 3)."""
         return np.asarray(_lines(self.indices).axes[section + self._first])
 
     def _interpolate(self, arc_m: Floats, values: Floats) -> Floats:
@@ -179,7 +179,7 @@ def _has_same_channels(first: Observations, other: Observations) -> bool:
 
 @cache
 def _members(kind: Any) -> dict[str, bool]:
-    """Whether each member of a dataclass has rows, or may have; none for other types."""
+    """Return whether each member of a dataclass has rows, or may have; none for other types."""
     return {f.name: f.name not in _OF_CHANNELS for f in fields(kind)} if is_dataclass(kind) else {}
 
 

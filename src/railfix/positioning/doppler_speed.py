@@ -163,7 +163,7 @@ def doppler_speed(
 
 
 def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Floats, Floats, Floats]:
-    """Measured ``slope v + drift``, the slope, and elevations, shapes (T, K)."""
+    """Return the measured ``slope v + drift``, the slope, and elevations, shapes (T, K)."""
     receiver, along = ecef_m[:, None, :], tangent[:, None, :]
     sat, velocity = dopplers.sat_ecef_m, dopplers.sat_velocity_mps
     _, sight = range_with_rotation(sat, receiver)

@@ -218,12 +218,12 @@ def means_of_windows(
 
 
 def _inverse_2x2(matrix: Floats) -> Floats:
-    """Inverse of symmetric 2 x 2 matrices, shape (T, 2, 2)."""
+    """Return the inverse of symmetric 2 x 2 matrices, shape (T, 2, 2)."""
     a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
     determinant = np.maximum(a * d - b * b, 1e-300)
     return np.array([d, -b, -b, a]).T.reshape(-1, 2, 2) / determinant[:, None, None]
 
 
 def beyond_threshold(offset: MapOffset, limits: MapOffsetLimits) -> Masks:
-    """Epochs whose window contradicts the map, shape (T,)."""
+    """Return epochs whose window contradicts the map, shape (T,)."""
     return np.asarray(offset.statistic > limits.threshold)

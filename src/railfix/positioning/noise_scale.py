@@ -82,7 +82,7 @@ class RobustFit:
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
-    """Inverse covariance of the place across and above sections of the line, shape (T, 3, 3) [1/m^2] in ECEF."""
+    """Return inverse covariance of the place across and above sections of the line, shape (T, 3, 3) [1/m^2] in ECEF."""
     return compute_information(trajectory.get_axes(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 
@@ -178,7 +178,7 @@ def noise_scale(
 
 
 def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
-    """Variance of the ranges of each epoch against their weights, shape (T,).
+    """Return the variance of the ranges of each epoch against their weights, shape (T,).
 
     Posterior mean of a variance that scatters about that of the window with `spread` degrees of freedom (scaled inverse
     chi-square distribution), given the epoch's own residuals.
@@ -189,7 +189,7 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
 
 
 def own_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
-    """Single-epoch sigma along the line, shape (T,) [m].
+    """Return the single-epoch sigma along the line, shape (T,) [m].
 
     The standard deviation by the weights, times the larger of the receiver's scale and that of the epoch's own
     residuals, widened as Student's t is where few ranges are redundant.
@@ -215,7 +215,7 @@ class RobustClock:
 def robust_clock(
     residual_m: Floats, sigma_m: Floats, groups: tuple[slice, ...], *, least_ranges: int = 4
 ) -> RobustClock:
-    """Receiver clock of each group of channels: Huber-weighted mean of the residuals, starting at their median.
+    """Return receiver clock of each group of channels: Huber-weighted mean of the residuals, starting at their median.
 
     `residual_m`, `sigma_m`, shape (T, K): range errors plus the clock, NaN is ignored; `least_ranges`: fewest ranges
     from which a clock is estimated.

@@ -38,7 +38,7 @@ class ClockTies:
     sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where nothing is known; shape (T, G).
 
     def take(self, epochs: Masks | Indices) -> ClockTies:
-        """The ties of some epochs, by mask or index."""
+        """Return the ties of some epochs, by mask or index."""
         return ClockTies(offset_m=self.offset_m[epochs], sigma_m=self.sigma_m[epochs])
 
 
@@ -63,7 +63,7 @@ class RangeArrays(NamedTuple):
         return self.starts.searchsorted(np.arange(self.code_m.shape[1]), side="right") - 1
 
     def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
-        """The arrays of some epochs."""
+        """Return the arrays of some epochs."""
         ties = (self.offset_m[epochs], self.sigma_m[epochs]) if self.tied else (self.offset_m, self.sigma_m)
         arrays = (self.sat_ecef_m[epochs], self.code_m[epochs], self.weight[epochs], *ties)
         sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
@@ -84,7 +84,7 @@ class Ranges:
         return len(self.code_m)
 
     def take(self, epochs: Masks | Indices) -> Ranges:
-        """The ranges of some epochs, by mask or index."""
+        """Return the ranges of some epochs, by mask or index."""
         return Ranges(
             sat_ecef_m=self.sat_ecef_m[epochs], code_m=self.code_m[epochs], weight=self.weight[epochs],
             groups=self.groups, ties=None if self.ties is None else self.ties.take(epochs),
@@ -151,7 +151,7 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
 
 
 def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
-    """Weighted sum of squared residuals at places (n, 3) [m], the clocks eliminated, shape (n,):
+    """Return the weighted sum of squared residuals at places (n, 3) [m], the clocks eliminated, shape (n,):
     `normal_equations(...).wsse` without the derivatives.
 
     `epochs`: epoch of each place; by default one place an epoch, in order.
@@ -286,7 +286,7 @@ class SinglePoint:
     residual_m: Floats  #: Shape (T, M).
 
     def take(self, epochs: Indices) -> SinglePoint:
-        """The positions of some epochs, by index."""
+        """Return the positions of some epochs, by index."""
         return SinglePoint(**{item.name: getattr(self, item.name)[epochs] for item in fields(self)})
 
 

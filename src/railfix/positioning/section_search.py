@@ -197,7 +197,7 @@ def _ball(
 def _in_ball(
     ranges: Ranges, index: SearchIndex, point: SinglePoint, weight_norm: Floats, epochs: Indices, radius: Floats
 ) -> SectionCandidates:
-    """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
+    """Return the points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
         point.wsse[epochs], weight_norm[epochs],

@@ -42,7 +42,7 @@ class IntegerSearch:
 
 
 def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Floats]:
-    """Integer transformation that makes the unknowns nearly uncorrelated, ordered by falling precision."""
+    """Return the integer transformation that makes the unknowns nearly uncorrelated, ordered by falling precision."""
     n = len(variance)
     lower, variance, transform = lower.copy(), variance.copy(), np.eye(n, dtype=np.int64)
     rounded_to = n - 2
@@ -76,7 +76,7 @@ def _exchange(lower: Floats, variance: Floats, transform: Integers, k: int, new:
 
 
 def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: float) -> tuple[Integers, Floats]:
-    """Nearest integer vectors of decorrelated unknowns, depth first from the last one."""
+    """Return the nearest integer vectors of decorrelated unknowns, depth first from the last one."""
     n = len(variance)
     # plain floats: the search goes one unknown at a time
     start, weight = cycles.tolist(), (1.0 / variance).tolist()
@@ -168,5 +168,5 @@ def phase_log_likelihood(
 
 
 def uniform_log_likelihood(phases: Sequence[MeanPhases], *, fault_prior: float) -> float:
-    """Logarithm of the density of phases that follow no model: a lower bound for every place."""
+    """Return the logarithm of the density of phases that follow no model: a lower bound for every place."""
     return float(np.log(fault_prior) - sum(np.log(phase.wavelength_m).sum() for phase in phases))

@@ -236,5 +236,5 @@ def _fit_field(
 
 
 def _sum(values: Floats) -> Floats:
-    """Sum over the channels one after the other: channels without a value between them change no bit."""
+    """Return the sum over the channels one after the other: channels without a value between them change no bit."""
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)

@@ -62,7 +62,7 @@ class StandstillErrors(Settings):
     unmapped_prior: float = option("Prior probability of a track not in the map.", 0.05, metavar="P", gt=0, lt=1)
 
     def bias_m(self, elevation_deg: Floats) -> Floats:
-        """Standard deviation of the constant code error [m]."""
+        """Return the standard deviation of the constant code error [m]."""
         return np.asarray(self.code_bias_m / _sine(elevation_deg))
 
     def phase_sigma_m(self, elevation_deg: Floats, *, distance_m: float) -> Floats:
@@ -70,7 +70,7 @@ class StandstillErrors(Settings):
         return np.asarray(np.hypot(np.sqrt(2.0) * self.phase_bias_m, _PHASE_SHARE * distance_m) / _sine(elevation_deg))
 
     def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
-        """Standard deviation of the mean of the varying code error over a time [m].
+        """Return the standard deviation of the mean of the varying code error over a time [m].
 
         Of a first-order Gauss-Markov process: 2 tau/T (1 - tau/T (1 - exp(-T/tau))) of its variance.
         """
@@ -162,7 +162,7 @@ class TrackPosterior:
     fits: bool  #: Whether the codes agree with the error model.
 
     def decision(self, *, risk: float) -> str:
-        """Name of the track whose probability exceeds one minus the risk; empty while undecided."""
+        """Return the name of the track whose probability exceeds one minus the risk; empty while undecided."""
         best = int(np.argmax(self.probability))
         return self.names[best] if self.fits and 1.0 - self.probability[best] < risk else ""
 
@@ -223,7 +223,7 @@ def track_posterior(
 def _with_phases(
     found: list[list[_Places]], fixes: Sequence[StandstillFix], phases: Sequence[MeanPhases], errors: StandstillErrors
 ) -> list[list[_Places]]:
-    """Evidence with that of the phases."""
+    """Return the evidence with that of the phases."""
     codes = [fix.place for fix in fixes if fix.place is not None]
     heights = np.array([code.place_m[2] for code in codes])
     best = max(item.log_evidence.max(initial=-np.inf) for row in found for item in row)
@@ -263,7 +263,7 @@ def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
-    """Covariance of all places, shape (2 A, 2 A): common errors and the map's are the same for every antenna."""
+    """Return covariance of all places, shape (2 A, 2 A): common errors and the map's are the same for every antenna."""
     nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
     step = np.diff(nearest.points_m, axis=0)
     middle = nearest.points_m[:-1] + step / 2.0
@@ -277,7 +277,7 @@ def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks
 
 
 def _clear(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Masks:
-    """Shifts of the nearest track, about the place of the train, that keep clear of all tracks of the map."""
+    """Return shifts of the nearest track, about the place of the train, that keep clear of all tracks of the map."""
     points = tracks[nearest].points_m
     start, step = points[:-1], np.diff(points, axis=0)
     share = np.clip(((place_m - start) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)
@@ -294,7 +294,7 @@ def _distance(points_m: Floats, place_m: Floats) -> float:
 
 
 def _distances(points_m: Floats, places_m: Floats) -> Floats:
-    """Distance of places, shape (n, 2), from a polyline, shape (n,)."""
+    """Return the distance of places, shape (n, 2), from a polyline, shape (n,)."""
     start, step = points_m[:-1], np.diff(points_m, axis=0)
     offset = places_m[:, None] - start
     share = np.clip((offset * step).sum(axis=-1) / (step**2).sum(axis=-1), 0.0, 1.0)

@@ -42,7 +42,7 @@ class Windows(NamedTuple):
         return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, last)
 
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
-        """Sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
+        """Return the sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
 
         `start`, shape (A, K): running sums after the epochs before; those after the last ones are returned as well.
         """

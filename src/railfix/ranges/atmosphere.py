@@ -47,7 +47,7 @@ _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
-    """Slant over vertical delay of an ionosphere in a thin shell (DO-229D A.4.4.10.4); NaN below the horizon."""
+    """Return slant over vertical delay of an ionosphere in a thin shell (DO-229D A.4.4.10.4); NaN below the horizon."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
 
@@ -61,7 +61,7 @@ def klobuchar_delay_m(
     coefficients: ArrayLike,
     frequency_hz: Floats,
 ) -> Floats:
-    """Ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
+    """Return the ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
 
     Latitude and longitude (T,), angles (T, M), `coefficients` alpha 0 to 3, beta 0 to 3, `frequency_hz` (M,): carriers
     other than L1 scale by (f1/f)^2. NaN where an input is NaN, and at or below the horizon.
@@ -89,7 +89,7 @@ def klobuchar_delay_m(
 def saastamoinen_delay_m(
     latitude_deg: Floats, height_m: Floats, elevation_deg: Floats, *, relative_humidity: float = 0.7
 ) -> Floats:
-    """Tropospheric delay of Saastamoinen in the standard atmosphere (J. Saastamoinen, 1972), shape (T, M) [m].
+    """Return tropospheric delay of Saastamoinen in the standard atmosphere (J. Saastamoinen, 1972), shape (T, M) [m].
 
     Both parts are mapped by 1/sin(elevation). Ellipsoidal heights below sea level count as sea level. NaN where an
     input is NaN, at or below the horizon, and outside -100 m to 10 km.
@@ -105,19 +105,19 @@ def saastamoinen_delay_m(
 
 
 def rtca_mapping(elevation_deg: Floats) -> Floats:
-    """Slant over vertical tropospheric delay of DO-229D (A.4.2.4), any shape; NaN below 2 degrees."""
+    """Return the slant over vertical tropospheric delay of DO-229D (A.4.2.4), any shape; NaN below 2 degrees."""
     elevation = np.where(elevation_deg >= _LOWEST_DEG, elevation_deg, np.nan)
     low = 1.0 + 0.015 * np.maximum(0.0, 4.0 - elevation) ** 2
     return np.asarray(1.001 / np.sqrt(0.002001 + np.sin(np.radians(elevation)) ** 2) * low)
 
 
 def rtca_troposphere_sigma_m(elevation_deg: Floats) -> Floats:
-    """Standard deviation of the slant delay after correction by `rtca_troposphere_m` [m]."""
+    """Return the standard deviation of the slant delay after correction by `rtca_troposphere_m` [m]."""
     return SIGMA_VERTICAL_M * rtca_mapping(elevation_deg)
 
 
 def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
-    """Tropospheric slant delay of RTCA DO-229D (A.4.2.4) by latitude and day of year, shape (T, K) [m].
+    """Return the tropospheric slant delay of RTCA DO-229D (A.4.2.4) by latitude and day of year, shape (T, K) [m].
 
     Height above mean sea level is meant; the ellipsoidal one differs by 1 mm in 3 m. NaN below 2 degrees, and outside
     -100 m to 10 km.
@@ -155,7 +155,7 @@ class SeenFrom:
 
     @classmethod
     def of(cls, receiver_ecef_m: Floats, satellite_ecef_m: Floats) -> SeenFrom:
-        """Directions and geodetic coordinates from Earth-fixed positions."""
+        """Return directions and geodetic coordinates from Earth-fixed positions."""
         latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
         elevation, azimuth = compute_angles(satellite_ecef_m - receiver_ecef_m[:, None], enu_axes(latitude, longitude))
         return cls(
@@ -190,7 +190,7 @@ def model_delays(
     ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
-    """Delays by the models of Klobuchar and Saastamoinen, 0 by a model that is off (`klobuchar` None)."""
+    """Return the delays by the models of Klobuchar and Saastamoinen, 0 by a model that is off (`klobuchar` None)."""
     shape = seen.elevation_deg.shape
     ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:

@@ -63,7 +63,7 @@ KINDS: Final[dict[str, str]] = {
 
 
 def satellite_kind(satellite: str) -> str:
-    """Kind of a satellite, a key of `KINDS`: "C05" -> "C-HIGH", "G05" -> "G"."""
+    """Return the kind of a satellite, a key of `KINDS`: "C05" -> "C-HIGH", "G05" -> "G"."""
     letter, number = satellite[0], int(satellite[1:])
     if letter == "C" and number in _BEIDOU_HIGH:
         return "C-HIGH"
@@ -110,7 +110,7 @@ class Cn0Mean:
         return PchipInterpolator(self.elevation_deg, self.mean_dbhz)
 
     def at(self, elevation_deg: ArrayLike) -> Floats:
-        """Mean C/N0 at elevations [dB-Hz]; NaN below the lowest bin's lower half and for NaN."""
+        """Return the mean C/N0 at elevations [dB-Hz]; NaN below the lowest bin's lower half and for NaN."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         lowest, highest = self.elevation_deg[0], self.elevation_deg[-1]
         half = (self.elevation_deg[1] - lowest) / 2.0
@@ -162,11 +162,11 @@ class Cn0Curve:
         return [self._by_key.get((satellite_kind(name), code)) for name, code in pairs]
 
     def covers(self, satellite: Strings, signal: Strings) -> Masks:
-        """Whether there is a curve for each channel, shape (M,)."""
+        """Return whether there is a curve for each channel, shape (M,)."""
         return np.array([mean is not None for mean in self._find(satellite, signal)], dtype=bool)
 
     def mean_dbhz(self, elevation_deg: ArrayLike, *, satellite: Strings, signal: Strings) -> Floats:
-        """Mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where there is no curve."""
+        """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where there is no curve."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         result = np.full(elevation.shape, np.nan)
         columns: dict[tuple[str, str], list[int]] = defaultdict(list)
@@ -178,7 +178,7 @@ class Cn0Curve:
         return result
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Differences of antenna and receiver between the log of the curve and another, one sentence each."""
+        """Return differences of antenna and receiver between the log of the curve and another, one sentence each."""
         notes = []
         for what in ("antenna", "receiver"):
             ours, theirs = _plain(getattr(self.source, what)), _plain(getattr(header, what))
@@ -216,7 +216,7 @@ class Cn0Samples:
         return sorted(self._parts)
 
     def of(self, kind: str, signal: str) -> tuple[Floats, Floats]:
-        """Elevation [deg] and C/N0 [dB-Hz] of one kind and signal."""
+        """Return the elevation [deg] and C/N0 [dB-Hz] of one kind and signal."""
         joined = np.concatenate(self._parts[kind, signal], axis=1).astype(np.float64)
         return joined[0], joined[1]
 
@@ -248,7 +248,7 @@ def fit_cn0_curve(
 
 
 def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
-    """Curve of one kind and signal, None where there are too few bins."""
+    """Return the curve of one kind and signal, None where there are too few bins."""
     which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
     bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
     if len(bins) < fit.least_bins:
@@ -265,7 +265,7 @@ def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFi
 
 
 def _robust(values: Floats, clip_sigma: float) -> tuple[float, float]:
-    """Mean without outliers, and robust standard deviation."""
+    """Return the mean without outliers, and robust standard deviation."""
     middle = float(np.median(values))
     spread = _NORMAL_MAD * float(np.median(np.abs(values - middle)))
     # C/N0 is reported in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish

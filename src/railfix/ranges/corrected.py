@@ -80,7 +80,7 @@ class CodeNoise(Settings):
 
 
 def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
-    """Sigma of corrected pseudoranges (T, M) [m]; NaN C/N0 is the reference; NaN at or below the horizon."""
+    """Return the sigma of corrected pseudoranges (T, M) [m]; NaN C/N0 is the reference; NaN at or below the horizon."""
     noise = noise or CodeNoise()
     sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     sigma = noise.zenith_sigma_m / sine
@@ -113,7 +113,7 @@ class NominalErrors(Settings):
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats) -> Floats:
-        """Standard deviation at elevations, any shape [m]; NaN below the horizon."""
+        """Return the standard deviation at elevations, any shape [m]; NaN below the horizon."""
         sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
         wet = 1.001 / np.sqrt(0.002001 + sine**2)
         parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
@@ -264,7 +264,7 @@ DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(
 def apply_dfmc(
     states: SatelliteStates, fixes: DfmcCorrections, satellite: Strings, signal: Strings
 ) -> tuple[SatelliteStates, Bits]:
-    """Satellites with the corrections of SBAS on L5 applied, and the reasons of those without, shape (T, K)."""
+    """Return satellites with the corrections of SBAS on L5 applied, and the reasons of those without, shape (T, K)."""
     covered = [code in DFMC_SIGNALS.get(name[0], ((),))[0] for name, code in zip(satellite, signal, strict=True)]
     moved, clock = states.position_ecef_m + fixes.position_m, states.clock_m + fixes.clock_m
     reason = np.where(covered, DFMC_REASONS[fixes.state], int(Reason.SBAS_NOT_COVERED))

@@ -50,7 +50,7 @@ class Conditions(Settings):
 def condition_differences(
     first: Conditions, second: Conditions, *, names: tuple[str, str] = ("model", "run")
 ) -> tuple[str, ...]:
-    """Fields in which two conditions differ, one text each: "codes: model raw, run smoothed".
+    """Return fields in which two conditions differ, one text each: "codes: model raw, run smoothed".
 
     The order of screens and constellations does not count; that of signals, which is a preference, does.
     """
@@ -106,7 +106,7 @@ class ErrorBins(Settings):
         return len(self.elevation_deg) - 1, self.sectors, len(self.cn0_dbhz) - 1
 
     def index(self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike) -> Integers:
-        """Flat index of the bin of each observation, any shape; -1 where elevation or azimuth is NaN.
+        """Return the flat index of the bin of each observation, any shape; -1 where elevation or azimuth is NaN.
 
         The azimuth is from the car's forward direction, clockwise.
         """
@@ -208,7 +208,7 @@ class ErrorModel:
     def at(
         self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike
     ) -> tuple[Floats, Floats]:
-        """Overbounding sigma and bias of observations, shapes as broadcast [m].
+        """Return the overbounding sigma and bias of observations, shapes as broadcast [m].
 
         NaN where the direction is unknown or the model has nothing.
         """
@@ -266,7 +266,7 @@ def write_error_model(model: ErrorModel, path: FilePath) -> None:
 
 
 def _columns(statistics: BinStatistics) -> _Columns:
-    """Columns to the millimetre."""
+    """Return columns to the millimetre."""
     return _Columns(**{name: tuple(np.round(getattr(statistics, name).ravel(), 3).tolist()) for name in _COLUMNS})
 
 

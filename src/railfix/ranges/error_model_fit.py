@@ -75,7 +75,7 @@ class ErrorSamples:
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
-    """Statistics of the bins from some of the samples, a mask of shape (n,).
+    """Return the statistics of the bins from some of the samples, a mask of shape (n,).
 
     A bin with fewer blocks than `ErrorModelFit.least_blocks` takes those of all azimuths of its elevation and C/N0,
     then of all C/N0 too, then of all elevations of its C/N0, then all.
@@ -208,7 +208,7 @@ def fault_rate(samples: ErrorSamples) -> FaultRate:
 
 
 def _upper(hits: int, trials: int) -> float:
-    """Upper end of the one-sided interval of a probability (Clopper and Pearson)."""
+    """Return the upper end of the one-sided interval of a probability (Clopper and Pearson)."""
     return float(betaincinv(hits + 1, trials - hits, _CONFIDENCE)) if trials > hits else 1.0
 
 

@@ -105,7 +105,7 @@ class ReferenceData:
 
 
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
-    """Reference positions of every antenna that has a log of positions.
+    """Return the reference positions of every antenna that has a log of positions.
 
     NoPositionError: when there are fewer than two good fixes. MismatchError: when there are two logs of positions
     without the distance between the antennas, or pulses or accelerations of another time.
@@ -245,7 +245,7 @@ class _ReferenceBuilder:
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 
     def _speeds(self, time: Datetimes, place_m: Floats) -> SolvedSpeeds:
-        """Doppler speeds of every receiver, seen from places along this antenna's path."""
+        """Return Doppler speeds of every receiver, seen from places along this antenna's path."""
         speeds_of = {}
         for name, dopplers in self._sources().items():
             t = _since(dopplers.time, time)
@@ -260,7 +260,7 @@ class _ReferenceBuilder:
         return speeds_of
 
     def _join(self, speeds: SolvedSpeeds) -> Speeds:
-        """All receivers' speeds as one; empty without any."""
+        """Return all receivers' speeds as one; empty without any."""
         own = [part for part, _ in speeds.values()]
         time = np.unique(np.concatenate([np.empty(0, dtype="datetime64[ns]"), *(part.time for part in own)]))
         if len(own) > 1:
@@ -271,7 +271,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Way travelled up to instants and its variance: by the wheel where there is one, else by Dopplers."""
+        """Return way travelled up to instants and its variance: by the wheel where there is one, else by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

@@ -111,7 +111,7 @@ class ReferenceOptions(Settings):
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
-    """Rows of fixes.csv of one antenna, rounded to tenths of millimetres."""
+    """Return the rows of fixes.csv of one antenna, rounded to tenths of millimetres."""
     fixes = part.fixes
     words = {int(code): FixRejection(int(code)).text or "good" for code in np.unique(fixes.rejection)}
     table = pl.DataFrame(
@@ -133,7 +133,7 @@ def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
 
 
 def antenna_record(part: Built) -> dict[str, Any]:
-    """One antenna as plain values."""
+    """Return one antenna as plain values."""
     reference = part.reference
     sigma = reference.sigma_m[reference.source == "bridged"]
     return {

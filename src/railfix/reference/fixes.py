@@ -141,7 +141,7 @@ class Fixes:
         return np.flatnonzero(self.rejection == 0)
 
     def counts(self) -> dict[str, int]:
-        """Number of rows by reason, the good ones first."""
+        """Return the number of rows by reason, the good ones first."""
         counted = {"good": int((self.rejection == 0).sum())}
         for flag in FixRejection:
             if flag:
@@ -182,7 +182,7 @@ def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
 
 
 def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
-    """The rows of one antenna by their distance to the other antenna's at the same instant (P2 3.3: 5 cm)."""
+    """Return the rows of one antenna by their distance to the other antenna's at the same instant (P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     there, place = other.time[rows], other.ecef_m[rows]
@@ -241,13 +241,13 @@ def match(
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
-    """Components of offsets to the right, and square to the path and that."""
+    """Return the components of offsets to the right, and square to the path and that."""
     right, along = trajectory.across[section], trajectory.tangent[section]
     return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
 
 
 def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, max_speed_mps: float) -> Indices:
-    """One pass a position: the cheapest chain from the first to the last."""
+    """Return one pass a position: the cheapest chain from the first to the last."""
     found, first = np.unique(position, return_index=True)
     if len(found) == len(position):
         return np.arange(len(found))
@@ -259,7 +259,7 @@ def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, 
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
-    """The rows by their distance to the trajectory, with their place on it and its standard deviation."""
+    """Return the rows by their distance to the trajectory, with their place on it and its standard deviation."""
     rows = fixes.good
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
@@ -309,7 +309,7 @@ def judge_travel(
 
 
 def _best_chain(agrees: Callable[[Indices, Indices], Masks], time_s: Floats, hold_s: float) -> Masks:
-    """Which fixes are in the chain of runs of most seconds, less `hold_s` for each joint that does not agree."""
+    """Return which fixes are in the chain of runs of most seconds, less `hold_s` for each joint that does not agree."""
     count = len(time_s)
     worth = np.minimum(np.diff(time_s, append=time_s[-1] + np.median(np.diff(time_s))), 1.0)
     every = np.arange(count)

@@ -198,7 +198,7 @@ def _with_wheel(
 
 
 def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
-    """The accelerometer's offset, a random walk."""
+    """Return the accelerometer's offset, a random walk."""
     if unknowns.offset >= 0:
         chain = _with_prior(chain, unknowns.offset, ACCELERATION_BIAS_MPS2)
         chain = _with_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
@@ -206,7 +206,7 @@ def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
 
 
 def _with_prior(chain: Chain, unknown: int, sigma: float) -> Chain:
-    """An unknown of expectation 0 at the first instant."""
+    """Return an unknown of expectation 0 at the first instant."""
     row = np.eye(chain.right.shape[1])[unknown]
     return chain.with_observations(np.array([0]), row, np.zeros(1), np.full(1, sigma**-2))
 
@@ -237,7 +237,7 @@ class Closings:
         return len(self.error_m)
 
     def excess_m2(self) -> float:
-        """Variance in excess of the model, from the 80th percentile of the squared errors [m2]."""
+        """Return the variance in excess of the model, from the 80th percentile of the squared errors [m2]."""
         return max(float(np.quantile(self.error_m**2, 0.8)) / _CHI2_80 - float(np.median(self.white_m2)), 0.0)
 
 
@@ -260,7 +260,7 @@ def closings(
 
 
 def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Sigma of the time-correlated Doppler speed error [m/s] by what noise leaves of the closing errors."""
+    """Return the sigma of the time-correlated Doppler speed error [m/s] by what noise leaves of the closing errors."""
     if len(misclosures) < WINDOWS:
         return settings.doppler_bias_mps
     tau = settings.doppler_bias_s
@@ -270,7 +270,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Random error of the wheel from the closing errors, its scale taken off [m per square root of m]."""
+    """Return the random error of the wheel from the closing errors, its scale taken off [m per square root of m]."""
     moving = np.abs(misclosures.way_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
@@ -371,7 +371,7 @@ def assemble_reference(
 
 
 def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
-    """Bridged instants by the sensors that have a number there, or a second or so from there."""
+    """Return the bridged instants by the sensors that have a number there, or a second or so from there."""
     measured = {
         "doppler": np.isfinite(evidence.doppler_mps),
         "pulses": np.isfinite(evidence.wheel_m),

@@ -98,7 +98,7 @@ def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Pa
 
 
 def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Rows of the filter, or of single epochs without one, with their errors where there is a reference."""
+    """Return the rows of the filter, or of single epochs without one, with their errors where there is a reference."""
     name = next((table for table in list_position_tables(folder) if table != POSITIONS_TABLE), POSITIONS_TABLE)
     table = read_table(folder, name, columns=cs.by_name("protection_level_m", require_all=False))[1]
     table = table.with_columns(pl.col("antenna", "status").cast(pl.String))
@@ -114,7 +114,7 @@ def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[st
 
 
 def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
-    """Percentiles of the size of each quantity, and the number of errors above their level."""
+    """Return the percentiles of the size of each quantity, and the number of errors above their level."""
     found: dict[str, float | int | None] = {}
     for name in _QUANTITIES:
         size = np.abs(floats(table, name)) if name in table.columns else np.empty(0)
@@ -127,7 +127,7 @@ def _figures(table: pl.DataFrame) -> dict[str, float | int | None]:
 
 
 def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
-    """The epoch with the largest error of each piece of the line and antenna; without errors, level or sigma."""
+    """Return the epoch with the largest error of each piece of the line and antenna; without errors, level or sigma."""
     quantity = next(name for name in _QUANTITIES if name in table.columns and table[name].is_not_null().any())
     placed = table.filter(pl.col("chainage_m").is_not_null(), pl.col(quantity).is_not_null())
     length = float(np.ptp(placed["chainage_m"].to_numpy())) if len(placed) else 0.0
@@ -139,7 +139,7 @@ def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
 
 
 def _worst(pieces: pl.DataFrame, quantity: str, out: Path) -> Table:
-    """The worst epochs, apart in time, with links to their explanations."""
+    """Return the worst epochs, apart in time, with links to their explanations."""
     ranked = pieces.filter(pl.col(quantity).is_finite()).sort(pl.col(quantity).abs(), descending=True)
     event = pl.col("time_gpst").dt.truncate(f"{_EVENT_S}s").alias("event")
     worst = ranked.unique(["run", event], keep="first", maintain_order=True).head(_WORST)

@@ -43,7 +43,7 @@ _OF_CHART: Final = (
 
 
 def script_json(value: Any) -> str:
-    """JSON text of plain values that is safe inside a script element; ValueError for NaN outside an array."""
+    """Return JSON text of plain values that is safe inside a script element; ValueError for NaN outside an array."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for mark, code in (("<", "\\u003c"), (">", "\\u003e"), ("\u2028", "\\u2028"), ("\u2029", "\\u2029")):
         text = text.replace(mark, code)
@@ -57,7 +57,7 @@ def pack_array(values: NDArray[Any], kind: str = "f") -> str:
 
 
 def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict[str, Any]:
-    """A chart as plain values; `epochs_from`: origin of ``epoch_s`` of its points, if not `Chart.start`."""
+    """Return a chart as plain values; `epochs_from`: origin of ``epoch_s`` of its points, if not `Chart.start`."""
     values: dict[str, Any] = {name: getattr(chart, name) for name in _OF_CHART}
     values |= {"axis": chart.common_axis, "layers": [_layer(layer) for layer in chart.layers]}
     if chart.start is not None:
@@ -68,12 +68,12 @@ def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict
 
 
 def since_1970(time: np.datetime64) -> float:
-    """A time as seconds, to the microsecond."""
+    """Return a time as seconds, to the microsecond."""
     return round(float(seconds(time - _EPOCH_ZERO)), 6)
 
 
 def _layer(layer: Layer) -> dict[str, Any]:
-    """A layer as plain values by the names of its fields."""
+    """Return a layer as plain values by the names of its fields."""
     values: dict[str, Any] = {"label": layer.label, "colour": layer.colour, "kind": layer.kind}
     if isinstance(layer, Cells):
         return values | _cells(layer)
@@ -85,7 +85,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 
 
 def _cells(layer: Cells) -> dict[str, Any]:
-    """Cells that are not empty; all have equal widths."""
+    """Return cells that are not empty; all have equal widths."""
     column, row = np.nonzero(layer.counts)
     return {
         "x0": float(layer.x_edges[0]),
@@ -102,7 +102,7 @@ def _cells(layer: Cells) -> dict[str, Any]:
 
 
 def sky_values(sky: SkyEpochs) -> dict[str, Any]:
-    """Satellites in view as plain values; angles and C/N0 in hundredths."""
+    """Return satellites in view as plain values; angles and C/N0 in hundredths."""
     values: dict[str, Any] = {
         "start": since_1970(sky.start),
         "epoch": pack_array(sky.epoch_s),
@@ -138,7 +138,7 @@ def read_background(path: Path) -> tuple[Floats, ...]:
 
 
 def _lines(path: Path, node: Any) -> Iterator[Floats]:
-    """Every line below a GeoJSON object."""
+    """Yield every line below a GeoJSON object."""
     kind = node.get("type") if isinstance(node, dict) else None
     if kind == "FeatureCollection":
         for feature in node.get("features") or ():
@@ -234,7 +234,7 @@ class PagePart:
 
 
 def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block], *, lead: Sequence[Block] = ()) -> str:
-    """HTML of a page of sentences, charts, and tables under them."""
+    """Return HTML of a page of sentences, charts, and tables under them."""
     numbers = count()
     figures = PagePart(title="", figures=[figure(chart, numbers) for chart in charts])
     return render("charts.html.j2", title, charts=figures, tables=tables, lead=lead)
@@ -250,7 +250,7 @@ def read_template(name: str) -> Template:
 
 
 def render(template: str, title: str, **content: Any) -> str:
-    """HTML of a page of this package, with its style and scripts."""
+    """Return HTML of a page of this package, with its style and scripts."""
     return read_template(template).render(
         title=title,
         created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -275,7 +275,7 @@ def figure(
     anchor: str = "",
     width: str = "",
 ) -> Figure:
-    """A chart with its values, linked with the sky plot and the charts of an axis that belong to it."""
+    """Return a chart with its values, linked with the sky plot and the charts of an axis that belong to it."""
     values: dict[str, Any]
     if isinstance(chart, SkyEpochs):
         values, linked, axis, width = sky_values(chart), sky, "", "wide"

@@ -47,7 +47,7 @@ _EXPLAINED: Final = (
 
 
 def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
-    """Tables on the protection levels of a run."""
+    """Return the tables on the protection levels of a run."""
     kind = run.folder.level_kind
     if kind is None:
         return [Absent(NO_LEVELS)]
@@ -83,7 +83,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
 
 
 def _priors(priors: Any) -> str:
-    """Priors by constellation, equal ones together."""
+    """Return priors by constellation, equal ones together."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}
@@ -97,7 +97,7 @@ def _value(value: Any, unit: str = "") -> str:
 
 
 def _availability(run: ReportedRun) -> Table:
-    """Percentiles and availability of the levels of a run without a reference."""
+    """Return the percentiles and availability of the levels of a run without a reference."""
     options = EvaluationOptions()
     limits = sorted({*options.alarm_limits_m, run.folder.alarm_limit_m or run.config.alarm_limit_m})
     return Table(
@@ -242,7 +242,7 @@ def _screens(
 
 
 def run_group(run: ReportedRun) -> Group:
-    """Charts of all antennas of a run together."""
+    """Return the charts of all antennas of a run together."""
     chunks = run.record.get("chunks") or {}
     start = find_start(run.folder.positions)
     if not all(chunks.get(name) for name in ("first_epoch_gpst", "epochs", "positioning_s")):
@@ -260,7 +260,7 @@ def _keep(*charts: Chart) -> tuple[Chart, ...]:
 
 
 def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
-    """Stanford diagrams of the usable levels, of all levels, and of the filter's usable levels."""
+    """Yield Stanford diagrams of the usable levels, of all levels, and of the filter's usable levels."""
     kind, filtered, options = run.folder.level_kind, run.filter_rows(antenna), EvaluationOptions()
     if kind is None:
         return
@@ -273,14 +273,14 @@ def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: flo
 
 
 def _align(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
-    """Errors at the rows of the positions."""
+    """Return the errors at the rows of the positions."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")
     return floats(joined, "error_m")
 
 
 def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
-    """Epochs of the largest errors, on the map and conventional."""
+    """Return the epochs of the largest errors, on the map and conventional."""
     if errors is None:
         return None
     times = errors["time_gpst"].to_numpy()
@@ -292,7 +292,7 @@ def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
 
 
 def _tunnels(errors: pl.DataFrame | None) -> list[tuple[float, float]]:
-    """Chainages between which the reference's environment is a tunnel [m]."""
+    """Return chainages between which the reference's environment is a tunnel [m]."""
     if errors is None:
         return []
     known = errors.filter(pl.col("chainage_m").is_not_null()).sort("chainage_m")

@@ -39,7 +39,7 @@ class Headline:
 
 
 def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> Headline:
-    """Verdict and key figures of one antenna, against the reference where there is one."""
+    """Return the verdict and key figures of one antenna, against the reference where there is one."""
     errors = run.get_errors(antenna)
     if evaluation is not None and errors is not None:
         compared = _compare(errors)
@@ -132,7 +132,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
 
 
 def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, own: Mapping[str, Any]) -> KeyFigure:
-    """Median protection level with errors above it, or the stated sigma without levels."""
+    """Return the median protection level with errors above it, or the stated sigma without levels."""
     kind = run.folder.level_kind
     if kind is None or evaluation.levels is None or kind not in evaluation.integrity:
         return KeyFigure(
@@ -161,7 +161,7 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
 
 
 def _filter(run: ReportedRun, antenna: str) -> dict[str, float]:
-    """Error sizes and rate of the filter along the track over all its epochs; empty without it."""
+    """Return the error sizes and rate of the filter along the track over all its epochs; empty without it."""
     table = run.filter_rows(antenna)
     known = pl.DataFrame() if table is None else table.filter("positioned", "reference_good")
     if table is None or not len(known):
@@ -172,7 +172,7 @@ def _filter(run: ReportedRun, antenna: str) -> dict[str, float]:
 
 
 def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> Iterator[str]:
-    """A sentence on the filter in the longest stretch without satellites."""
+    """Yield a sentence on the filter in the longest stretch without satellites."""
     if evaluation.outages is not None:
         passed = evaluation.outages.filter(run=run.name_in(evaluation, "train"), antenna=antenna)
         for row in passed.sort("travelled_m", descending=True, nulls_last=True).head(1).iter_rows(named=True):
@@ -196,7 +196,7 @@ def _alike(run: ReportedRun, compared: _Compared, filtered: Mapping[str, float])
 
 
 def _larger_error(compared: _Compared) -> list[str]:
-    """A sentence on the largest error on the map where it exceeds the conventional one."""
+    """Return a sentence on the largest error on the map where it exceeds the conventional one."""
     if compared.on_map_m.max() <= compared.conventional_m.max():
         return []
     at = int(np.argmax(compared.on_map_m))

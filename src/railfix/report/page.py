@@ -37,7 +37,7 @@ from railfix.run.record import budget_tables, level_basis
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
-    """One row per run and antenna: rates and, with a reference, errors."""
+    """Return one row per run and antenna: rates and, with a reference, errors."""
     head = ["run", "antenna", "settings", "epochs", "rate", "ok", "sigma p95"]
     judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
     rows = []
@@ -76,7 +76,7 @@ def _antennas(run: ReportedRun) -> Mapping[str, Mapping[str, Any]]:
 
 
 def provenance(run: ReportedRun) -> list[Block]:
-    """Command, versions, inputs with hashes, line, notes."""
+    """Return the command, versions, inputs with hashes, line, notes."""
     record = run.record
     written = datetime.fromtimestamp((run.folder.path / "run.json").stat().st_mtime, tz=UTC)
     versions: Mapping[str, Any] = record.get("versions") or {}
@@ -111,7 +111,7 @@ def provenance(run: ReportedRun) -> list[Block]:
 
 
 def settings(run: ReportedRun) -> list[Block]:
-    """Settings asked for beside those used."""
+    """Return settings asked for beside those used."""
     asked = flat_settings(run.record.get("settings_asked") or {})
     used = flat_settings(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
@@ -124,7 +124,7 @@ def settings(run: ReportedRun) -> list[Block]:
 
 
 def budget(run: ReportedRun) -> list[Block]:
-    """Epochs by status, and pseudoranges by the first reason for their rejection."""
+    """Return epochs by status, and pseudoranges by the first reason for their rejection."""
     antennas = _antennas(run)
     signs = [
         [name, sign, count(seen["epochs"]), str(seen["first"])]
@@ -144,12 +144,12 @@ def budget(run: ReportedRun) -> list[Block]:
 
 
 def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
-    """Figures of merit of one run, on the map beside conventional."""
+    """Return the figures of merit of one run, on the map beside conventional."""
     return _with_groups(select_evaluation(evaluation, run.name_in(evaluation)))
 
 
 def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
-    """Figures of the filter along the track: all epochs, with and without satellites, outages, probabilities."""
+    """Return figures of the filter along the track: all epochs, with and without satellites, outages, probabilities."""
     name = run.name_in(evaluation, "train")
     if not name:
         return [Absent("The run has no filter along the track (railfix run --filter off).")]
@@ -232,7 +232,7 @@ def report_page(
 
 
 def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list[Block]:
-    """Table of all runs, and what the page lacks."""
+    """Return the table of all runs, and what the page lacks."""
     blocks: list[Block] = [summary(runs, evaluation)]
     if evaluation is None:
         blocks.append(Absent(NO_REFERENCE))

@@ -58,7 +58,7 @@ class ReportedRun:
     notes: tuple[str, ...]
 
     def name_in(self, evaluation: Evaluation, table: str = POSITIONS_TABLE) -> str:
-        """Name of one of its tables of positions in the tables of an evaluation; empty where it is not there."""
+        """Return name of one of its tables of positions in the tables of an evaluation; empty where it is not there."""
         mine = (run for run in evaluation.runs if run.path.resolve() == self.folder.path.resolve())
         return next((run.name for run in mine if run.table == table), "")
 
@@ -68,24 +68,24 @@ class ReportedRun:
         return self.folder.record
 
     def get_positions(self, antenna: str) -> pl.DataFrame:
-        """Rows of one antenna in order of time."""
+        """Return the rows of one antenna in order of time."""
         return self.folder.positions.filter(antenna=antenna)
 
     def get_errors(self, antenna: str) -> pl.DataFrame | None:
-        """Rows of one antenna, None without a reference."""
+        """Return the rows of one antenna, None without a reference."""
         return None if self.errors is None else self.errors.filter(antenna=antenna)
 
     def filter_rows(self, antenna: str) -> pl.DataFrame | None:
-        """Rows of the filter along the track, None without."""
+        """Return the rows of the filter along the track, None without."""
         return None if self.filtered is None else self.filtered.filter(antenna=antenna)
 
     def get_train(self, antenna: str) -> pl.DataFrame | None:
-        """Positions by the filter along the track, None without."""
+        """Return positions by the filter along the track, None without."""
         return None if self.train is None else self.train.filter(antenna=antenna)
 
 
 def get_figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
-    """Figures of merit of one antenna and kind of position; empty where there are none."""
+    """Return the figures of merit of one antenna and kind of position; empty where there are none."""
     rows = evaluation.figures.filter(
         grouping="all", epochs_of="own", run=run.name_in(evaluation), antenna=antenna, position=position
     )
@@ -191,7 +191,7 @@ def _observations(path: Path) -> pl.LazyFrame | None:
 
 
 def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[str, ...]]:
-    """C/N0 curve that the run used, or a note on why it is not drawn."""
+    """Return C/N0 curve that the run used, or a note on why it is not drawn."""
     if config.cn0_curve is None:
         return None, ()
     path = next(iter(folder.input_paths("cn0_curve")), Path(config.cn0_curve))

@@ -43,7 +43,7 @@ Span = tuple[np.datetime64, np.datetime64]
 
 
 def navigation_span(navigation: Navigation) -> Span | None:
-    """Reference times of the first and the last record; None where there is none."""
+    """Return the reference times of the first and the last record; None where there is none."""
     times = [navigation.kepler.toe, navigation.glonass.toe]
     if navigation.precise is not None:
         times.append(navigation.precise.time)
@@ -53,12 +53,12 @@ def navigation_span(navigation: Navigation) -> Span | None:
 
 
 def _spans(tally: Tally) -> dict[str, Span]:
-    """First and last epoch of the log of each antenna."""
+    """Return the first and last epoch of the log of each antenna."""
     return {n: (a.first, a.last) for n, a in tally.antennas.items() if a.first is not None and a.last is not None}
 
 
 def _apart(one: Span, other: Span, *, reach: np.timedelta64 = _SECOND * 0) -> bool:
-    """Whether two spans have no time in common, each reaching further at both ends; False for NaT."""
+    """Return whether two spans have no time in common, each reaching further at both ends; False for NaT."""
     return bool(one[0] - reach > other[1] or one[1] + reach < other[0])
 
 

@@ -78,7 +78,7 @@ def convert_logs(
 
 
 def _scan(logs: tuple[Path, ...], date: np.datetime64 | None) -> tuple[ObservationHeader, int, Counter[str]]:
-    """Header with the signals of the whole log, number of epochs, and what is passed over."""
+    """Return the header with the signals of the whole log, number of epochs, and what is passed over."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
     header, epochs, skipped = ObservationHeader(), 0, Counter[str]()
@@ -251,7 +251,7 @@ def sensor_table(path: Path, kind: str) -> pl.DataFrame:
 
 
 def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
-    """Rows of the balise of each group that its place is that of."""
+    """Return the rows of the balise of each group that its place is that of."""
     return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
 
 
@@ -262,7 +262,7 @@ def _group() -> pl.Expr:
 
 
 def _in_gps_time(path: Path, table: pl.DataFrame) -> pl.DataFrame:
-    """Rows in order of time, with the time of the schema as GPS time."""
+    """Return the rows in order of time, with the time of the schema as GPS time."""
     column = table["TIMESTAMP_UTC"]
     utc = column.str.to_datetime(time_unit="ns", strict=False) if column.dtype == pl.String else column
     if not utc.dtype.is_temporal() or utc.is_null().any():
@@ -337,7 +337,7 @@ def _metres(values: np.ndarray) -> pl.Series:
 
 
 def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFrame:
-    """The balise read last before each row, with its chainage; null before the first."""
+    """Return the balise read last before each row, with its chainage; null before the first."""
     empty = pl.DataFrame(schema={"read_gpst": pl.Datetime("ns"), "balise": pl.String, "chainage_m": pl.Float64})
     read = empty if passings is None else passings.filter(pl.col("verdict") == "read").select(empty.columns)
     times = rows.select(pl.col("time_gpst").cast(pl.Datetime("ns")))
@@ -346,5 +346,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """The columns of a table of the schema in their order; those that railfix has not are empty."""
+    """Return the columns of a table of the schema in their order; those that railfix has not are empty."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

@@ -163,7 +163,7 @@ def open_inputs(
 
 
 def find_record_time(navigation: Navigation) -> np.datetime64 | None:
-    """A time within days of the records, for the epoch of reference frames."""
+    """Return a time within days of the records, for the epoch of reference frames."""
     clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
     if navigation.precise is not None:
         clocks = navigation.precise.time
@@ -337,7 +337,7 @@ def collect_notes(
 
 
 def _describe_detectable(detectable_m: Floats) -> str:
-    """Which offsets of the map the run does not exclude, one clause."""
+    """Return which offsets of the map the run does not exclude, one clause."""
     if np.isnan(detectable_m).any():
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()

@@ -58,7 +58,7 @@ class InputFiles(Settings):
     """Input files of a command, each field a path, several paths, or None."""
 
     def files_by_name(self) -> Iterator[tuple[str, Path]]:
-        """Each file with the name of its field."""
+        """Yield each file with the name of its field."""
         for name in type(self).model_fields:
             value = getattr(self, name)
             for path in value if isinstance(value, tuple) else (value,):
@@ -148,7 +148,7 @@ class RunInputs(InputFiles):
     @model_validator(mode="before")
     @classmethod
     def _with_mate(cls, values: Any) -> Any:
-        """Inputs that a folder of tables gives, beside those that are given themselves."""
+        """Return the inputs that a folder of tables gives, beside those that are given themselves."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
         from railfix.run.convert import find_inputs

@@ -79,7 +79,7 @@ def locate_files(
 
 
 def solution_text(time: Datetimes, ecef_m: Floats, sigma_m: Floats, n_used: Integers) -> str:
-    """Positions as RTKLIB's solution format (GPST, latitude, longitude, ellipsoidal height, sigmas)."""
+    """Return positions as RTKLIB's solution format (GPST, latitude, longitude, ellipsoidal height, sigmas)."""
     lines = [
         "% program   : railfix locate",
         "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)",
@@ -316,7 +316,7 @@ def _nearest(feature: Feature, others: Sequence[Feature]) -> float:
 
 
 def _features(rows: pl.DataFrame) -> list[Feature]:
-    """Features of rows by chainage; stretches without values part them."""
+    """Return the features of rows by chainage; stretches without values part them."""
     at = rows[_COLUMNS[0]].to_numpy()
     grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), STEP_M)
     first = np.searchsorted(at, grid - 0.5 * BASE_M)
@@ -353,7 +353,7 @@ def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Fea
 
 
 def _means(values: Floats, first: np.ndarray, last: np.ndarray) -> tuple[Floats, Floats]:
-    """Means of values between indices, and their standard deviations."""
+    """Return the means of values between indices, and their standard deviations."""
     count = np.maximum(last - first, 1)
     middle = values - values.mean()
     sums, squares = (np.concatenate([[0.0], np.cumsum(each)]) for each in (middle, middle**2))

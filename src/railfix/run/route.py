@@ -114,7 +114,7 @@ class RouteOfLog:
         return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
 
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
-        """Whether the train is, with more than a risk, on another track than where it was placed on the route.
+        """Return whether the train is, with more than a risk, on another track than where it was placed on the route.
 
         By the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside another has
         its own probability. At the positions matched before and after each time: the track between two that are known
@@ -209,7 +209,7 @@ class RouteOfLog:
         }
 
     def on_tracks(self, table: pl.DataFrame, line: Track) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """A table of positions with `ON_TRACK_COLUMNS`, and every track near each position (`TRACK_COLUMNS`).
+        """Return a table of positions with `ON_TRACK_COLUMNS`, and every track near each position (`TRACK_COLUMNS`).
 
         `line` is the route, whose sections are its tracks. There are no rows of tracks where there is no position.
         """

@@ -132,7 +132,7 @@ def _of_speeds(
 
 
 def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
-    """Lag of the sensor's time tags behind the satellites' [s]; 0 where none of seconds is certain."""
+    """Return the lag of the sensor's time tags behind the satellites' [s]; 0 where none of seconds is certain."""
     x, found = _centre(expected), {}
     for lag in np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1.0).tolist():
         y = measured(time + timedelta(np.array([lag])))
@@ -159,7 +159,7 @@ def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
 
 
 def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
-    """Means of samples over two cells about instants; NaN where the samples do not reach so far."""
+    """Return the means of samples over two cells about instants; NaN where the samples do not reach so far."""
     half = timedelta(np.array([_CELL_S]))
     begin, end = middle - half, middle + half
     first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
@@ -169,7 +169,7 @@ def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
 
 
 def _centre(values: Floats) -> Floats:
-    """Values less their mean: an offset of the unit on the body has no part in what it is compared by."""
+    """Return values less their mean: an offset of the unit on the body has no part in what it is compared by."""
     known = np.isfinite(values)
     return values - (values[known].mean() if known.any() else 0.0)
 
@@ -192,7 +192,7 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:
-    """Slope of measured over expected values; NaN where there are too few, or these are too small."""
+    """Return the slope of measured over expected values; NaN where there are too few, or these are too small."""
     known = np.isfinite(expected) & np.isfinite(measured)
     x, y = expected[known], measured[known]
     if len(x) < _LEAST_CELLS or np.sqrt(np.mean(x * x)) < least:
@@ -343,7 +343,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
 
 
 def _check(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck | None:
-    """Speeds against those by satellites; None with too few in common."""
+    """Return speeds against those by satellites; None with too few in common."""
     if len(right_time) < 2 or not len(time):
         return None
     after = np.clip(np.searchsorted(right_time, time), 1, len(right_time) - 1)

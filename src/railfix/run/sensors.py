@@ -194,7 +194,7 @@ def _times(table: pl.DataFrame) -> Datetimes:
 
 
 def _names_of_columns(kind: str) -> list[str]:
-    """Names of the columns of a table, those that may be absent among them."""
+    """Return the names of the columns of a table, those that may be absent among them."""
     return [column.strip("[]") for column in COLUMNS[kind]]
 
 
@@ -210,14 +210,14 @@ def _column(path: Path, table: pl.DataFrame, name: str) -> NDArray[Any]:
 
 
 def _names(path: Path, table: pl.DataFrame, name: str) -> Strings:
-    """A column of names, none of them empty."""
+    """Return a column of names, none of them empty."""
     if (empty := table[name].is_null()).any():
         raise InputFileError(path, f"row {int(empty.arg_max() or 0) + 2}: {name} is empty; name it")
     return table[name].cast(pl.String).to_numpy().astype(np.str_)
 
 
 def _table(path: Path, kind: str) -> pl.DataFrame:
-    """A table with times that do not fall."""
+    """Return a table with times that do not fall."""
     table = _columns(path, kind)
     if not table["time_gpst"].dtype.is_temporal():
         raise InputFileError(path, "time_gpst is no time; expected GPS time as 2024-03-05T03:10:00.000000000")
@@ -234,7 +234,7 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
 
 
 def _list_columns(table: pl.DataFrame, kind: str) -> pl.Expr:
-    """Those that the table has beside the time."""
+    """Return those that the table has beside the time."""
     return pl.col([name for name in _names_of_columns(kind) if name in table.columns])
 
 
@@ -267,7 +267,7 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
 
 
 def _numbers(path: Path, column: pl.Series, *, may_be_empty: pl.Series) -> pl.Series:
-    """A column as numbers; those of pulses and directions are whole."""
+    """Return a column as numbers; those of pulses and directions are whole."""
     numbers = column.cast(pl.Int64 if column.name in ("pulse", "direction") else pl.Float64, strict=False)
     wrong = numbers.is_null() & (column.is_not_null() | ~may_be_empty)
     if wrong.any():

@@ -195,7 +195,7 @@ def _read_line(
 def _paths(
     track: Track, vehicle: Path | None, antennas: tuple[Antenna, ...], reading: TrackReading, prepared: PreparedLines
 ) -> tuple[Vehicle | None, dict[str, Trajectory]]:
-    """The vehicle, and the path of each antenna."""
+    """Return the vehicle, and the path of each antenna."""
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
@@ -231,7 +231,7 @@ class Log:
     skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
 
     def parts(self) -> Iterator[Observations]:
-        """Pieces of the log in order of time; errors as of `railfix.io.rinex.scan_observations`."""
+        """Yield the pieces of the log in order of time; errors as of `railfix.io.rinex.scan_observations`."""
         pieces = scan_observations(
             self.paths,
             epochs=self.chunk_epochs,
@@ -306,7 +306,7 @@ def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
 
 
 def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
-    """Results whose statuses and levels know where another track is more probable than `Config.track_risk`."""
+    """Return results whose statuses and levels know where another track is more probable than `Config.track_risk`."""
     antennas, fusion = dict(result.antennas), dict(result.fusion)
     for name, single in antennas.items():
         beside = route.is_uncertain(single.time, single.chainage_m, risk=config.track_risk)

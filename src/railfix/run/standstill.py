@@ -51,7 +51,7 @@ class StandstillCodes:
     phases: StandstillPhases | None = None  #: None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
-        """Mean place over some epochs."""
+        """Return the mean place over some epochs."""
         seconds = float((self.time[epochs][-1] - self.time[epochs][0]) / np.timedelta64(1, "s"))
         return standstill_fix(
             self.azimuth_deg,
@@ -73,7 +73,7 @@ def standstill_codes(
     base: tuple[Observations, Floats] | None = None,
     origin_ecef_m: Floats | None = None,
 ) -> StandstillCodes:
-    """Codes, and beside a base station phases, of an antenna at rest about an origin, by default its mean place.
+    """Return codes, and beside a base station phases, of an antenna at rest about an origin, by default its mean place.
 
     `base` are the observations of a base station and its place, ECEF, shape (3,) [m].
     MismatchError: the antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
@@ -129,14 +129,14 @@ def standstill_codes(
 
 
 def _residual(seen: UncorrectedRanges, origin_ecef_m: Floats) -> Floats:
-    """Observed minus computed codes at a place, the Earth's rotation in transit included; NaN where unused."""
+    """Return observed minus computed codes at a place, the Earth's rotation in transit included; NaN where unused."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
     return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)
 
 
 def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Indices]:
-    """Epochs of two logs with the same time tags, to a tenth of a second."""
+    """Return the epochs of two logs with the same time tags, to a tenth of a second."""
     step = np.timedelta64(100, "ms")
     stamps = [np.round((t - obs.time[0]) / step).astype(np.int64) for t in (obs.time, other.time)]
     _, mine, its = np.intersect1d(*stamps, return_indices=True)
@@ -146,7 +146,7 @@ def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Ind
 
 
 def _common_channels(seen: UncorrectedRanges, other: UncorrectedRanges) -> tuple[Indices, Indices]:
-    """Channels of two receivers with the same satellites and signals."""
+    """Return the channels of two receivers with the same satellites and signals."""
     names = [list(zip(s.channels.satellite.tolist(), s.channels.signal.tolist(), strict=True)) for s in (seen, other)]
     shared = [name for name in names[0] if name in names[1]]
     if not shared:
@@ -168,7 +168,7 @@ class StandstillPhases:
     distance_m: float  #: From the base station.
 
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
-        """Mean double differences over some epochs, of each satellite over its longest unbroken part."""
+        """Return the mean double differences over some epochs, of each satellite over its longest unbroken part."""
         difference, lost, toward = self.difference_m[epochs], self.lost[epochs], self.toward[epochs]
         least = _UNBROKEN * len(difference)
         elevation = np.where(np.isfinite(difference), self.elevation_deg[epochs], 0.0).sum(axis=0)
@@ -201,7 +201,7 @@ class StandstillPhases:
 
 
 def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
-    """The longest run of epochs with values and without a slip."""
+    """Return the longest run of epochs with values and without a slip."""
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return slice(0, 0)
@@ -216,7 +216,7 @@ _Side = tuple[Observations, UncorrectedRanges, Floats, Indices, Indices]
 
 
 def _phases(train: _Side, base: _Side) -> StandstillPhases:
-    """Single differences of the phases; GLONASS, whose wavelengths differ, is left out."""
+    """Return the single differences of the phases; GLONASS, whose wavelengths differ, is left out."""
     sides, lost = [], []
     for obs, seen, place, epochs, columns in (train, base):
         channel = seen.channels.columns[columns]

@@ -218,7 +218,7 @@ class AntennaTally:
         return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return the plain values for JSON."""
         return {
             "epochs": self.epochs,
             "epochs_with_observations": self.observed,

@@ -56,7 +56,7 @@ def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path)
 def prior_of_last_place(
     path: Path, network: Network, *, moved_m: float, missed_move: float, unmapped: float
 ) -> TrackPrior:
-    """Prior of tracks from the last place (`write_last_place`) and the distance moved since [m].
+    """Return the prior of tracks from the last place (`write_last_place`) and the distance moved since [m].
 
     `missed_move` is the probability that the train was moved unnoticed, anywhere; `unmapped` the prior of a track that
     the map lacks, for a train that was moved. InputFileError: the file is not a last place on this network.
@@ -86,7 +86,7 @@ def prior_of_last_place(
 
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
-    """Tracks that a train from anywhere on a track can stand on after a distance, turns included."""
+    """Return tracks that a train from anywhere on a track can stand on after a distance, turns included."""
     ends: nx.Graph[int] = nx.Graph()
     for k, length in enumerate(network.length_m.tolist()):
         ends.add_edge(2 * k, 2 * k + 1, weight=length)
@@ -98,7 +98,7 @@ def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
 
 
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
-    """Weights of the tracks that the interlocking states, of ``NAME=WEIGHT,...``.
+    """Return the weights of the tracks that the interlocking states, of ``NAME=WEIGHT,...``.
 
     SettingsError: it is not such a text, or names a track that the map lacks.
     """
@@ -316,7 +316,7 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:
-    """Weights of all tracks: the product of what the interlocking and the last place state."""
+    """Return the weights of all tracks: the product of what the interlocking and the last place state."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
         weights, unmapped = prior_of_last_place(

@@ -100,7 +100,7 @@ class TagDifference(NamedTuple):
 
 
 def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacing:
-    """Heading, gradient and length of the line from the rear to the front antenna.
+    """Return the heading, gradient and length of the line from the rear to the front antenna.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def expected_difference_m(
     gradient_permille: ArrayLike,
     spacing_m: ArrayLike,
 ) -> Floats:
-    """Pseudorange of the rear antenna less that of the front one, clocks alike, shape (P, C) [m].
+    """Return the pseudorange of the rear antenna less that of the front one, clocks alike, shape (P, C) [m].
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def ambiguity_m(
     elevation_error_deg: float = 3.0,
     azimuth_error_deg: float = 3.5,
 ) -> Floats:
-    """Largest change of the expected difference that the errors of the angles explain [m].
+    """Return the largest change of the expected difference that the errors of the angles explain [m].
 
     Of all directions within the errors the one that differs most: 1.1 m at most at 18.2 m spacing (P1
     2.3(3)), for a low satellite abeam.

@@ -137,13 +137,13 @@ class RunTables(Protocol):
     """Result tables of one antenna as arrays, for the pictures."""
 
     def channels(self, column: str) -> Floats:
-        """Column of the observations, shape (T, M); NaN where not observed."""
+        """Return the column of the observations, shape (T, M); NaN where not observed."""
 
     def rejected(self, reason: Reason) -> Masks:
-        """Observations that carry a reason, shape (T, M)."""
+        """Return observations that carry a reason, shape (T, M)."""
 
     def epochs(self, column: str) -> Floats:
-        """Column of the positions, shape (T, 1)."""
+        """Return the column of the positions, shape (T, 1)."""
 
 
 class Screen(ABC, Generic[Limits]):
@@ -307,7 +307,7 @@ def pair_antennas(
 
 
 def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floats:
-    """Median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
+    """Return the median over the channels of one clock, at each channel (T, M); NaN below `least` satellites."""
     return kernels.screens.clock_medians(
         kernel_array(values), *_clocks(satellite.dtype.str, satellite.tobytes()), least
     )

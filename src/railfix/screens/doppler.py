@@ -85,7 +85,7 @@ def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = Non
 
 
 def _growth(interval: Floats, limits: DopplerLimits) -> Floats:
-    """Noise of a change against that at the short interval."""
+    """Return the noise of a change against that at the short interval."""
     long = np.expm1(-np.maximum(interval, limits.short_interval_s) / limits.correlation_s)
     return np.asarray(np.sqrt(long / np.expm1(-limits.short_interval_s / limits.correlation_s)))
 
@@ -250,7 +250,7 @@ def doppler_screen(
 
 
 def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
-    """The state on the channels of this chunk; channels that left have no observation in it anyway."""
+    """Return the state on the channels of this chunk; channels that left have no observation in it anyway."""
     if state.satellite.tobytes() == satellite.tobytes() and state.signal.tobytes() == signal.tobytes():
         return state
     row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
@@ -262,7 +262,7 @@ def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerS
 
 
 def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | None, limits: DopplerLimits) -> Floats:
-    """Interval into each epoch by the tags, shape (T,) [s]; NaN where nothing may be differenced."""
+    """Return the interval into each epoch by the tags, shape (T,) [s]; NaN where nothing may be differenced."""
     every = np.concatenate([np.array([last], dtype="datetime64[ns]"), time])
     interval = seconds(every[1:] - every[:-1])
     possible = (interval > 0.0) & (interval <= limits.longest_interval_s)
@@ -272,7 +272,7 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 
 
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
-    """Change of the codes against the Dopplers, the clock taken out, shape (T, M) [m]."""
+    """Return the change of the codes against the Dopplers, the clock taken out, shape (T, M) [m]."""
     raw = change - rate * interval[:, None]
     # the receiver clock's step is not elapsed time
     passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT

@@ -67,19 +67,19 @@ class Alignment(Knots):
         return float(self.knot_m[-1])
 
     def curvature_at(self, chainage_m: ArrayLike) -> Floats:
-        """Curvature in plan [1/m], positive to the right."""
+        """Return the curvature in plan [1/m], positive to the right."""
         return np.interp(np.asarray(chainage_m, dtype=np.float64), self.knot_m, self.curvature)
 
     def lean_at(self, chainage_m: ArrayLike) -> Floats:
-        """Cant [m], positive where the vehicle leans to the right."""
+        """Return the cant [m], positive where the vehicle leans to the right."""
         return np.interp(np.asarray(chainage_m, dtype=np.float64), self.knot_m, self.lean_m)
 
     def grade_at(self, chainage_m: ArrayLike) -> Floats:
-        """Gradient [m/m]."""
+        """Return the gradient [m/m]."""
         return np.interp(np.asarray(chainage_m, dtype=np.float64), self.grade_knot_m, self.grade)
 
     def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
-        """The line's own marking [m]."""
+        """Return the line's own marking [m]."""
         if self.file is not None:
             return interpolate_kilometrage(chainage_m, self.file.point_m, self.file.track.kilometrage_m)
         return np.asarray(np.asarray(chainage_m, dtype=np.float64) + self.settings.kilometrage_start_m)
@@ -93,15 +93,15 @@ class Alignment(Knots):
         return CubicHermiteSpline(chainage, place, tangent, axis=0)
 
     def at(self, chainage_m: ArrayLike) -> Floats:
-        """Points of the curve, shape (..., 3) ECEF [m]; beyond the ends its first and last pieces go on."""
+        """Return the points of the curve, shape (..., 3) ECEF [m]; beyond the ends its first and last pieces go on."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64)))
 
     def tangent_at(self, chainage_m: ArrayLike) -> Floats:
-        """Unit vectors along the curve, shape (..., 3), of length 1 within 1e-6."""
+        """Return the unit vectors along the curve, shape (..., 3), of length 1 within 1e-6."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64), 1))
 
     def point_beside(self, chainage_m: Floats, lateral_m: float, height_m: float) -> Floats:
-        """Points to the right of the curve and above it, square to it and level, shape (n, 3) ECEF [m]."""
+        """Return the points to the right of the curve and above it, square to it and level, shape (n, 3) ECEF [m]."""
         place, tangent = self.at(chainage_m), self.tangent_at(chainage_m)
         up = axes_at(place)[:, 2]
         right = np.cross(tangent, up)
@@ -122,7 +122,7 @@ class Alignment(Knots):
         return np.concatenate(points)
 
     def map_error_m(self, chainage_m: ArrayLike) -> Floats:
-        """Offset of the map from the line, to the east, to the north and up, shape (..., 3) [m]."""
+        """Return the offset of the map from the line, to the east, to the north and up, shape (..., 3) [m]."""
         error = self.settings.map_error
         rng = np.random.default_rng([error.seed, 12])
         sigmas = (error.plan_sigma_m, error.plan_sigma_m, error.height_sigma_m)
@@ -130,7 +130,7 @@ class Alignment(Knots):
         return np.stack([offset.at(chainage_m) for offset in offsets], axis=-1)
 
     def track(self) -> Track:
-        """The track map: the curve at `point_chainage_m`, with its attributes and the map's error."""
+        """Return the track map: the curve at `point_chainage_m`, with its attributes and the map's error."""
         chainage = self.point_chainage_m()
         ecef = self.at(chainage)
         exact = not (self.settings.map_error.plan_sigma_m or self.settings.map_error.height_sigma_m)
@@ -156,7 +156,7 @@ class Alignment(Knots):
 
 
 def build_alignment(settings: LineSettings) -> Alignment:
-    """The line of a scenario, of any of the four kinds.
+    """Return the line of a scenario, of any of the four kinds.
 
     SettingsError: when the elements do not make a line. InputFileError: when the track file cannot be read, or is too
     rough for a line.
@@ -198,7 +198,7 @@ def _pattern_knots(length_m: float) -> Knots:
 
 
 def _integrate(line: Alignment) -> tuple[Floats, Floats]:
-    """Points and unit tangents of the curve at even chainages, shapes (n, 3).
+    """Return the points and unit tangents of the curve at even chainages, shapes (n, 3).
 
     ``d azimuth = curvature * plan step + sin(latitude) d longitude`` (convergence of the meridians),
     ``d latitude = cos(azimuth) / (M + h)``, ``d longitude = sin(azimuth) / ((N + h) cos(latitude))``,
@@ -213,7 +213,7 @@ def _integrate(line: Alignment) -> tuple[Floats, Floats]:
     lat0, lon0 = np.radians([settings.latitude_deg, settings.longitude_deg])
 
     def total(rate: Floats) -> tuple[Floats, Floats]:
-        """Integral of a rate given at the Gauss points: at the edges, and back at the Gauss points."""
+        """Return the integral of a rate given at the Gauss points: at the edges, and back at the Gauss points."""
         at_edges = np.concatenate([[0.0], np.cumsum(rate.mean(axis=1) * step)])
         slope = (rate[:, 1] - rate[:, 0]) / (offset[1] - offset[0])
         start = rate[:, 0] - slope * offset[0]

@@ -35,7 +35,7 @@ _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
-    """Slips and slides of the run, given and drawn, in order; a drawn one that overlaps another is left out."""
+    """Return slips and slides of the run, given and drawn, in order; a drawn one that overlaps another is left out."""
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _SLIPS])
     slips = list(settings.slips)
@@ -67,7 +67,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
 
 
 def slip_ratio(slips: list[SlipInterval], time_s: Floats) -> Floats:
-    """Wheel speed over train speed, less 1, at times [s]."""
+    """Return the wheel speed over train speed, less 1, at times [s]."""
     ratio = np.zeros(np.shape(time_s))
     for slip in slips:
         part = (time_s - slip.start_s) / (slip.end_s - slip.start_s)
@@ -105,7 +105,7 @@ def pulse_times_s(
 
 
 def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Floats) -> Floats:
-    """Times at which the wheel has turned by given lengths of its rim; constant acceleration between nodes."""
+    """Return times at which the wheel has turned by given lengths of its rim; constant acceleration between nodes."""
     step = np.diff(node_s)
     cell = np.clip(np.searchsorted(turned_m, target_m, side="left") - 1, 0, len(step) - 1)
     # s = v t + a t^2 / 2 with the distance of the cell kept.
@@ -119,7 +119,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
 
 
 def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
-    """Pulse times with pulses lost and doubled at random; a doubled one comes before the next tooth."""
+    """Return the pulse times with pulses lost and doubled at random; a doubled one comes before the next tooth."""
     if not (settings.lost_chance or settings.doubled_chance) or len(time_s) < 2:
         return time_s
     lost, doubled, part = np.random.default_rng([seed, _MISCOUNT]).uniform(size=(3, len(time_s)))
@@ -130,7 +130,7 @@ def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats
 
 
 def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Pulses as the tachometer gives them, see `railfix.simulate.sensor_tables.COLUMNS`."""
+    """Return pulses as the tachometer gives them, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _WHEEL])
     slips = wheel_slips(simulation, settings)
@@ -158,7 +158,7 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
 
 
 def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Truth of the wheel's slips and slides, see `railfix.simulate.sensor_tables.COLUMNS`."""
+    """Return the truth of the wheel's slips and slides, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     slips = wheel_slips(simulation, settings)
     start = scenario.start + timedelta([slip.start_s for slip in slips])
@@ -178,7 +178,7 @@ _NOISE, _ACCEL_DRIFT, _GYRO_DRIFT, _WALK, _VIBRATION = 22, 23, 24, 25, 29
 
 
 def gravity_mps2(latitude_deg: Floats, height_m: Floats) -> Floats:
-    """Normal gravity, centrifugal part included (NIMA TR8350.2, equations 4-1 and 4-3)."""
+    """Return the normal gravity, centrifugal part included (NIMA TR8350.2, equations 4-1 and 4-3)."""
     equator, k, flattening, m, axis = _GRAVITY
     sine = np.sin(np.radians(latitude_deg)) ** 2
     ground = equator * (1.0 + k * sine) / np.sqrt(1.0 - _ECCENTRICITY_2 * sine)
@@ -187,7 +187,7 @@ def gravity_mps2(latitude_deg: Floats, height_m: Floats) -> Floats:
 
 
 def _pose(simulation: Simulation, offset_m: tuple[float, float, float], time_s: Floats) -> tuple[Floats, Floats]:
-    """Structures, shape (n, 3) [m], and the axes forward, right, down in its rows, shape (n, 3, 3)."""
+    """Return structures, shape (n, 3) [m], and the axes forward, right, down in its rows, shape (n, 3, 3)."""
     along, across, up = offset_m
     truth, _ = simulation.body_truth(offset_m, time_s)
     aside, _ = simulation.body_truth((along, across + _LEVER_M, up), time_s)
@@ -217,7 +217,7 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
 
 
 def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.DataFrame:
-    """Samples of the inertial sensor, see `railfix.simulate.sensor_tables.COLUMNS`."""
+    """Return the samples of the inertial sensor, see `railfix.simulate.sensor_tables.COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(int(scenario.duration_s * settings.rate_hz + 1e-9) + 1) / settings.rate_hz
     offset = (settings.along_m, settings.across_m, settings.up_m)
@@ -233,7 +233,7 @@ def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.Dat
 
 
 def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Floats) -> Floats | float:
-    """Vibration of the six axes at times, shape (n, 6); 0 where there is none."""
+    """Return the vibration of the six axes at times, shape (n, 6); 0 where there is none."""
     sigmas = np.repeat([settings.vibration_sigma_mps2, settings.vibration_sigma_radps], 3)
     if not sigmas.any():
         return 0.0
@@ -250,7 +250,7 @@ def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Float
 
 
 def _with_errors(true: Floats, time_s: Floats, settings: InertialSettings, seed: int) -> Floats:
-    """Samples with misalignment, scale errors, biases and drifts, noise, quantisation, applied in this order."""
+    """Return samples with misalignment, scale errors, biases and drifts, noise, quantisation, applied in this order."""
     turned = Rotation.from_rotvec(settings.misalignment_rad).inv()
     measured = np.concatenate([turned.apply(true[:, :3]), turned.apply(true[:, 3:])], axis=1)
     measured *= 1.0 + np.array([*settings.accel_scale, *settings.gyro_scale])

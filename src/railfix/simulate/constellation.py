@@ -66,7 +66,7 @@ def _messages(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 
 def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, tuple[str, ...]]) -> KeplerRecords:
-    """Records of the simulated signals, with plausible transmission times."""
+    """Return the records of the simulated signals, with plausible transmission times."""
     letter = records.satellite.astype("<U1")
     usable = np.zeros(len(records), dtype=np.bool_)
     delay = np.where(letter == "E", records.group_delay_2_s, records.group_delay_1_s)
@@ -121,7 +121,7 @@ class _Orbit:
 
 
 def simulate_navigation(scenario: Scenario) -> Navigation:
-    """Broadcast records for the whole of a run, as `railfix.io.write_navigation` writes them.
+    """Return the broadcast records for the whole of a run, as `railfix.io.write_navigation` writes them.
 
     All values are rounded to the digits of the file, so that file and arrays are the same satellites. Where the
     scenario names a navigation file, its records; errors as `navigation_of_file`.
@@ -192,7 +192,7 @@ def _slot_name(system: str, k: int) -> str:
 def _figure_of_eight(
     name: str, longitude_deg: float, phase: float, *, eccentricity: float = 0.075, tilt_deg: float = 41.0
 ) -> _Orbit:
-    """Inclined synchronous orbit, northmost and farthest at a longitude, `phase` radians ago."""
+    """Return the inclined synchronous orbit, northmost and farthest at a longitude, `phase` radians ago."""
     return _Orbit(
         name=name,
         semi_major_m=_SYNCHRONOUS_M,
@@ -205,7 +205,7 @@ def _figure_of_eight(
 
 
 def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Records of one satellite: the one before the run, the one in force, and those that follow."""
+    """Return the records of one satellite: the one before the run, the one in force, and those that follow."""
     every, shift = _ISSUE_S[system], BDT_MINUS_GPST_S if system == "C" else 0.0
     mu, rotation = GM[system], ROTATION[system]
     start_sow = float(to_week(scenario.start)[1])
@@ -258,7 +258,7 @@ def _wrap(angle: float) -> float:
 
 
 def _digits(value: float) -> str:
-    """A value in the digits of RINEX's D19.12."""
+    """Return a value in the digits of RINEX's D19.12."""
     return f"{value:.12E}"
 
 
@@ -289,14 +289,14 @@ def record_state(
 
 
 def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
-    """Row of the satellite's newest record transmitted by each time (its first where there is none)."""
+    """Return the row of the satellite's newest record transmitted by each time (its first where there is none)."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.argsort(records.transmitted[rows], kind="stable")]
     return np.asarray(rows[np.maximum(np.searchsorted(records.transmitted[rows], time, side="right") - 1, 0)])
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Signals of a satellite at a receiver, `late_s` before T tags: the light-time equation by iteration."""
+    """Return the signals of a satellite at a receiver, `late_s` before T tags: the light-time equation by iteration."""
     row = newest_record(records, satellite, tag)
     since_toe = seconds(tag - records.toe[row]) - late_s
     since_toc = seconds(tag - records.toc[row]) - late_s
@@ -354,7 +354,7 @@ class SatelliteTable:
         self._powers = np.einsum("kn,pnsc->kpsc", to_powers, values)
 
     def links(self, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-        """Signals of all satellites, as `links`, shapes (T, S); ValueError outside the table's span."""
+        """Return the signals of all satellites, as `links`, shapes (T, S); ValueError outside the table's span."""
         when = seconds(tag - self._start)
         if when.size and (when.min() < 0.0 or when.max() > self._end):
             raise ValueError("tag is outside of the span that the satellite table was made for")

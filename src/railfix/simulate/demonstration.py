@@ -21,7 +21,7 @@ DEMO_FILES: Final = {
 
 
 def demo_folder() -> Path:
-    """Folder of the demonstration run: in an installed package, or in the clone it runs from.
+    """Return the folder of the demonstration run: in an installed package, or in the clone it runs from.
 
     InputFileError: when neither has it, or a file is missing.
     """
@@ -43,7 +43,7 @@ def demo_files() -> dict[str, Path]:
 
 
 def demo_inputs() -> RunInputs:
-    """The files of the demonstration run; InputFileError where neither the package nor the clone has them."""
+    """Return the files of the demonstration run; InputFileError where neither the package nor the clone has them."""
     files = demo_files()
     return RunInputs(
         front=(files["front"],),

@@ -28,7 +28,7 @@ _ROOM_S: Final = (0.1, 1.0)
 
 
 def satellite_key(satellite: str) -> tuple[int, int]:
-    """Two numbers that identify a satellite in seeds, so that its errors do not depend on other satellites."""
+    """Return two numbers that identify a satellite in seeds, so that its errors do not depend on other satellites."""
     return ord(satellite[0]), int(satellite[1:])
 
 
@@ -41,7 +41,7 @@ class Interpolated:
         self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """The four nodes about each time, shape (T, C), and the share of the cell, shape (T, 1)."""
+        """Return the four nodes about each time, shape (T, C), and the share of the cell, shape (T, 1)."""
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
@@ -50,24 +50,24 @@ class Interpolated:
         return a, b, c, d, (place - cell)[:, None]
 
     def at(self, time_s: Floats) -> Floats:
-        """Values, shape (T, C), at seconds after the start, shape (T,); ValueError far outside of the run."""
+        """Return values, shape (T, C), at seconds after the start, shape (T,); ValueError far outside of the run."""
         a, b, c, d, u = self._place(time_s)
         return np.asarray(b + u / 2.0 * ((c - a) + u * (2.0 * a - 5.0 * b + 4.0 * c - d + u * (3.0 * (b - c) + d - a))))
 
     def rate(self, time_s: Floats) -> Floats:
-        """Rates of change a second, shape (T, C)."""
+        """Return the rates of change a second, shape (T, C)."""
         a, b, c, d, u = self._place(time_s)
         slope = (c - a) + u * (2.0 * (2.0 * a - 5.0 * b + 4.0 * c - d) + 3.0 * u * (3.0 * (b - c) + d - a))
         return np.asarray(slope / 2.0 / self._spacing_s)
 
 
 def nodes_before(spacing_s: float) -> int:
-    """Nodes before second 0."""
+    """Return nodes before second 0."""
     return max(_BEFORE, int(np.ceil(_ROOM_S[0] / spacing_s)) + 1)
 
 
 def node_count(duration_s: float, spacing_s: float) -> int:
-    """Nodes that a run of a duration needs, with the room before and after it."""
+    """Return the nodes that a run of a duration needs, with the room before and after it."""
     return nodes_before(spacing_s) + int(np.ceil((duration_s + _ROOM_S[1]) / spacing_s)) + 4
 
 
@@ -87,7 +87,7 @@ class GaussMarkov(Interpolated):
 
 
 def _interpolate_sigma(rho: float) -> float:
-    """Standard deviation between nodes, root mean square, of a process of standard deviation 1."""
+    """Return the standard deviation between nodes, root mean square, of a process of standard deviation 1."""
     u = (np.arange(200) + 0.5) / 200.0
     weight = 0.5 * np.stack(
         [-u + 2 * u**2 - u**3, 2 - 5 * u**2 + 3 * u**3, u + 4 * u**2 - 3 * u**3, -(u**2) + u**3], axis=-1
@@ -128,12 +128,12 @@ class RandomFunction:
 
     @classmethod
     def smooth(cls, rng: np.random.Generator, *, sigma: float, correlation: float) -> Self:
-        """Function with the correlation exp(-d^2 / (2 correlation^2))."""
+        """Return the function with the correlation exp(-d^2 / (2 correlation^2))."""
         return cls._draw(rng, sigma, rng.normal(0.0, 1.0 / correlation, _COSINES))
 
     @classmethod
     def periodic(cls, rng: np.random.Generator, *, sigma: float, period: float) -> Self:
-        """Oscillation about one period, with a relative bandwidth of 15 percent."""
+        """Return the oscillation about one period, with a relative bandwidth of 15 percent."""
         return cls._draw(rng, sigma, 2.0 * np.pi / period * (1.0 + 0.15 * rng.normal(0.0, 1.0, _COSINES)))
 
     @classmethod
@@ -142,7 +142,7 @@ class RandomFunction:
         return cls(amplitude=sigma * float(np.sqrt(2.0 / _COSINES)), frequency=frequency, phase=phase)
 
     def at(self, x: ArrayLike) -> Floats:
-        """Values at positions or times, same shape as `x`."""
+        """Return values at positions or times, same shape as `x`."""
         where = np.asarray(x, dtype=np.float64)
         if self.amplitude == 0.0:
             return np.zeros(where.shape)
@@ -162,12 +162,12 @@ _CLOCK, _AXIS, _DELAY, _IONOSPHERE, _TROPOSPHERE = 10, 11, 14, 15, 16
 
 
 def ionosphere_mapping(elevation_deg: Floats) -> Floats:
-    """Slant over vertical delay of a thin layer 350 km up (DO-229D, A.4.4.10.4)."""
+    """Return the slant over vertical delay of a thin layer 350 km up (DO-229D, A.4.4.10.4)."""
     return 1.0 / np.sqrt(1.0 - (_EARTH_KM / (_EARTH_KM + _LAYER_KM) * np.cos(np.radians(elevation_deg))) ** 2)
 
 
 def troposphere_mapping(elevation_deg: Floats) -> Floats:
-    """Slant over zenith delay (DO-229D, A.4.2.4)."""
+    """Return the slant over zenith delay (DO-229D, A.4.2.4)."""
     return 1.001 / np.sqrt(0.002001 + np.sin(np.radians(elevation_deg)) ** 2)
 
 
@@ -210,7 +210,7 @@ class CommonErrors:
         return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
     def _of_satellites(self, stream: int, sigma: str, time: str) -> list[tuple[list[int], GaussMarkov]]:
-        """Processes of each constellation that has this error, with the columns of its satellites."""
+        """Return the processes of each constellation that has this error, with the columns of its satellites."""
         found = []
         for letter, table in sorted(self._settings.satellites.items()):
             columns = [k for k, name in enumerate(self._satellites) if name[0] == letter]
@@ -295,7 +295,7 @@ class CommonErrors:
     def ionosphere_m(
         self, time_s: Floats, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> Floats:
-        """Ionospheric delay on L1 beyond the model, shape (T, S) [m]; positions of shape (T, 1) [deg]."""
+        """Return the ionospheric delay on L1 beyond the model, shape (T, S) [m]; positions of shape (T, 1) [deg]."""
         atmosphere = self._settings.ionosphere
         vertical = np.zeros(np.shape(elevation_deg))
         if atmosphere.vertical_sigma_m > 0.0:
@@ -307,7 +307,7 @@ class CommonErrors:
         return np.asarray(vertical * ionosphere_mapping(elevation_deg))
 
     def group_delay_m(self, satellites: Sequence[str], signals: Sequence[str]) -> Floats:
-        """Constant error of each channel's code, shape (M,) [m]."""
+        """Return the constant error of each channel's code, shape (M,) [m]."""
         delays = []
         for name, signal in zip(satellites, signals, strict=True):
             rng = np.random.default_rng([self._seed, _DELAY, *satellite_key(name), *(ord(c) for c in signal)])
@@ -317,7 +317,7 @@ class CommonErrors:
 
 
 def fault_m(faults: Sequence[SatelliteFault], time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
-    """Range errors of faults [m] and their rates [m/s], shapes (T, M), at seconds after the start."""
+    """Return the range errors of faults [m] and their rates [m/s], shapes (T, M), at seconds after the start."""
     names = np.asarray(satellites)
     added, rate = np.zeros((2, len(time_s), len(names)))
     for fault in faults:

@@ -128,7 +128,7 @@ class MapError(ScenarioSettings):
 
 
 def _length_m(given: dict[str, Any]) -> float:
-    """Length of a line whose settings do not give it."""
+    """Return the length of a line whose settings do not give it."""
     total = math.fsum(item.length_m for item in given.get("elements", ()))
     by_kind = {"pattern": PATTERN_LENGTH_M, "generated": GENERATED_LENGTH_M, "elements": total}
     return by_kind.get(given.get("kind", "file"), math.nan)
@@ -205,7 +205,7 @@ class Knots:
 
 
 def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]) -> Knots:
-    """Knots of a line of given elements; SettingsError where they do not fit together."""
+    """Return the knots of a line of given elements; SettingsError where they do not fit together."""
     for k, (element, following) in enumerate(pairwise(elements)):
         both = {element.kind, following.kind}
         if both == {"transition"}:
@@ -225,7 +225,7 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
 
 
 def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, Floats]:
-    """Gradients joined by vertical curves in which the gradient changes evenly."""
+    """Return gradients joined by vertical curves in which the gradient changes evenly."""
     places, values, reached, current = [0.0], [0.0], 0.0, 0.0
     for k, item in enumerate(gradients):
         value = 1e-3 * item.permille
@@ -246,7 +246,7 @@ def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, F
 
 
 def generate_knots(settings: LineSettings) -> Knots:
-    """Knots of a generated line, straights and curves in turn."""
+    """Return the knots of a generated line, straights and curves in turn."""
     rng = np.random.default_rng([settings.generated.seed, 11])
     return knots_of_elements(_plan(settings, rng), _profile(settings, rng))
 
@@ -283,7 +283,7 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
 
 
 def _cut(elements: list[Element], length_m: float) -> list[Element]:
-    """The elements up to the length: the last curve that does not fit gives way to a straight."""
+    """Return the elements up to the length: the last curve that does not fit gives way to a straight."""
     while elements and sum(item.length_m for item in elements) > length_m:
         # Straight, transition, curve, transition: all four go.
         del elements[-4:]
@@ -326,7 +326,7 @@ class FileLine:
 
 
 def line_of_file(settings: LineFile) -> FileLine:
-    """The line through the points of a track file; InputFileError where it has too few, or bends too sharply."""
+    """Return the line through the points of a track file; InputFileError where it has too few, or bends too sharply."""
     track = read_track(
         settings.path,
         crs=settings.crs or None,
@@ -363,7 +363,7 @@ def line_of_file(settings: LineFile) -> FileLine:
 
 
 def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, Floats]:
-    """Parameters at about every half metre, the knots among them, and the arc length there (Gauss, 3 points)."""
+    """Return parameters at about every half metre, the knots among them, and the arc length there (Gauss, 3 points)."""
     pieces = np.maximum(np.ceil(np.diff(knots) / _STEP_M).astype(np.int64), 1)
     knot, number = places_in_groups(pieces)
     at = np.append(knots[knot] + number * (np.diff(knots) / pieces)[knot], knots[-1])
@@ -375,7 +375,7 @@ def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, 
 
 
 def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Floats, Floats]:
-    """Curvature in plan, right positive [1/m], and gradient [m/m]."""
+    """Return the curvature in plan, right positive [1/m], and gradient [m/m]."""
     axes = axes_at(place)
     v, a = np.einsum("nij,nj->ni", axes, slope), np.einsum("nij,nj->ni", axes, bend)
     plan = np.hypot(v[:, 0], v[:, 1])
@@ -383,7 +383,7 @@ def _curvature_and_grade(place: Floats, slope: Floats, bend: Floats) -> tuple[Fl
 
 
 def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: Floats) -> Knots:
-    """Curvature of the file where it has radii, else of the spline; lean of the file's cant."""
+    """Return the curvature of the file where it has radii, else of the spline; lean of the file's cant."""
     bend = (
         np.interp(arc, point, _fill_gaps(point, 1.0 / track.radius_m))
         if (~np.isnan(track.radius_m)).any()
@@ -395,6 +395,6 @@ def _knots(track: Track, point: Floats, arc: Floats, curvature: Floats, grade: F
 
 
 def _fill_gaps(point: Floats, values: Floats) -> Floats:
-    """Values with NaN filled by their neighbours."""
+    """Return values with NaN filled by their neighbours."""
     known = np.isfinite(values)
     return np.interp(point, point[known], values[known])

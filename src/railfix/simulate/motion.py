@@ -41,7 +41,7 @@ class Motion:
     jerk_mps3: Floats | float = 0.0  #: Shape (P,) [m/s^3].
 
     def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Chainage [m] and speed [m/s] at times; before 0 the train stands."""
+        """Return the chainage [m] and speed [m/s] at times; before 0 the train stands."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.maximum(np.searchsorted(self.time_s, time, side="right") - 1, 0)
         since = np.maximum(time - self.time_s[piece], 0.0)
@@ -53,7 +53,7 @@ class Motion:
         return chainage + jerk * since**3 / 6.0, speed + jerk * since**2 / 2.0
 
     def acceleration_at(self, time_s: ArrayLike) -> Floats:
-        """Acceleration along the line [m/s^2] at times; before 0 none."""
+        """Return the acceleration along the line [m/s^2] at times; before 0 none."""
         time = np.asarray(time_s, dtype=np.float64)
         piece = np.searchsorted(self.time_s, time, side="right") - 1
         at = np.maximum(piece, 0)
@@ -98,7 +98,7 @@ def _breakpoints(start_s: Floats, duration_s: float) -> Floats:
 
 
 def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> Floats:
-    """Acceleration at breakpoints less that a duration earlier, both just after them."""
+    """Return the acceleration at breakpoints less that a duration earlier, both just after them."""
     after = time_s + 1e-9
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 
@@ -108,7 +108,7 @@ _RAIL_HEAD_M: Final = 0.070  #: Contact points of the wheels lie further apart t
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
-    """Motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or the like are given.
+    """Return motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or the like are given.
 
     Its duration is the scenario's unless given; 0: one way, to the last stop and its stand. SettingsError: when the
     train has no room on the line.
@@ -127,7 +127,7 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Motion between two chainages, standing at each, for at least a duration."""
+    """Return the motion between two chainages, standing at each, for at least a duration."""
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
@@ -211,7 +211,7 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
 
 
 def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_m: float) -> Floats:
-    """Highest speed at places [m/s]: cruising, limits of the line, and curves."""
+    """Return the highest speed at places [m/s]: cruising, limits of the line, and curves."""
     limit = np.full(chainage_m.shape, settings.cruise_mps)
     for part in settings.limits:
         inside = (chainage_m >= part.from_m) & (chainage_m <= part.to_m)

@@ -33,14 +33,14 @@ class CarriedNoise:
         self._cn0 = _FirstOrder((*key, 1), channels, interval_s / settings.cn0_wander_time_s)
 
     def code(self, white: Floats) -> Floats:
-        """Code noise of standard deviation 1, shape (T, M), from white noise of that shape."""
+        """Return the code noise of standard deviation 1, shape (T, M), from white noise of that shape."""
         share = self._settings.code_correlated_share
         if share == 0.0:
             return white
         return np.asarray(np.sqrt(1.0 - share) * white + np.sqrt(share) * self._code.next(len(white)))
 
     def cn0_db(self, epochs: int) -> Floats | float:
-        """Variation of C/N0 [dB] over the next epochs, shape (T, M); 0 where there is none."""
+        """Return the variation of C/N0 [dB] over the next epochs, shape (T, M); 0 where there is none."""
         sigma = self._settings.cn0_wander_sigma_db
         return 0.0 if sigma == 0.0 else sigma * self._cn0.next(epochs)
 
@@ -69,7 +69,7 @@ class CodeSmoothing:
         self._state = np.full(channels, np.nan)
 
     def next(self, error_m: Floats, lost: Masks) -> Floats:
-        """Filtered errors of the next epochs, shape (T, M); unchanged where lost."""
+        """Return the filtered errors of the next epochs, shape (T, M); unchanged where lost."""
         if self._keep == 0.0:
             return error_m
         smoothed, keep = error_m.copy(), self._keep
@@ -110,7 +110,7 @@ class TrackingNoise:
         self._weak = np.zeros(channels, dtype=np.bool_)
 
     def too_weak(self, cn0_dbhz: Floats) -> Masks:
-        """Signals that have fallen below the threshold and not yet risen to the C/N0 of re-acquisition."""
+        """Return signals that have fallen below the threshold and not yet risen to the C/N0 of re-acquisition."""
         threshold, again = self._settings.threshold_dbhz, self._settings.reacquisition_dbhz
         if threshold is None:
             return np.zeros(cn0_dbhz.shape, dtype=np.bool_)
@@ -128,7 +128,7 @@ class TrackingNoise:
         return np.asarray(state)
 
     def follow(self, bad: Masks) -> LockState:
-        """Lock state over the next epochs of channels that cannot be tracked where `bad`, shape (T, M)."""
+        """Return the lock state over the next epochs of channels that cannot be tracked where `bad`, shape (T, M)."""
         epoch = np.arange(1, len(bad) + 1, dtype=np.int64)[:, None]
         last_bad = np.maximum.accumulate(np.where(bad, epoch, -self._since), axis=0)
         since = epoch - last_bad
@@ -145,7 +145,7 @@ class TrackingNoise:
 
 
 def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
-    """Whole cycles in +-2e6 for each channel and number of losses, 0 for none (mixed by splitmix64)."""
+    """Return the whole cycles in +-2e6 for each channel and number of losses, 0 for none (mixed by splitmix64)."""
     mixed = salt + losses * np.uint64(0x9E3779B97F4A7C15)
     mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -167,7 +167,7 @@ def ionosphere_m(
     *,
     frequency_hz: float | Floats,
 ) -> Floats:
-    """Klobuchar's delay [m] at a frequency, all arguments of one shape; angles inside in semicircles."""
+    """Return Klobuchar's delay [m] at a frequency, all arguments of one shape; angles inside in semicircles."""
     elevation, azimuth = elevation_deg / 180.0, np.radians(azimuth_deg)
     psi = 0.0137 / (elevation + 0.11) - 0.022
     phi = np.clip(latitude_deg / 180.0 + psi * np.cos(azimuth), -0.416, 0.416)
@@ -184,7 +184,7 @@ def ionosphere_m(
 
 
 def troposphere_m(latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
-    """Saastamoinen's delay [m], all arguments of one shape."""
+    """Return Saastamoinen's delay [m], all arguments of one shape."""
     height = np.maximum(height_m, 0.0)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
     temperature = 15.0 - 6.5e-3 * height + 273.16
@@ -204,7 +204,7 @@ _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
 def list_signals(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
-    """Signals that a receiver observes of a constellation."""
+    """Return the signals that a receiver observes of a constellation."""
     return (_WITH_L5 if settings.has_l5 else SIGNALS)[letter][: settings.signals_per_satellite]
 
 
@@ -253,7 +253,7 @@ class Receiver:
         )
 
     def white(self, epochs: int) -> Floats:
-        """White noise of code, phase, Doppler and C/N0 for the next epochs, shape (T, M, 4)."""
+        """Return the white noise of code, phase, Doppler and C/N0 for the next epochs, shape (T, M, 4)."""
         return self._rng.standard_normal((epochs, len(self.names), 4))
 
 
@@ -287,7 +287,7 @@ class ReceiverClocks:
         self._scenario = scenario
 
     def _line(self, receiver: str) -> tuple[float, float]:
-        """Bias at the start [s] and drift [s/s] of a receiver."""
+        """Return bias at the start [s] and drift [s/s] of a receiver."""
         settings = self._scenario.receiver
         bias, drift = settings.clock_bias_s, settings.clock_drift
         if receiver not in ANTENNAS:
@@ -297,7 +297,7 @@ class ReceiverClocks:
         return -0.61 * bias, 0.83 * drift
 
     def bias_s(self, receiver: str, tag_s: Floats) -> Floats:
-        """Tag minus GPS time at tags counted from the start, shape (T,) [s]."""
+        """Return the tag minus GPS time at tags counted from the start, shape (T,) [s]."""
         bias, drift = self._line(receiver)
         value = bias + drift * tag_s
         walk = self._walk(receiver)
@@ -307,13 +307,13 @@ class ReceiverClocks:
         return value - np.rint(value * 1e3) * 1e-3 if steps else value
 
     def rate_mps(self, receiver: str, tag_s: Floats) -> Floats:
-        """Rate at tags, steps left out, shape (T,) [m/s]."""
+        """Return the rate at tags, steps left out, shape (T,) [m/s]."""
         even = np.full(np.shape(tag_s), SPEED_OF_LIGHT * self._line(receiver)[1])
         walk = self._walk(receiver)
         return even if walk is None else even + walk.rate(tag_s)[:, 0]
 
     def _walk(self, receiver: str) -> ClockWalk | None:
-        """Random walk of a receiver's clock, the same for both antennas where their clock is common."""
+        """Return the random walk of a receiver's clock, the same for both antennas where their clock is common."""
         common = self._scenario.receiver.clocks == "common" and receiver in ANTENNAS
         return self._walks[ANTENNAS[0] if common else receiver]
 

@@ -92,7 +92,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
 
 
 def _list_effects(scenario: Scenario) -> str:
-    """One sentence a group of errors: on, or none."""
+    """Return one sentence a group of errors: on, or none."""
     usual = Scenario().errors
     names = list(type(usual).model_fields)
     errors = [name for name in names if getattr(scenario.errors, name) != getattr(usual, name)]
@@ -129,7 +129,7 @@ def _list_effects(scenario: Scenario) -> str:
 
 
 def _settings(scenario: Scenario) -> dict[str, Any]:
-    """Settings by their names; of the longer groups what is not at its default."""
+    """Return settings by their names; of the longer groups what is not at its default."""
     usual = Scenario(sensors=None).describe()
     table = {}
     for name, value in scenario.describe().items():
@@ -145,7 +145,7 @@ _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",
 
 
 def truth_table(simulation: Simulation) -> pl.DataFrame:
-    """Ground truth of the antennas at the epochs of their receivers, one row an epoch and antenna.
+    """Return the ground truth of the antennas at the epochs of their receivers, one row an epoch and antenna.
 
     `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point abeam the antenna, on the track map's chainage),
     `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage), `acceleration_mps2` (along the
@@ -178,7 +178,7 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
 
 
 def section_table(simulation: Simulation) -> pl.DataFrame:
-    """Sections of the line from end to end: `from_m`, `to_m` (on the track map's chainage), `environment`."""
+    """Return sections of the line from end to end: `from_m`, `to_m` (on the track map's chainage), `environment`."""
     line = simulation.line
     ends = [m for part in simulation.environment.sections for m in (part.from_m, part.to_m)]
     edges = np.unique(np.clip([0.0, *ends, line.length_m], 0.0, line.length_m))
@@ -285,7 +285,7 @@ def _parquet(table: pl.DataFrame) -> bytes:
 
 
 def vehicle_table(vehicle: VehicleSettings) -> dict[str, Any]:
-    """The vehicle as the vehicle file holds it, see `railfix.track.vehicle.read_vehicle`."""
+    """Return the vehicle as the vehicle file holds it, see `railfix.track.vehicle.read_vehicle`."""
     antennas = {
         name: dict(zip(("along_m", "across_m", "up_m"), getattr(vehicle, name), strict=True)) for name in ANTENNAS
     }

@@ -88,7 +88,7 @@ def parameters(second: int, **values: int) -> Bytes:
 
 
 def half(satellites: Sequence[LongTerm], iodp: int) -> list[Field]:
-    """Half of type 25 without velocity: (slot from 1, IODE, position [m], clock [2^-31 s]) of up to two."""
+    """Return the half of type 25 without velocity: (slot from 1, IODE, position [m], clock [2^-31 s]) of up to two."""
     fields: list[Field] = [(0, 1)]
     for i in range(2):
         slot, iode, position, clock = satellites[i] if i < len(satellites) else (0, 0, (0.0, 0.0, 0.0), 0.0)
@@ -158,7 +158,7 @@ class Service:
 
     @staticmethod
     def slot(name: str) -> int:
-        """Number of a satellite in the mask, 0 where it is not corrected."""
+        """Return the number of a satellite in the mask, 0 where it is not corrected."""
         return int(name[1:]) if name[0] == "G" else 0
 
     def _instant(self, second: float) -> Floats:
@@ -166,13 +166,13 @@ class Service:
         return np.asarray(np.clip(np.array([second - self._settings.latency_s]), 0.0, self._last_s))
 
     def fast_m(self, second: float) -> Floats:
-        """Fast corrections of `satellites` [m]: their clocks, and the group delay of their code."""
+        """Return the fast corrections of `satellites` [m]: their clocks, and the group delay of their code."""
         clock = self._errors.clock_error_m(self._instant(second))[0]
         noise = self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(self.satellites))
         return np.asarray(np.clip(clock - self._group_delay_m + noise, -_LARGEST_FAST_M, _LARGEST_FAST_M))
 
     def indicators(self, second: float) -> list[int]:
-        """UDREI (L5: DFREI) of `satellites`: as set, do not use during a fault."""
+        """Return UDREI (L5: DFREI) of `satellites`: as set, do not use during a fault."""
         settings = self._settings
         usual = settings.udrei if settings.band == "L1" else settings.dfrei
         at = self._instant(second - settings.alert_s + settings.latency_s)
@@ -180,7 +180,7 @@ class Service:
         return [DO_NOT_USE if abs(f) > settings.alert_m else usual for f in fault[0].tolist()]
 
     def orbits(self, second: float) -> list[LongTerm]:
-        """Long-term corrections of `satellites`: positions, to the issue of data in force."""
+        """Return the long-term corrections of `satellites`: positions, to the issue of data in force."""
         at = self._instant(second)
         error = self._errors.orbit_error_m(at)[0]
         error = error + self._settings.orbit_sigma_m * self._rng[_ORBIT].standard_normal(error.shape)
@@ -197,7 +197,7 @@ class Service:
         ]
 
     def _grid_points(self) -> dict[int, list[tuple[int, float, float]]]:
-        """Bit, latitude and longitude of the grid points near the line, by band."""
+        """Return the bit, latitude and longitude of the grid points near the line, by band."""
         latitude, longitude = self._simulation.origin_deg
         bands: dict[int, list[tuple[int, float, float]]] = {}
         for band in range(BANDS):
@@ -212,7 +212,7 @@ class Service:
         return bands
 
     def delays_m(self, second: float, points: list[tuple[int, float, float]]) -> list[float]:
-        """Vertical delays of grid points [m], model and error of the simulated ionosphere."""
+        """Return the vertical delays of grid points [m], model and error of the simulated ionosphere."""
         at = self._instant(second)
         latitude, longitude = (np.array([point[k] for point in points]) for k in (1, 2))
         time = self._start + timedelta(at)
@@ -229,7 +229,7 @@ class Service:
         return [float(delay) for delay in np.clip(total, 0.0, _LARGEST_DELAY_M)]
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Messages of types 2 to 5 and 24, each a function of the second and of the issue (IODF)."""
+        """Return the messages of types 2 to 5 and 24, each a function of the second and of the issue (IODF)."""
         return [partial(self._fast, block=block) for block in range(-(-len(self.satellites) // _FAST))]
 
     def _fast(self, second: int, issue: int, block: int) -> Bytes:
@@ -241,7 +241,7 @@ class Service:
         return fast(second, values, grades, kind=2 + block, iodf=issue)
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """All other messages in the order in which they are sent in turn, each a function of the second."""
+        """Return all other messages in the order in which they are sent in turn, each a function of the second."""
         numbers = {int(name[1:]) for name in self.satellites}
         count = len(self.satellites)
         messages: list[Callable[[int], Bytes]] = [

@@ -99,7 +99,7 @@ class SimulatedDfmc(Service):
 
     @staticmethod
     def slot(name: str) -> int:
-        """Slot of a satellite, 0 without one."""
+        """Return the slot of a satellite, 0 without one."""
         return SLOT_OF.get(name, 0)
 
     def clocks_m(self, second: float) -> Floats:
@@ -151,7 +151,7 @@ LOST: Final = 53  #: Stream of random numbers of lost messages.
 
 
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:
-    """Messages from `lead_s` before the run to its end, one a second.
+    """Return messages from `lead_s` before the run to its end, one a second.
 
     Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
     long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` puts

@@ -241,7 +241,7 @@ class Scenario(ScenarioSettings):
             raise SettingsError(problem)
 
     def _room_problem(self, length_m: float) -> str:
-        """Sentence on why the train does not stay within a line of this length; empty where it does."""
+        """Return the sentence on why the train does not stay within a line of this length; empty where it does."""
         margin, stations = self.run.end_margin_m, self.run.stations
         reach = max(abs(v) for v in (self.vehicle.front[0], self.vehicle.rear[0], self.vehicle.bogie_distance_m / 2.0))
         if length_m <= 2.0 * margin or margin < reach + 1.0:
@@ -278,7 +278,7 @@ class Scenario(ScenarioSettings):
         return np.timedelta64(round(1e7 / self.rate_hz) * 100, "ns")
 
     def describe(self) -> dict[str, Any]:
-        """All settings as plain values, by their dotted names; those of a list by their number, from 1."""
+        """Return all settings as plain values, by their dotted names; those of a list by their number, from 1."""
         return _flatten("", self.model_dump() | {"start": str(self.start)})
 
 

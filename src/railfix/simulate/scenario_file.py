@@ -75,7 +75,7 @@ class Recipe:
 
 
 def whole_run_s(scenario: Scenario) -> float:
-    """Time to the end of the stop at the end of the first leg, in whole seconds."""
+    """Return the time to the end of the stop at the end of the first leg, in whole seconds."""
     motion = build_motion(build_alignment(scenario.line), scenario, duration_s=0.0)
     run = scenario.run
     last = run.stations[-1 if run.direction == "rising" else 0].dwell_s if run.stations else run.stand_s
@@ -83,12 +83,12 @@ def whole_run_s(scenario: Scenario) -> float:
 
 
 def list_scenarios() -> dict[str, Path]:
-    """Scenario files that come with railfix, by name."""
+    """Return the scenario files that come with railfix, by name."""
     return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
 
 
 def find_scenario(name: FilePath) -> Path:
-    """A scenario file by its path, or by the name of a shipped one; InputFileError when it is neither."""
+    """Return a scenario file by its path, or by the name of a shipped one; InputFileError when it is neither."""
     shipped, path = list_scenarios(), Path(name)
     if path.is_file() or (path.suffix and str(name) not in shipped):
         return path
@@ -98,7 +98,7 @@ def find_scenario(name: FilePath) -> Path:
 
 
 def load_recipe(name: FilePath) -> Recipe:
-    """Contents of a scenario file (a path, or the name of a shipped scenario), one run or several.
+    """Return the contents of a scenario file (a path, or the name of a shipped scenario), one run or several.
 
     InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a recipe is not one (names
     twice, other keys); settings of a run are checked by `Recipe.scenario`.
@@ -145,7 +145,7 @@ def _run_table(
 
 
 def load_scenario(name: FilePath) -> Scenario:
-    """The scenario of a file that holds one run: a path, or the name of a shipped scenario.
+    """Return the scenario of a file that holds one run: a path, or the name of a shipped scenario.
 
     InputFileError: the file is missing, unreadable, or no TOML. SettingsError: a setting is misspelt, of the wrong
     kind, or out of range; or the file lists many runs.
@@ -157,7 +157,7 @@ def load_scenario(name: FilePath) -> Scenario:
 
 
 def scenario_table(scenario: Scenario) -> dict[str, Any]:
-    """All settings of a scenario as a scenario file holds them, for `railfix.core.settings.write_toml`.
+    """Return all settings of a scenario as a scenario file holds them, for `railfix.core.settings.write_toml`.
 
     None is the word "none"; `multipath` is not in it.
     """
@@ -173,7 +173,7 @@ def _without_none(value: Any) -> Any:
 
 
 def _absolute(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """The same settings with absolute paths."""
+    """Return the same settings with absolute paths."""
     changes: dict[str, Any] = {}
     sky, line = table.get("sky"), table.get("line")
     if isinstance(sky, dict) and isinstance(sky.get("nav"), str) and sky["nav"] != "none":
@@ -184,7 +184,7 @@ def _absolute(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a base overridden by others, table by table."""
+    """Return the settings of a base overridden by others, table by table."""
     both = {**base, **values}
     for name in set(base) & set(values):
         if isinstance(base[name], Mapping) and isinstance(values[name], Mapping):

@@ -46,7 +46,7 @@ def beyond_start(to_m: float, info: ValidationInfo) -> float:
 
 
 def at_least(least: float) -> AfterValidator:
-    """Validator of a range of lengths that must begin at this length [m]."""
+    """Return the validator of a range of lengths that must begin at this length [m]."""
 
     def check(pair: tuple[float, float]) -> tuple[float, float]:
         if pair[0] < least:
@@ -62,7 +62,7 @@ AngleBetween = Annotated[tuple[Finite, Finite], AfterValidator(_rising)]
 
 
 def _gps_time(value: Any) -> np.datetime64:
-    """GPS time of a TOML time, a text or a datetime64."""
+    """Return GPS time of a TOML time, a text or a datetime64."""
     with suppress(ValueError):
         if isinstance(value, str | datetime | np.datetime64) and not np.isnat(time := gps_time(value)):
             return time
@@ -70,7 +70,7 @@ def _gps_time(value: Any) -> np.datetime64:
 
 
 def _toml_time(time: np.datetime64) -> datetime | str:
-    """A TOML time where microseconds are enough, else text."""
+    """Return a TOML time where microseconds are enough, else text."""
     rounded = datetime.fromisoformat(str(time.astype("datetime64[us]")))
     return rounded if np.datetime64(rounded) == time else str(time)
 

@@ -65,7 +65,7 @@ class Simulation:
         self.clocks = ReceiverClocks(scenario)
 
     def time(self, first: int = 0, last: int | None = None) -> Datetimes:
-        """Time tags of epochs `first` to before `last`, GPS time."""
+        """Return the time tags of epochs `first` to before `last`, GPS time."""
         last = self.scenario.epochs if last is None else last
         return np.asarray(self.scenario.start + np.arange(first, last) * self.scenario.interval)
 
@@ -85,7 +85,7 @@ class Simulation:
         return self.compute_errors(self.satellites)
 
     def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
-        """Errors of satellites and atmosphere; those of a satellite do not depend on the others."""
+        """Return the errors of satellites and atmosphere; those of a satellite do not depend on the others."""
         scenario = self.scenario
         return CommonErrors(
             scenario.errors,
@@ -152,7 +152,7 @@ class Simulation:
         )
 
     def pieces(self, antenna: str, *, chunk_epochs: int = CHUNK_EPOCHS) -> Iterator[Piece]:
-        """Truth and observations of one antenna, piece by piece; any cutting gives the same numbers."""
+        """Yield the truth and observations of one antenna, piece by piece; any cutting gives the same numbers."""
         receiver = Receiver(
             self.scenario,
             antenna,
@@ -165,7 +165,7 @@ class Simulation:
             yield _piece(self, receiver, self.time(first, min(first + chunk_epochs, self.scenario.epochs)))
 
     def observations(self, antenna: str) -> Iterator[Observations]:
-        """Observations of one antenna, piece by piece."""
+        """Return the observations of one antenna, piece by piece."""
         return (piece.observations for piece in self.pieces(antenna))
 
 
@@ -182,7 +182,7 @@ class _Instant:
 
 
 def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ecef_m: Floats) -> _Instant:
-    """Signals of `Simulation.satellites` that arrive at the antenna `late_s` before the tags."""
+    """Return the signals of `Simulation.satellites` that arrive at the antenna `late_s` before the tags."""
     scale, navigation = simulation.scenario.sky, simulation.navigation
     found = simulation.satellite_table.links(time, late_s, antenna_ecef_m)
     sky = found.satellite_ecef_m
@@ -220,7 +220,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
 
 
 def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
-    """Geometry by satellite, the instant of the epochs, and rates of path and ionosphere over 10 ms [m/s]."""
+    """Return geometry by satellite, the instant of the epochs, and rates of path and ionosphere over 10 ms [m/s]."""
     late = simulation.clocks.bias_s(antenna, tags := seconds(time - simulation.scenario.start))
     truth, speed = simulation.truth(antenna, tags - late)
     now = _instant(simulation, time, late, truth.ecef_m)
@@ -246,7 +246,7 @@ def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[Si
 
 
 def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece:
-    """The next epochs of a receiver."""
+    """Return the next epochs of a receiver."""
     scenario, settings = simulation.scenario, simulation.scenario.receiver
     by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, receiver.antenna, time)
     column, scale, wavelength = receiver.column, receiver.scale, receiver.wavelength_m
@@ -325,7 +325,7 @@ def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[
 
 
 def _is_tracked(elevation_deg: Floats, scenario: Scenario) -> Masks:
-    """Satellites that a receiver tracks, shape (T, S)."""
+    """Return satellites that a receiver tracks, shape (T, S)."""
     tracked = elevation_deg >= scenario.sky.cutoff_deg
     most = scenario.sky.satellites_at_most
     if most is not None and most < elevation_deg.shape[1]:

@@ -62,7 +62,7 @@ class HeldFrame:
         return _ITRF[self.itrf]
 
     def plate_at(self, latitude_deg: float, longitude_deg: float) -> str:
-        """The plate that carries a place of the country."""
+        """Return the plate that carries a place of the country."""
         if self.border is None:
             return self.plate
         other, (south, west), (north, east) = self.border
@@ -70,7 +70,7 @@ class HeldFrame:
         return other if cross < 0.0 else self.plate
 
     def describe_rest(self, years: float) -> str:
-        """What is left out after some years, in words."""
+        """Return what is left out after some years, in words."""
         low, high = (abs(years) * rate / 1000.0 for rate in self.rest_mm)
         but = f", {self.but}" if self.but else ""
         return f"its motion against that plate, {low:.2f} to {high:.2f} m, is left out{but}"
@@ -170,7 +170,7 @@ Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
 @lru_cache(maxsize=32)
 def kind_of_frame(crs: str) -> Kind:
-    """How a CRS is tied to the Earth; SettingsError when it is unknown."""
+    """Return how a CRS is tied to the Earth; SettingsError when it is unknown."""
     geodetic = get_geodetic_frame(crs)
     name = geodetic.name
     if name in REALISATIONS:
@@ -184,12 +184,12 @@ def kind_of_frame(crs: str) -> Kind:
 
 @lru_cache(maxsize=64)
 def _system(crs: str) -> CRS:
-    """The system of a name, which takes PROJ a millisecond to find; CRSError when it knows none."""
+    """Return the system of a name, which takes PROJ a millisecond to find; CRSError when it knows none."""
     return CRS.from_user_input(crs)
 
 
 def find_crs(crs: str, *, path: FilePath = "") -> CRS:
-    """The system of a name, asked for in a file; SettingsError when PROJ does not know it."""
+    """Return the system of a name, asked for in a file; SettingsError when PROJ does not know it."""
     try:
         return _system(crs)
     except CRSError:
@@ -213,7 +213,7 @@ def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | No
 
 
 def unit_of_grid(crs: str, *, path: str) -> float:
-    """Metres of the unit of a projected CRS; SettingsError when it is none."""
+    """Return the metres of the unit of a projected CRS; SettingsError when it is none."""
     system = find_crs(crs, path=path)
     if not system.is_projected and not (system.is_compound and system.sub_crs_list[0].is_projected):
         raise SettingsError(f"{path}: {crs} is {system.name}, no grid; a design is in one, such as EPSG:25832 (--crs)")
@@ -221,20 +221,20 @@ def unit_of_grid(crs: str, *, path: str) -> float:
 
 
 def unit_of_heights(crs: str | None) -> float:
-    """Metres of the unit of the heights of a CRS; 1 where it has none."""
+    """Return the metres of the unit of the heights of a CRS; 1 where it has none."""
     axes = [] if crs is None else find_crs(crs).axis_info
     return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
 
 
 def get_vertical_datum(crs: str | None) -> CRS | None:
-    """The height datum of a compound CRS, None for others."""
+    """Return the height datum of a compound CRS, None for others."""
     system = None if crs is None else find_crs(crs)
     return system.sub_crs_list[1] if system is not None and system.is_compound else None
 
 
 @lru_cache(maxsize=64)
 def get_geodetic_frame(crs: str) -> CRS:
-    """The geodetic frame that a CRS is based on."""
+    """Return the geodetic frame that a CRS is based on."""
     geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
@@ -254,7 +254,7 @@ def find_operation(crs: str) -> Transformer | None:
 
 
 def operations_between(source: CRS, target: CRS | str, area: Any = None) -> TransformerGroup:
-    """What PROJ knows between two systems over an area; grids that are not installed are no warning."""
+    """Return what PROJ knows between two systems over an area; grids that are not installed are no warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
@@ -361,7 +361,7 @@ def _modern_frame(crs: str) -> tuple[str, float]:
 
 
 def _share_covered(crs: CRS, other: CRS) -> float:
-    """Share of the area of use of a CRS, in degrees, that that of another covers; 0 where either is unknown."""
+    """Return share of the area of use of a CRS, in degrees, that that of another covers; 0 where either is unknown."""
     area, by = crs.area_of_use, other.area_of_use
     if area is None or by is None:
         return 0.0
@@ -374,7 +374,7 @@ def _share_covered(crs: CRS, other: CRS) -> float:
 
 @lru_cache(maxsize=32)
 def older_datum_note(crs: str | None) -> tuple[str, ...]:
-    """A note on the transformation of a map in an older datum; none for other maps."""
+    """Return a note on the transformation of a map in an older datum; none for other maps."""
     if crs is None or kind_of_frame(crs) != "older datum":
         return ()
     code, accuracy = _modern_frame(crs)
@@ -389,7 +389,7 @@ def older_datum_note(crs: str | None) -> tuple[str, ...]:
 
 
 def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_deg: float) -> Masks:
-    """Which points lie in the area of use of a CRS, with a margin; all where it has none."""
+    """Return which points lie in the area of use of a CRS, with a margin; all where it has none."""
     area = crs.area_of_use
     if area is None:
         return np.ones(len(latitude_deg), dtype=bool)

@@ -65,20 +65,20 @@ class PlanElement:
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
-        """Curvature [1/m] at ways from the first point."""
+        """Return the curvature [1/m] at ways from the first point."""
         t = way_m / self.length_m
         bend = self.lean_m / self.length_m**2 * 420.0 * t**2 * (1.0 - t) ** 2 * (1.0 - 2.0 * t)
         return np.asarray(self.first + (self.last - self.first) * LAWS[self.law][0](t) - bend)
 
     def direction_at(self, way_m: Floats) -> Floats:
-        """Direction [rad] at ways from the first point."""
+        """Return the direction [rad] at ways from the first point."""
         t = way_m / self.length_m
         change = (self.last - self.first) * self.length_m * LAWS[self.law][1](t)
         change = change - self.lean_m / self.length_m * 140.0 * t**3 * (1.0 - t) ** 3
         return np.asarray(self.direction_rad + self.first * way_m + change)
 
     def place_at(self, way_m: Floats) -> Floats:
-        """Easting and northing at ways from the first point, shape (n, 2) [m]."""
+        """Return the easting and northing at ways from the first point, shape (n, 2) [m]."""
         turn = max(abs(self.first), abs(self.last)) * self.length_m
         pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))  # even: Helmert's law has its knot in the middle
         knots = np.linspace(0.0, self.length_m, pieces + 1)
@@ -106,7 +106,7 @@ class ProfileElement:
     arc: str = "parabola"  #: ``"circle"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
 
     def height_at(self, place_m: Floats) -> Floats:
-        """Height [m] at places in plan."""
+        """Return the height [m] at places in plan."""
         way = place_m - self.start_m
         if self.arc == "parabola" or self.first == self.last:
             bend = (self.last - self.first) * way**2 / (2.0 * self.length_m)
@@ -116,7 +116,7 @@ class ProfileElement:
         return np.asarray(self.height_m - radius * (np.sqrt(1.0 - sine**2) - np.sqrt(1.0 - _sine(self.first) ** 2)))
 
     def gradient_at(self, place_m: Floats) -> Floats:
-        """Gradient [m/m] at places in plan."""
+        """Return the gradient [m/m] at places in plan."""
         share = (place_m - self.start_m) / self.length_m
         if self.arc == "parabola" or self.first == self.last:
             return np.asarray(self.first + (self.last - self.first) * share)
@@ -135,7 +135,7 @@ class CantElement:
     law: str = "linear"
 
     def rails_at(self, place_m: Floats) -> tuple[Floats, Floats]:
-        """Heights of the left and the right rail over the profile [m]."""
+        """Return the heights of the left and the right rail over the profile [m]."""
         share = LAWS[self.law][0](np.clip((place_m - self.start_m) / self.length_m, 0.0, 1.0))
         left, right = (np.asarray(a + (b - a) * share) for a, b in (self.left_m, self.right_m))
         return left, right
@@ -181,12 +181,12 @@ def alignment_at(
 
 
 def plan_starts(plan: Sequence[PlanElement]) -> Floats:
-    """Length in plan at the start of each element, shape (elements,) [m]."""
+    """Return the length in plan at the start of each element, shape (elements,) [m]."""
     return np.cumsum([0.0, *(element.length_m for element in plan)])[:-1]
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Rows and number of each element that places lie in: the last that begins before, else the first."""
+    """Return the rows and number of each element that places lie in: the last that begins before, else the first."""
     if not len(starts):
         return []
     index = np.maximum(np.searchsorted(starts, place_m, side="right") - 1, 0)
@@ -312,7 +312,7 @@ def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
 
 
 def _within(crs: str, xy: Floats) -> bool:
-    """Whether coordinates lie in the area of use of a CRS; True where it has none."""
+    """Return whether coordinates lie in the area of use of a CRS; True where it has none."""
     system = CRS.from_user_input(crs)
     if system.area_of_use is None:
         return True

@@ -72,7 +72,7 @@ class FrameShift:
 
 
 def decimal_year(time: np.datetime64 | Datetimes) -> float:
-    """Time as a decimal year, as frames' epochs are written."""
+    """Return the time as a decimal year, as frames' epochs are written."""
     year = np.asarray(time, dtype="datetime64[Y]")
     start, end = year.astype("datetime64[s]"), (year + np.timedelta64(1, "Y")).astype("datetime64[s]")
     part = (np.asarray(time, dtype="datetime64[s]") - start) / (end - start)
@@ -137,7 +137,7 @@ def points_at(
 
 
 def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
-    """Points after a transformation of PROJ at an epoch."""
+    """Return the points after a transformation of PROJ at an epoch."""
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), year))
     return ecef_from_geodetic(np.asarray(lat), np.asarray(lon), np.asarray(up))
@@ -159,7 +159,7 @@ def in_map_frame(
 def _from_dynamic(
     ecef_m: Floats, crs: str, year: float, epoch: float | None, plate: str | None
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Coordinates of an ITRF at an epoch, in the working frame at the log's."""
+    """Return the coordinates of an ITRF at an epoch, in the working frame at the log's."""
     name = get_geodetic_frame(crs).name
     moved = _in_itrf2020(ecef_m, REALISATIONS[name], year if epoch is None else epoch)
     if epoch is None:
@@ -174,7 +174,7 @@ def _from_dynamic(
 
 
 def _in_itrf2020(ecef_m: Floats, code: str, year: float) -> Floats:
-    """Coordinates of a realisation of the ITRF in ITRF2020, both at an epoch."""
+    """Return the coordinates of a realisation of the ITRF in ITRF2020, both at an epoch."""
     return _transform(Transformer.from_crs(code, WORKING_FRAME, always_xy=True), ecef_m, year)
 
 
@@ -233,14 +233,14 @@ def _by_parameters(
 
 
 def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
-    """Coordinates moved with a plate for some years (ITRF2020 plate motion model)."""
+    """Return coordinates moved with a plate for some years (ITRF2020 plate motion model)."""
     motion = Transformer.from_pipeline(f"+proj=pipeline +step +init=ITRF2020:{plate} +t_epoch=0")
     x, y, z, _ = motion.transform(ecef_m[:, 0], ecef_m[:, 1], ecef_m[:, 2], np.full(len(ecef_m), years))
     return np.stack([x, y, z], axis=-1)
 
 
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
-    """A note on how far a map without a named frame may be off at a point of it."""
+    """Return a note on how far a map without a named frame may be off at a point of it."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     found = []
     for name, code in REGIONAL.items():
@@ -310,12 +310,12 @@ def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, pa
 
 
 def _has_grid(name: str) -> bool:
-    """Whether PROJ has a grid."""
+    """Return whether PROJ has a grid."""
     return any((Path(folder) / name).is_file() for folder in (*get_data_dir().split(os.pathsep), get_user_data_dir()))
 
 
 def _egm96(latitude_deg: Floats, longitude_deg: Floats) -> tuple[str, Floats]:
-    """EGM96 by sidereon's grid of 1 degree."""
+    """Return EGM96 by sidereon's grid of 1 degree."""
     try:
         import sidereon
     except ImportError:
@@ -329,7 +329,7 @@ def _egm96(latitude_deg: Floats, longitude_deg: Floats) -> tuple[str, Floats]:
 
 
 def _missing_grids(source: CRS) -> str:
-    """Names of the grids that PROJ would need for heights of a compound CRS."""
+    """Return the names of the grids that PROJ would need for heights of a compound CRS."""
     group = operations_between(source, "EPSG:4979")
     names = {grid.short_name for operation in group.unavailable_operations for grid in operation.grids}
     return " or ".join(sorted(names)) or "NAME"

@@ -103,7 +103,7 @@ def _dense(track: Track) -> Track:
 
 @contextmanager
 def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
-    """A raster and its CRS; InputFileError where there is none."""
+    """Yield a raster and its CRS; InputFileError where there is none."""
     try:
         import rasterio
     except ImportError:
@@ -121,7 +121,7 @@ def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
 def _from_raster(
     track: Track, path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None
 ) -> Track:
-    """Heights of a raster at the points of the track, linear between the middles of its cells."""
+    """Return the heights of a raster at the points of the track, linear between the middles of its cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
     with _open_raster(path) as (raster, crs):
         height_datum, geoid = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
@@ -224,7 +224,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
 
 
 def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, reach_m: float) -> Floats:
-    """Weighted straight lines through the heights about each target; NaN farther than a reach from any."""
+    """Return the weighted straight lines through the heights about each target; NaN farther than a reach from any."""
     kernel = float(np.clip(_KERNEL_M * np.median(sigma) / SIGMA_HEIGHT_M, _KERNEL_M, _LARGEST_KERNEL_M))
     weight = 1.0 / sigma**2
     for _ in range(_WEIGHED_AGAIN if kernel > _KERNEL_M else 0):
@@ -244,7 +244,7 @@ def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, rea
 
 
 def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, kernel_m: float) -> Floats:
-    """Heights of weighted straight lines about each target; NaN beside all positions."""
+    """Return the heights of weighted straight lines about each target; NaN beside all positions."""
     fitted = np.full(len(target), np.nan)
     bounds = np.searchsorted(place, [target - 3.0 * kernel_m, target + 3.0 * kernel_m]).T
     for k, (low, high) in enumerate(bounds.tolist()):

@@ -48,7 +48,7 @@ class _Placement:
     turn_rad: float = 0.0
 
     def then(self, x: float, y: float, z: float, turn: float) -> _Placement:
-        """Axes that lie so in these."""
+        """Return axes that lie so in these."""
         cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
         return _Placement(
             float(self.x_m + cosine * x - sine * y),
@@ -152,7 +152,7 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _units(step: _Step) -> tuple[float, float]:
-    """Metres of a length and radians of an angle in the file."""
+    """Return the metres of a length and radians of an angle in the file."""
     length = angle = 1.0
     assigned = {r for _, e in step.of_kind("IFCUNITASSIGNMENT") for r in e.values[0]}
     for number, entity in step.entities.items():
@@ -196,7 +196,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Placement of an alignment; that of its layout in plan where it is relative to the alignment's."""
+    """Return the placement of an alignment; that of its layout in plan where it is relative to the alignment's."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative
@@ -216,7 +216,7 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Placements from an object to the world; InputFileError where one is not local."""
+    """Return placements from an object to the world; InputFileError where one is not local."""
     found: list[Any] = []
     while reference is not None and reference not in found:
         entity = step.at(reference, what="ObjectPlacement")
@@ -232,7 +232,7 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
 def _move(
     plan: list[PlanElement], profile: list[ProfileElement], at: _Placement
 ) -> tuple[list[PlanElement], list[ProfileElement]]:
-    """Elements in the coordinates of the project."""
+    """Return the elements in the coordinates of the project."""
     moved = []
     for element in plan:
         placed = at.then(element.x_m, element.y_m, 0.0, element.direction_rad)

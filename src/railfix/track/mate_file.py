@@ -43,7 +43,7 @@ def read_edges(path: Path, reading: MapReading) -> list[Segment]:
 
 
 def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
-    """The points of one track edge; cant in millimetres, a radius of 0 or none is straight."""
+    """Return the points of one track edge; cant in millimetres, a radius of 0 or none is straight."""
     values = {name: rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy() for name in _NUMBERS}
     for name in _NUMBERS[:3]:
         if not np.isfinite(values[name]).all():
@@ -75,7 +75,7 @@ Row = dict[str, str]
 
 
 def is_mate(path: FilePath) -> bool:
-    """Whether a CSV is a table of positions of track segments, by its header."""
+    """Return whether a CSV is a table of positions of track segments, by its header."""
     head = next(iter(text_lines(path)), "").upper()
     return "TRACK_EDGE_ID" in head and "TRACK_SEGMENT_TYPE" in head
 
@@ -97,7 +97,7 @@ def read_mate_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
-    """Rows of each edge by their distance from its start; of another table beside the file where it is there."""
+    """Return rows of each edge by their distance from its start; of another table beside the file where it is there."""
     file = Path(path)
     if table is not None:
         names = {entry.name.upper(): entry for entry in file.parent.iterdir()}
@@ -128,7 +128,7 @@ def _number(path: str, row: Row, name: str) -> float:
 
 
 def _find_crs(cell: str) -> str | None:
-    """CRS of a UTM cell ("32T"), or of the Swiss grid."""
+    """Return CRS of a UTM cell ("32T"), or of the Swiss grid."""
     if cell.strip().upper() == "LV95":
         return "EPSG:2056"
     zone = re.fullmatch(r"\s*(\d{1,2})\s*([C-X])?\s*", cell.upper())
@@ -138,7 +138,7 @@ def _find_crs(cell: str) -> str | None:
 
 
 def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
-    """Elements of an edge, of each row the form that meets its neighbours best."""
+    """Return the elements of an edge, of each row the form that meets its neighbours best."""
     forms = [_forms(path, row) for row in rows]
     gaps = (np.array([[_gap(a, b) for a in before] for b in after]) for before, after in pairwise(forms))
     chosen = cheapest_path([np.zeros(len(options)) for options in forms], gaps)
@@ -155,14 +155,14 @@ def _end(element: PlanElement) -> tuple[np.ndarray, float]:
 
 
 def _gap(before: PlanElement, after: PlanElement) -> float:
-    """Distance between the end of an element and the start of the next, and of their directions over 10 m."""
+    """Return distance between the end of an element and the start of the next, and of their directions over 10 m."""
     place, direction = _end(before)
     turn = np.angle(np.exp(1j * (direction - after.direction_rad)))
     return float(np.hypot(*(place - (after.x_m, after.y_m))) + 10.0 * abs(turn))
 
 
 def _forms(path: str, row: Row) -> list[PlanElement]:
-    """Elements that a row may mean, the likeliest first."""
+    """Return elements that a row may mean, the likeliest first."""
     kind = row.get("TRACK_SEGMENT_TYPE", "").lower()
     east, north, length = (_number(path, row, name) for name in ("EAST", "NORTH", "TRACK_SEGMENT_LENGTH"))
     if kind == "line":
@@ -192,13 +192,13 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
 
 
 def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
-    """An element by azimuth and curvature clockwise, as a design has them counter-clockwise from the easting."""
+    """Return an element by azimuth and curvature clockwise, as a design has them counter-clockwise from the easting."""
     direction = np.pi / 2.0 - azimuth
     return PlanElement(x_m=x, y_m=y, direction_rad=direction, first=-first, last=-last, length_m=length)
 
 
 def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float, length: float) -> PlanElement:
-    """The part of a clothoid from an arc from its point without curvature on."""
+    """Return the part of a clothoid from an arc from its point without curvature on."""
     if arc == 0.0:
         return _element(east, north, azimuth, 0.0, rate * length, length)
     # back from the origin a clothoid has the same curvature to the other side, and runs the other way
@@ -208,7 +208,7 @@ def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float
 
 
 def _turn(element: PlanElement) -> PlanElement:
-    """An element from its end to its start."""
+    """Return an element from its end to its start."""
     (x, y), direction = _end(element)
     return replace(
         element, x_m=float(x), y_m=float(y), direction_rad=direction + np.pi, first=-element.last, last=-element.first

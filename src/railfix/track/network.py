@@ -79,7 +79,7 @@ class Network:
     notes: tuple[str, ...] = ()
 
     def connect(self, links: tuple[Link, ...], note: str) -> Network:
-        """The network with other connections, and a note on them; what is known of its points is kept."""
+        """Return the network with other connections, and a note on them; what is known of its points is kept."""
         network = replace(self, links=links, notes=(note,))
         vars(network).update({name: vars(self)[name] for name in _OF_POINTS if name in vars(self)})
         return network
@@ -226,7 +226,7 @@ class Network:
         return distance, np.where(np.isfinite(distance), sample, 0).astype(np.intp)
 
     def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
-        """Tracks within a distance in plan of positions, shapes (n,), by a spatial index of all tracks."""
+        """Return tracks within a distance in plan of positions, shapes (n,), by a spatial index of all tracks."""
         parts = [
             self._near(latitude_deg[k : k + _TOGETHER], longitude_deg[k : k + _TOGETHER], within_m, most)
             for k in range(0, max(len(latitude_deg), 1), _TOGETHER)
@@ -234,7 +234,7 @@ class Network:
         return join_rows(parts)
 
     def _near(self, latitude_deg: Floats, longitude_deg: Floats, within_m: float, most: int) -> Candidates:
-        """Some of `near`: arrays have every sample near each position."""
+        """Return some of `near`: arrays have every sample near each position."""
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         _, segment, of_track, _ = self._index
         usable = ~np.isnan(points[:, 0])
@@ -274,7 +274,7 @@ class Network:
         return chainage, offset
 
     def kilometrage_on(self, track: Indices, chainage_m: Floats) -> Floats:
-        """Kilometrage of tracks at chainages on them, shape (n,); NaN where there is none."""
+        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where there is none."""
         kilometrage = np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
             rows = track == number
@@ -321,7 +321,7 @@ class Network:
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Tracks of the shortest route that passes the given tracks in order; None where there is none."""
+        """Return the tracks of the shortest route that passes the given tracks in order; None where there is none."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         best: dict[int, tuple[float, list[int]]] = {4 * wanted[0] + e: (0.0, [wanted[0]]) for e in (1, 3)}
         for stop in wanted[1:]:
@@ -342,7 +342,7 @@ class Network:
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:
-    """Ends of tracks on the ellipsoid and unit vectors out of them, shapes (tracks, 2, 3)."""
+    """Return the ends of tracks on the ellipsoid and unit vectors out of them, shapes (tracks, 2, 3)."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     place, before = network._way
     inner = np.clip(np.searchsorted(place, before + _DIRECTION_M), first + 1, last)

@@ -87,7 +87,7 @@ class Transitions:
         return np.asarray(state[:-1, :, None] != state[1:, None, :])
 
     def __call__(self, k: int) -> Floats:
-        """Probabilities from epoch k to k + 1, shape (m + 1, m + 1), row by row."""
+        """Return probabilities from epoch k to k + 1, shape (m + 1, m + 1), row by row."""
         before, after = self._track[k], self._track[k + 1]
         m = len(before)
         same = (before[:, None] == after) & (before[:, None] >= 0)
@@ -127,7 +127,7 @@ class Transitions:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Shares of the states of an urn in equilibrium, and its passages after a time, from row to column."""
+    """Return the shares of the states of an urn in equilibrium, and its passages after a time, from row to column."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -154,15 +154,15 @@ class _CommonError:
         self.first = np.outer(np.outer(plan, plan), _urn(self._balls_up, 0.0)[0])
 
     def later(self, share: Floats, seconds: float) -> Floats:
-        """Probabilities after a time, shape (..., C, U)."""
+        """Return probabilities after a time, shape (..., C, U)."""
         return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
-        """What is expected, a time before, of values of shape (..., C, U)."""
+        """Return what is expected, a time before, of values of shape (..., C, U)."""
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
-        """Values after the matrices of each axis: small ones, where one for all axes would wait for threads."""
+        """Return values after the matrices of each axis: small ones, where one for all axes would wait for threads."""
         axis, heights = len(plan), len(up)
         east = np.matmul(plan, values.reshape(-1, axis, axis * heights))
         north = np.matmul(plan, east.reshape(-1, axis, axis, heights))
@@ -170,12 +170,12 @@ class _CommonError:
 
 
 def _places(balls: int, sigma_m: float) -> Floats:
-    """States of an urn in metres."""
+    """Return the states of an urn in metres."""
     return np.asarray((np.arange(balls + 1) - balls / 2.0) * (2.0 * sigma_m / np.sqrt(max(balls, 1))))
 
 
 def _student(square: Floats) -> Floats:
-    """Negative logarithm of the likelihood of squares of normalized errors, 0 for none."""
+    """Return the negative logarithm of the likelihood of squares of normalized errors, 0 for none."""
     return np.asarray(0.5 * (_FREEDOM + 1.0) * np.log1p(square / _FREEDOM))
 
 
@@ -242,7 +242,7 @@ class _At:
 def _forward(
     residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
 ) -> Iterator[tuple[int, _At]]:
-    """Positions from one, where all states have given probabilities, to before another."""
+    """Yield positions from one, where all states have given probabilities, to before another."""
     states = residuals.offset_m.shape[1] + 1
     share, move = first, np.eye(states)
     for k in range(start, stop):

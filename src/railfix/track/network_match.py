@@ -135,7 +135,7 @@ def read_plan_positions(path: FilePath, *, columns: Mapping[str, str] | None = N
 
 
 def plan_log(path: str, time: Datetimes, ecef_m: Floats, sigma_m: Floats) -> PlanLog:
-    """Positions in plan with heights, of 3-D ones and their standard deviations north, east and up."""
+    """Return positions in plan with heights, of 3-D ones and their standard deviations north, east and up."""
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     return PlanLog(
         path=path,
@@ -214,7 +214,7 @@ def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
 
 
 def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
-    """How much larger than stated errors are, at least 1: by changes of the distance over `correlation_s`."""
+    """Return how much larger than stated errors are, at least 1: by changes of the distance over `correlation_s`."""
     seconds, distance = np.cumsum(residuals.seconds), residuals.offset_m
     rows = np.arange(len(seconds))
     later = np.minimum(np.searchsorted(seconds, seconds + correlation_s), len(rows) - 1)
@@ -226,7 +226,7 @@ def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
 
 
 def _median_scale(ratio: Floats) -> float:
-    """How much larger than normal, of variance 1, values are by their median, at least 1."""
+    """Return how much larger than normal, of variance 1, values are by their median, at least 1."""
     ratio = np.abs(ratio[np.isfinite(ratio)])
     return max(1.0, float(np.median(ratio)) / _NORMAL_MEDIAN) if len(ratio) else 1.0
 
@@ -240,7 +240,7 @@ def _residuals(
     sigma_m: Floats,
     correlation_s: float,
 ) -> Residuals:
-    """The positions of some rows of a log beside their candidates."""
+    """Return the positions of some rows of a log beside their candidates."""
     known = candidates.track >= 0
     row = np.nonzero(known)[0]
     track, chainage = candidates.track[known], candidates.chainage_m[known]
@@ -283,7 +283,7 @@ def _residuals(
 
 
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
-    """Matched positions put on their rows of a log, the others without."""
+    """Return the matched positions put on their rows of a log, the others without."""
 
     def over(values: Any, empty: float) -> Any:
         full = np.full((count, *values.shape[1:]), empty, dtype=values.dtype)

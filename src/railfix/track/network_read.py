@@ -47,7 +47,7 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
 
 
 def _relations(path: FilePath) -> list[Relation]:
-    """Connections that a file states, empty where it states none."""
+    """Return connections that a file states, empty where it states none."""
     if ending(path) in (".xml", ".railml"):
         return read_railml_relations(path)
     if ending(path) in RDF_FORMATS:
@@ -103,7 +103,7 @@ def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tupl
 
 
 def is_route(segments: Sequence[Segment]) -> bool:
-    """Whether segments join to one route in their order: ends meet, and no train would have to turn back."""
+    """Return whether segments join to one route in their order: ends meet, and no train would have to turn back."""
     if first_gap(segments) is not None:
         return False
     _, outward = end_points(Network(tracks=tuple(orient(segments)), links=()))
@@ -111,7 +111,7 @@ def is_route(segments: Sequence[Segment]) -> bool:
 
 
 def _divide(whole: Network, tolerance_m: float) -> tuple[Network, int]:
-    """Tracks divided at inner points on which the end of another track lies, and how many were divided."""
+    """Return tracks divided at inner points on which the end of another track lies, and how many were divided."""
     tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
@@ -207,7 +207,7 @@ def check_network(network: Network) -> NetworkQuality:
 
 
 def _finding(network: Network, kind: str, tracks: Sequence[int], end: int, sentence: str) -> NetworkFinding:
-    """A fault at an end of the first of some tracks, whose names stand in the sentence for {0} and {1}."""
+    """Return a fault at an end of the first of some tracks, whose names stand in the sentence for {0} and {1}."""
     names, segment = tuple(network.names[track] for track in tracks), network.tracks[tracks[0]]
     k = -end  # 0 is the first point, -1 the last
     return NetworkFinding(
@@ -220,7 +220,7 @@ def _finding(network: Network, kind: str, tracks: Sequence[int], end: int, sente
 
 
 def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFinding]:
-    """Ends without a connection near another such end, or that turn into nothing."""
+    """Yield ends without a connection near another such end, or that turn into nothing."""
     if not loose:
         return
     ends, outward = end_points(network)
@@ -241,7 +241,7 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
 
 
 def _joints(network: Network) -> Iterator[NetworkFinding]:
-    """Connections whose ends do not meet, and navigable ones with a kink."""
+    """Yield connections whose ends do not meet, and navigable ones with a kink."""
     ends, outward = end_points(network)
     for link in network.links:
         first, second, tracks = (link.first, link.first_end), (link.second, link.second_end), (link.first, link.second)
@@ -256,7 +256,7 @@ def _joints(network: Network) -> Iterator[NetworkFinding]:
 
 
 def _too_near(network: Network) -> Iterator[NetworkFinding]:
-    """Pairs of tracks nearer than vehicles' clearance away from their ends."""
+    """Yield the pairs of tracks nearer than vehicles' clearance away from their ends."""
     latitude = np.concatenate([t.latitude_deg for t in network.tracks])
     longitude = np.concatenate([t.longitude_deg for t in network.tracks])
     track = np.repeat(np.arange(len(network.tracks)), np.diff(network.first_point))

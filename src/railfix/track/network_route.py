@@ -82,7 +82,7 @@ def _fill_before(
 
 
 def _excess_m(legs: tuple[Indices, Floats, Floats], way_m: Floats) -> float:
-    """Difference of a route's length from the distance travelled."""
+    """Return the difference of a route's length from the distance travelled."""
     return abs(float(np.abs(legs[2] - legs[1]).sum()) - float(way_m[-1] - way_m[0]))
 
 
@@ -119,7 +119,7 @@ def _put_on(
 def _fill_legs(
     network: Network, first: int, from_m: float, last: int, to_m: float
 ) -> tuple[Indices, Floats, Floats] | None:
-    """Tracks of the shortest route between two places, and the chainages where each is entered and left."""
+    """Return the tracks of the shortest route between two places, and the chainages where each is entered and left."""
     if first == last:
         return np.array([first]), np.array([from_m]), np.array([to_m])
     length = network.length_m
@@ -156,7 +156,7 @@ def find_route(network: Network, matched: Matched) -> tuple[list[int], list[int]
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:
-    """The longest parts of a route that come to no joint a second time but at their end."""
+    """Return the longest parts of a route that come to no joint a second time but at their end."""
     joints = _joints(network, route)
     parts: list[list[int]] = []
     last = 0
@@ -171,7 +171,7 @@ def _once(network: Network, route: list[int]) -> list[list[int]]:
 
 
 def _joints(network: Network, route: list[int]) -> list[int]:
-    """The joint before each track of a route, and the one after the last."""
+    """Return the joint before each track of a route, and the one after the last."""
     joint, entry = network.joints, 0
     found: list[int] = []
     for track, after in pairwise([*route, route[-1]]):
@@ -185,7 +185,7 @@ def _joints(network: Network, route: list[int]) -> list[int]:
 
 
 def _legs(network: Network, passed: list[int]) -> list[list[int]]:
-    """The longest parts of a sequence of tracks that are a route."""
+    """Return the longest parts of a sequence of tracks that are a route."""
     legs: list[list[int]] = []
     start = 0
     while start < len(passed):

@@ -84,13 +84,13 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
 
 
 def _is_no_line(feature: dict[str, Any]) -> bool:
-    """Whether one of several features is a point or an area, such as a station."""
+    """Return whether one of several features is a point or an area, such as a station."""
     geometry = feature.get("geometry")
     return isinstance(geometry, dict) and geometry.get("type") in ("Point", "MultiPoint", "Polygon", "MultiPolygon")
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Name of one of several features: its id, where it has no name of its own."""
+    """Return the name of one of several features: its id, where it has no name of its own."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -161,7 +161,7 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
 
 
 def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]:
-    """Latitude, longitude and frame of coordinates in easting-northing or longitude-latitude order."""
+    """Return the latitude, longitude and frame of coordinates in easting-northing or longitude-latitude order."""
     if find_crs(crs, path=path).is_geographic:
         over = np.abs(values[:, 1]) > 90.0
         if over.any() or (np.abs(values[:, 0]) > 360.0).any():
@@ -196,7 +196,7 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
-    """Ways of the JSON of Overpass, which is no GeoJSON."""
+    """Return the ways of the JSON of Overpass, which is no GeoJSON."""
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
@@ -233,7 +233,7 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
 def _heights(
     line: _GeojsonLine, crs: str, latitude: Floats, longitude: Floats, reading: MapReading
 ) -> tuple[Floats, str, str]:
-    """Ellipsoidal heights of a line, the geoid used, and the datum of the file."""
+    """Return the ellipsoidal heights of a line, the geoid used, and the datum of the file."""
     stated = line.text("height_datum")
     if stated is not None and stated not in HEIGHT_DATUMS:
         raise line.error(f"height_datum is {stated!r}; expected 'ellipsoidal' or 'orthometric'")
@@ -377,7 +377,7 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
 
 
 def _check_degrees(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats, str]:
-    """Degrees of a geographic system, and the modern frame they are in."""
+    """Return the degrees of a geographic system, and the modern frame they are in."""
     if crs is None:
         return latitude, longitude, "EPSG:4979"
     system = find_crs(crs, path=path)

@@ -97,7 +97,7 @@ def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQualit
 
 
 def error_note(quality: TrackQuality) -> tuple[str, ...]:
-    """A note on the errors of a map, with the first one; none without errors."""
+    """Return a note on the errors of a map, with the first one; none without errors."""
     if not quality.errors:
         return ()
     return (

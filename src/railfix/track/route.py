@@ -141,7 +141,7 @@ def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
 
 
 def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
-    """The first segment that does not meet the one before, and the gap [m]; None where all meet."""
+    """Return the first segment that does not meet the one before, and the gap [m]; None where all meet."""
     ends = _ends(segments)
     backwards = np.array(_turn(ends, max_gap_m), dtype=np.intp)
     rows = np.arange(1, len(ends))
@@ -196,7 +196,7 @@ def join(
 
 
 def one_frame(pieces: Sequence[Segment]) -> str:
-    """The frame of all pieces; pieces in two frames would be joined with a step of up to 2 m."""
+    """Return the frame of all pieces; pieces in two frames would be joined with a step of up to 2 m."""
     frames = {piece.frame: piece.source for piece in pieces}
     if len(frames) > 1:
         what = "; ".join(f"{source} in {frame}" for frame, source in frames.items())

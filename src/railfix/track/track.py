@@ -329,7 +329,7 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
 
 
 def mean_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
-    """Mean gradients [permille] of attribute and heights over a window, shapes (V,); NaN where unknown."""
+    """Return the mean gradients [permille] of attribute and heights over a window, shapes (V,); NaN where unknown."""
     different = np.concatenate([[True], np.diff(track.chainage_m) > 0.0])
     along, height = track.chainage_m[different], track.height_m[different]
     low, high = _windows(track.chainage_m, window_m)

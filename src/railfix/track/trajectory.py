@@ -58,7 +58,7 @@ class NearestOnPolyline:
         self._tree = cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
 
     def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
-        """Segment, distance along it and distance from it, shapes (n,); -1 and NaN for NaN."""
+        """Return the segment, distance along it and distance from it, shapes (n,); -1 and NaN for NaN."""
         points = np.asarray(ecef_m, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"ecef_m has shape {points.shape}, expected (n, 3)")
@@ -231,7 +231,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         return read_only(right / np.linalg.norm(right, axis=1, keepdims=True))
 
     def get_axes(self, segment: Indices) -> Floats:
-        """Unit vectors along, across and up at some segments, shape (n, 3, 3)."""
+        """Return the unit vectors along, across and up at some segments, shape (n, 3, 3)."""
         return np.stack([self.tangent[segment], self.across[segment], self.up[segment]], axis=1)
 
     @cached_property
@@ -271,7 +271,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
-        """Values (V, ...) at arc lengths of any shape; NaN beyond the ends by more than the tolerance."""
+        """Return values (V, ...) at arc lengths of any shape; NaN beyond the ends by more than the tolerance."""
         arc = np.asarray(arc_m, dtype=np.float64)
         return between_points(arc, self.arc_m, self.length_m, values, self.segment_at(arc)[0])
 

@@ -53,7 +53,7 @@ class Way:
 
 
 def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Tags of a feature, and its other columns."""
+    """Return the tags of a feature, and its other columns."""
     tags = dict(row)
     for name in ("tags", "all_tags", "other_tags"):
         value = row.get(name)
@@ -73,7 +73,7 @@ def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
-    """Whether a feature is one of OpenStreetMap, by its id or kind."""
+    """Return whether a feature is one of OpenStreetMap, by its id or kind."""
     names = (str(row.get(key) or "") for key in ("@id", "id"))
     of_id = any(row.get(key) is not None for key in _IDS[:4])
     of_kind = any(row.get(key) in ("way", "relation") for key in _KINDS)
@@ -81,7 +81,7 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
-    """Why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
+    """Return why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
     railway = get_tags(row).get("railway")
     railway = railway if isinstance(railway, str) and railway else None
     if railway in _RAILWAYS or not (of_openstreetmap or railway in _OTHERS):
@@ -257,7 +257,7 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _features(path: FilePath) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]]]]:
-    """CRS, columns and lines of the features of each layer; of OSM XML without GDAL, which needs sorted nodes."""
+    """Yield CRS, columns and lines of the features of each layer; of OSM XML without GDAL, which needs sorted nodes."""
     if ending(path) == ".osm":
         ways = read_osm_xml(path)
         yield "EPSG:4326", [way.row for way in ways], [[way.points_deg] for way in ways]
@@ -268,7 +268,7 @@ def _features(path: FilePath) -> Iterator[tuple[str | None, list[dict[str, Any]]
 
 
 def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
-    """Accuracy that a feature states."""
+    """Return the accuracy that a feature states."""
     keys = ("sigma_plan_m", "sigma_height_m")
     return {key: str(row[key]) for key in keys if row.get(key) is not None and row[key] == row[key]}
 
@@ -305,7 +305,7 @@ def plan_segment(
 
 
 def get_name(row: Mapping[str, Any], *, fallback: str) -> str:
-    """Name of a feature by the first of `_NAMES` that it has."""
+    """Return the name of a feature by the first of `_NAMES` that it has."""
     lower = {key.lower(): value for key, value in row.items()}
     for key in _NAMES:
         value = lower.get(key)

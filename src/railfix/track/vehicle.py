@@ -205,7 +205,7 @@ def _pose(line: _VehicleLine, track: Track, vehicle: Vehicle, middle: Floats) ->
 
 
 def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
-    """The antenna, ECEF, shape (n, 3) [m]."""
+    """Return the antenna, ECEF, shape (n, 3) [m]."""
     sign = 1.0 if vehicle.facing == "rising" else -1.0
     return np.asarray(
         body.origin + sign * offset.along_m * body.forward + sign * offset.across_m * body.right + offset.up_m * body.up

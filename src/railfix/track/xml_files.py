@@ -133,7 +133,7 @@ def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
 
 
 def _notes(alignment: Any, name: str) -> tuple[str, ...]:
-    """Notes on what of an alignment is not used."""
+    """Return the notes on what of an alignment is not used."""
     notes = []
     if (count := len(alignment.findall(".//{*}ProfAlign"))) > 1:
         notes.append(f"{name}: the first of {count} profiles is used")
@@ -143,7 +143,7 @@ def _notes(alignment: Any, name: str) -> tuple[str, ...]:
 
 
 def _number(text: Any) -> float:
-    """A finite number of a text; ValueError where it is none."""
+    """Return a finite number of a text; ValueError where it is none."""
     value = float(text)
     if not np.isfinite(value):
         raise ValueError(f"{text} is not finite")
@@ -151,12 +151,12 @@ def _number(text: Any) -> float:
 
 
 def _elements(parent: Any) -> list[Any]:
-    """Children that are neither comments nor extensions of a country or program (`Feature`)."""
+    """Return the children that are neither comments nor extensions of a country or program (`Feature`)."""
     return [e for e in parent if isinstance(e.tag, str) and e.tag.rsplit("}", 1)[-1] != "Feature"]
 
 
 def _point(element: Any, name: str, scale: float) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Easting and northing of a child; LandXML writes northing first."""
+    """Return the easting and northing of a child; LandXML writes northing first."""
     north, east = (_number(v) for v in element.find(f"{{*}}{name}").text.split()[:2])
     return np.array([east, north]) * scale
 
@@ -203,7 +203,7 @@ def _landxml_plan(path: str, element: Any, scale: float) -> PlanElement:
 
 
 def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> list[ProfileElement]:
-    """Elements of points of vertical intersection and the curves at them."""
+    """Return the elements of points of vertical intersection and the curves at them."""
     if profile is None:
         return []
     points = []
@@ -394,7 +394,7 @@ def _graph(path: FilePath) -> Graph:
 
 @lru_cache(maxsize=2)
 def _parse(path: str, _: str) -> Graph:
-    """The triples of a file, kept for its relations."""
+    """Return the triples of a file, kept for its relations."""
     try:
         from rdflib import Graph
     except ImportError:

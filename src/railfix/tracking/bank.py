@@ -117,7 +117,7 @@ def budget(limits: TrackingLimits) -> Budget:
 
 
 def classify_source(name: str) -> SourceKind:
-    """Kind of a source: `G12` is a satellite, `G` a constellation, `wheel` a sensor."""
+    """Return the kind of a source: `G12` is a satellite, `G` a constellation, `wheel` a sensor."""
     if name in CLOCKS:
         return SourceKind.CONSTELLATION
     if name in OTHERS:
@@ -128,5 +128,5 @@ def classify_source(name: str) -> SourceKind:
 
 
 def get_clock(satellite: str) -> str:
-    """Letter of the clock of a satellite's codes."""
+    """Return the letter of the clock of a satellite's codes."""
     return "G" if satellite[:1] in ("J", "S") else satellite[:1]

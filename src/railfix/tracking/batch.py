@@ -91,7 +91,7 @@ def fit_batch(epochs: GnssEpochs, trajectory: Trajectory, near_m: Floats | None 
 
 
 def _first_guess(epochs: GnssEpochs, trajectory: Trajectory) -> Floats:
-    """Places of the line nearest to positions without it, between them by time."""
+    """Return the places of the line nearest to positions without it, between them by time."""
     if epochs.near_ecef_m is None:
         return np.full(len(epochs), np.nan)
     known = np.flatnonzero(np.isfinite(epochs.near_ecef_m).all(axis=1))
@@ -126,7 +126,7 @@ class _Fit:
         self._solve()
 
     def _motion_rows(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
-        """Rows of the motion and those that keep the matrix regular, over their standard deviations."""
+        """Return the rows of the motion and those that keep the matrix regular, over their standard deviations."""
         n, k = self._count, np.arange(self._count - 1)
         size = 4 * n + len(self._clocks)
         place = 1.0 / np.sqrt(_ACCELERATION * self._step_s**3 / 12.0)
@@ -138,7 +138,7 @@ class _Fit:
         return sparse.csr_matrix(entries, shape=(2 * (n - 1), size)), sparse.csr_matrix(sparse.identity(size) / _LOOSE)
 
     def _line(self) -> tuple[Floats, Floats]:
-        """Points of the line at the places, straight on beyond its ends, and its directions there."""
+        """Return the points of the line at the places, straight on beyond its ends, and its directions there."""
         path = self._trajectory
         inside = np.clip(self.arc_m, _STEP_M, path.arc_m[-1] - _STEP_M)
         tangent = path.at_arc(inside + _STEP_M) - path.at_arc(inside - _STEP_M)
@@ -147,7 +147,7 @@ class _Fit:
         return path.at_arc(on) + (self.arc_m - on)[:, None] * tangent, tangent
 
     def _equations(self) -> tuple[Floats, sparse.csr_matrix]:
-        """Residuals of codes and rates without their clocks' start, and their derivatives, over the sigmas."""
+        """Return residuals of codes and rates without their clocks' start, and their derivatives, over the sigmas."""
         n, (k, i), (j, h) = self._count, self._code, self._rate
         point, tangent = self._line()
         drift = self._rest[n : 2 * n]
@@ -201,7 +201,7 @@ class _Fit:
         self.cost = float(fit.sum() + 0.5 * ((self._motion @ state) ** 2).sum())
 
     def sigma_m(self, rows: slice) -> Floats:
-        """Standard deviations of places: the inverse of the matrix of the last round."""
+        """Return the standard deviations of places: the inverse of the matrix of the last round."""
         wanted = np.arange(self._count)[rows]
         variance = np.empty(len(wanted))
         for first in range(0, len(wanted), _BLOCK):
@@ -213,7 +213,7 @@ class _Fit:
 
 
 def _sight(sat_ecef_m: Floats, point_ecef_m: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors to satellites, and the ranges with the turn of the Earth while the signal travels."""
+    """Return the unit vectors to satellites, and the ranges with the turn of the Earth while the signal travels."""
     way = sat_ecef_m - point_ecef_m
     distance = np.linalg.norm(way, axis=1)
     turn = sat_ecef_m[:, 0] * point_ecef_m[:, 1] - sat_ecef_m[:, 1] * point_ecef_m[:, 0]
@@ -221,7 +221,7 @@ def _sight(sat_ecef_m: Floats, point_ecef_m: Floats) -> tuple[Floats, Floats]:
 
 
 def _medians(values: Floats, group: Indices, groups: int) -> Floats:
-    """Median of the values of each group; 0 for one without."""
+    """Return the median of the values of each group; 0 for one without."""
     order = np.lexsort((values, group))
     count = np.bincount(group, minlength=groups)
     middle = np.cumsum(count) - count + count // 2
@@ -251,7 +251,7 @@ def joined_epochs(parts: list[GnssEpochs]) -> GnssEpochs:
 
 
 def _channels(epochs: GnssEpochs) -> list[tuple[str, str, int]]:
-    """Satellite, clock and number among equal ones of each channel."""
+    """Return the satellite, clock and number among equal ones of each channel."""
     seen: dict[tuple[str, str], int] = {}
     keys = []
     for satellite, clock in zip(epochs.satellite.tolist(), epochs.clock.tolist(), strict=True):

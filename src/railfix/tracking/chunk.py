@@ -86,7 +86,7 @@ class Chunk:
 
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
-    """The chunk; the state gets an error for each satellite measured in it."""
+    """Return the chunk; the state gets an error for each satellite measured in it."""
     phase, before = _previous(epochs, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
     placed = np.isfinite(epochs.sat_ecef_m).all(axis=2)
@@ -154,7 +154,7 @@ def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: Tr
 
 
 def _previous(epochs: GnssEpochs, previous: Previous | None) -> tuple[Floats, Floats]:
-    """Phase and satellites of the epoch before the first, in the order of the channels."""
+    """Return the phase and satellites of the epoch before the first, in the order of the channels."""
     if previous is not None and epochs.satellite.tolist() == previous.satellite.tolist():
         return previous.phase_m, previous.sat_ecef_m
     size = len(epochs.satellite)

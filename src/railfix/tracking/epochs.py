@@ -121,7 +121,7 @@ class BaliseEpochs:
 
     @classmethod
     def none(cls, epochs: int) -> BaliseEpochs:
-        """Epochs without a balise."""
+        """Return epochs without a balise."""
         place_m, sigma_m = np.full((2, epochs, 2), np.nan)
         return cls(time=np.zeros((epochs, 2), dtype="datetime64[ns]"), place_m=place_m, sigma_m=sigma_m)
 

@@ -149,7 +149,7 @@ class Recursion:
 
 
 def _kernel() -> Callable[..., int]:
-    """The compiled recursion; numba is imported here, for what runs no filter does without."""
+    """Return the compiled recursion; numba is imported here, for what runs no filter does without."""
     from railfix.kernels.tracking.recursion import advance
 
     return advance
@@ -185,7 +185,7 @@ def _columns(sensors: SensorEpochs, time: Datetimes) -> dict[str, Floats]:
 
 @lru_cache(maxsize=8)
 def _parameters(limits: TrackingLimits, branch_m: float) -> layout.Parameters:
-    """Settings as the kernel takes them."""
+    """Return settings as the kernel takes them."""
     budget = bank.budget(limits)
     given: dict[str, Any] = {
         "degrees": tuple(limits.tails),
@@ -208,7 +208,7 @@ def track(
     levels: bool = False,
     trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
-    """Places along the trajectory, each from its own and earlier epochs.
+    """Return places along the trajectory, each from its own and earlier epochs.
 
     The recursion is compiled (`railfix.kernels.tracking.recursion`); with ``NUMBA_DISABLE_JIT=1`` in the environment
     the same code runs as plain Python, for a debugger.

@@ -176,7 +176,7 @@ class Handover:
         )
 
     def _idle(self, state: TrackState, elapsed_s: float) -> tuple[Floats, Floats]:
-        """Mean and variance of unknowns that are not in use, after so many seconds of random walks."""
+        """Return the mean and variance of unknowns that are not in use, after so many seconds of random walks."""
         mean, variance = state.mean[0].copy(), state.covariance[0].diagonal().copy()
         for unknown, _, walk in _SENSORS:
             variance[unknown] += walk**2 * elapsed_s
@@ -207,7 +207,7 @@ class Handover:
 
 
 def _in_use(state: TrackState, chunk: Chunk, sensed: Masks, first: int, last: int) -> Masks:
-    """Unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
+    """Return unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
     used = (state.covariance != 0.0).sum(axis=1).max(axis=0) > 1
     if state.bank is not None and len(state.bank.without):
         used |= (state.bank.covariance != 0.0).sum(axis=1).max(axis=0) > 1
@@ -235,7 +235,7 @@ def _scatter(
 def _subfilters(
     state: TrackState, full: Indices, names: list[str], line: Line, limits: TrackingLimits
 ) -> layout.Subfilters:
-    """Sub-filters by source, none of them where levels are off."""
+    """Return the sub-filters by source, none of them where levels are off."""
     n = len(full)
     begun, parameters = np.zeros(n + len(_OF_EPOCH)), _source_parameters(tuple(names), limits)
     running, weak = np.zeros(len(names), dtype=np.bool_), np.zeros(len(names))
@@ -259,7 +259,7 @@ def _subfilters(
 
 @lru_cache(maxsize=64)
 def _source_parameters(names: tuple[str, ...], limits: TrackingLimits) -> dict[str, Floats]:
-    """Prior and factors of sub-filters by their source, which the kernel only reads."""
+    """Return the prior and factors of sub-filters by their source, which the kernel only reads."""
     given, kinds = bank.budget(limits), np.array([bank.classify_source(name) for name in names], dtype=np.intp)
     return {
         "prior": np.array(given.prior)[kinds],
@@ -271,7 +271,7 @@ def _source_parameters(names: tuple[str, ...], limits: TrackingLimits) -> dict[s
 def _work_space(
     channels: int, sensors: int, unknowns: int, hypotheses: int, sources: int
 ) -> tuple[layout.Rows, layout.Work]:
-    """Lists of rows and work space of the kernel for so many channels, compact unknowns and hypotheses."""
+    """Return the lists of rows and work space of the kernel for so many channels, compact unknowns and hypotheses."""
     width, room = unknowns + len(_OF_EPOCH), hypotheses + 1
     pairs = sources * (sources - 1) // 2
     most = 3 * channels + sensors
@@ -311,5 +311,5 @@ def whole_lanes(size: int) -> int:
 
 
 def _sources(state: TrackState) -> list[str]:
-    """Sources of sub-filters in the order of the kernel."""
+    """Return the sources of sub-filters in the order of the kernel."""
     return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]

@@ -115,7 +115,7 @@ def thin_epochs(
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
-    """Values and variances of the sensors that are summed, shape (T, 3); NaN without one."""
+    """Return the values and variances of the sensors that are summed, shape (T, 3); NaN without one."""
     value, variance = np.full((epochs, 3), np.nan), np.full((epochs, 3), np.nan)
     for column, (name, sigma) in enumerate(_SUMMED):
         if getattr(sensors, name) is not None:
@@ -126,7 +126,7 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
 def _balises(
     sensors: SensorEpochs, since: AccumulatedIncrement, interval: Indices, taken: int
 ) -> tuple[BaliseEpochs | None, BaliseEpochs | None]:
-    """Balises at the epochs that are taken, and those read after them, with what was left before."""
+    """Return balises at the epochs that are taken, and those read after them, with what was left before."""
     if sensors.balises is None and since.balises is None:
         return None, None
     before = since.balises or BaliseEpochs.none(1)
@@ -143,7 +143,7 @@ def _balises(
 
 
 def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
-    """Which satellites' phases went on at all epochs since the last one that was taken, shape (K,)."""
+    """Return which satellites' phases went on at all epochs since the last one that was taken, shape (K,)."""
     if since.unbroken is None:
         return np.ones(len(epochs.satellite), dtype=np.bool_)
     return np.array([name in since.unbroken for name in epochs.satellite.tolist()], dtype=np.bool_)
@@ -154,7 +154,7 @@ def _names(epochs: GnssEpochs, unbroken: Masks, *, anew: bool) -> frozenset[str]
 
 
 def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats) -> SensorEpochs:
-    """Sensors at the epochs that are taken."""
+    """Return sensors at the epochs that are taken."""
     values: dict[str, Any] = {}
     for column, names in enumerate(_SUMMED):
         if getattr(sensors, names[0]) is not None:
@@ -288,12 +288,12 @@ def carried_levels(
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
-    """Statuses of places: one without a level is neither tracking nor coasting."""
+    """Return the statuses of places: one without a level is neither tracking nor coasting."""
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)
 
 
 def _since(last: Datetimes, time: Datetimes) -> Floats:
-    """Seconds since the last epoch with sub-filters; NaN before the first."""
+    """Return seconds since the last epoch with sub-filters; NaN before the first."""
     return np.where(np.isnat(last), np.nan, seconds(time - last))

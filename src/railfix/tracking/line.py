@@ -38,7 +38,7 @@ class Line:
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> Line:
-        """Axes at the vertices of a trajectory."""
+        """Return the axes at the vertices of a trajectory."""
         segment = np.asarray(trajectory.tangent)
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -96,7 +96,7 @@ class Line:
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Shift of places beyond an end of a closed line to where it goes on [m]; 0 for others.
+        """Return the shift of places beyond an end of a closed line to where it goes on [m]; 0 for others.
 
         Parameters
         ----------

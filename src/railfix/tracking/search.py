@@ -48,7 +48,7 @@ _KEPT: Final = np.array([StateIndex.WHEEL, StateIndex.FORCE_OFFSET, StateIndex.R
 
 
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tuple[Floats, Floats]:
-    """Places along the line that the codes of an epoch are consistent with.
+    """Return places along the line that the codes of an epoch are consistent with.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
 
 
 def _thin(line: Line) -> Indices:
-    """Vertices about `_SPACING_M` apart."""
+    """Return vertices about `_SPACING_M` apart."""
     marks = np.arange(line.arc_m[0], line.arc_m[-1] + _SPACING_M, _SPACING_M)
     return np.unique(np.minimum(np.searchsorted(line.arc_m, marks), len(line.arc_m) - 1))
 
@@ -106,7 +106,7 @@ def begin(
     *,
     known: tuple[Floats, Floats] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Mean and covariance of new hypotheses at places, shapes (H, N) and (H, N, N).
+    """Return the mean and covariance of new hypotheses at places, shapes (H, N) and (H, N, N).
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def begin(
 def split(
     mean: Floats, covariance: Floats, log_probability: float, arc_m: Floats, sigma_m: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Narrower hypotheses within a wide one, about places; probabilities by its density there.
+    """Return the narrower hypotheses within a wide one, about places; probabilities by its density there.
 
     Parameters
     ----------

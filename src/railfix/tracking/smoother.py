@@ -215,7 +215,7 @@ def smooth_steps(
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """The vector and matrix for other satellites; those that are not in the state any more said nothing."""
+    """Return the vector and matrix for other satellites; those that are not in the state any more said nothing."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(SATELLITES), SATELLITES + here])
     of = np.concatenate([np.arange(SATELLITES), SATELLITES + there])

@@ -185,7 +185,7 @@ class TrackState:
 
     @classmethod
     def empty(cls) -> TrackState:
-        """State before the first epoch."""
+        """Return the state before the first epoch."""
         return cls(
             time=np.datetime64("NaT", "ns"),
             mean=np.empty((0, SATELLITES)),

@@ -95,7 +95,7 @@ def compute_velocity(
 
 
 def _fit(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floats) -> tuple[Floats, Floats]:
-    """Velocities by arrays in C order, so that the kernel is compiled for one kind of them."""
+    """Return velocities by arrays in C order, so that the kernel is compiled for one kind of them."""
     from railfix.kernels.tracking.velocity import fitted_velocities
 
     return fitted_velocities(
@@ -114,7 +114,7 @@ singer = lru_cache(maxsize=64)(singer_step)
 
 
 def _keep(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
-    """Share of each unknown that is left after an interval, shape (H, N)."""
+    """Return the share of each unknown that is left after an interval, shape (H, N)."""
     travel = np.abs(mean[:, StateIndex.SPEED]) * dt
     kept = np.ones(mean.shape)
     kept[:, FRESH] = 0.0
@@ -126,13 +126,13 @@ def _keep(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 
 
 def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
-    """Transition of all unknowns over an interval from a state, shape (N, N); `mean` has shape (N,)."""
+    """Return the transition of all unknowns over an interval from a state, shape (N, N); `mean` has shape (N,)."""
     step, _ = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
     return np.asarray(_move(np.eye(len(mean))[None], _keep(mean[None], dt, limits), step, dt)[0])
 
 
 def _move(rows: Floats, kept: Floats, step: Floats, dt: float) -> Floats:
-    """The transition times a matrix, shape (H, N, ...)."""
+    """Return the transition times a matrix, shape (H, N, ...)."""
     moved = rows * kept[:, :, None]
     moved[:, :3] = step @ rows[:, :3]
     moved[:, StateIndex.PREVIOUS_ARC] = rows[:, StateIndex.ARC]

@@ -342,7 +342,7 @@ def _state(
 
 
 def _sum(terms: Floats) -> Floats:
-    """Sum over the nodes (axis 1) in a fixed order, for reproducible rounding."""
+    """Return the sum over the nodes (axis 1) in a fixed order, for reproducible rounding."""
     total = terms[:, 0].copy()
     for i in range(1, terms.shape[1]):
         total += terms[:, i]

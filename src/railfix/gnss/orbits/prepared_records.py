@@ -244,7 +244,7 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m]; else 0."""
+    """Return the sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m]; else 0."""
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
 

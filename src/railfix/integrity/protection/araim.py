@@ -264,7 +264,7 @@ class IntegritySupport(Settings):
         return self
 
     def holds(self, time: Datetimes) -> Masks:
-        """Whether the message holds at epochs, shape (T,)."""
+        """Return whether the message holds at epochs, shape (T,)."""
         first, last = (
             np.datetime64("NaT" if end is None else end, "ns") for end in (self.valid_from, self.valid_until)
         )

@@ -119,7 +119,7 @@ def along_track_level(
     sides: Masks | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
-    """Protection level along the track (P1 2.4; WG-C ARAIM in one dimension).
+    """Return the protection level along the track (P1 2.4; WG-C ARAIM in one dimension).
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def along_track_level(
 
 
 def _by_epoch(values: ArrayLike | None, epochs: int, width: int) -> Floats:
-    """Values for each epoch, shape (T, width); (T, 0) for none."""
+    """Return values for each epoch, shape (T, width); (T, 0) for none."""
     if values is None:
         return np.zeros((epochs, 0))
     return _broadcast(np.asarray(values, dtype=np.float64), (epochs, width))
@@ -178,7 +178,7 @@ def _broadcast(values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
-    """A result without positions."""
+    """Return a result without positions."""
     floats = "level_m fault_free_m one_fault_m two_fault_m sigma_m k_fault_free k_one_fault k_two_faults k_false_alarm"
     return ProtectionLevel(
         **{name: np.full(epochs, np.nan) for name in (*floats.split(), "separation")},
@@ -189,7 +189,7 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
-    """Epochs of like numbers of hypotheses together: no block is wider than it must be."""
+    """Return the epochs of like numbers of hypotheses together: no block is wider than it must be."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
     used = model.used[rows].sum(axis=1)
@@ -323,7 +323,7 @@ def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:
-    """Channels at places side by side, shape (T, k); -1 for -1."""
+    """Return channels at places side by side, shape (T, k); -1 for -1."""
     return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 

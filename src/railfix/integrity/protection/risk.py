@@ -43,7 +43,7 @@ MOST_TOGETHER: Final = 4  #: Faulty satellites at a time that can be hypotheses 
 
 
 def k_factor(risk: float) -> float:
-    """Sigmas that an error in one dimension exceeds, on either side, with this probability of one sample.
+    """Return sigmas that an error in one dimension exceeds, on either side, with this probability of one sample.
 
     Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a horizontal position.
     """
@@ -53,7 +53,7 @@ def k_factor(risk: float) -> float:
 
 
 def one_sided_k(probability: Floats) -> Floats:
-    """Sigmas that noise exceeds on one side with this probability; -inf from 1 on, inf at 0 and below."""
+    """Return sigmas that noise exceeds on one side with this probability; -inf from 1 on, inf at 0 and below."""
     return np.asarray(-ndtri(np.clip(probability, 0.0, 1.0)))
 
 
@@ -132,7 +132,7 @@ class RiskBudget(Settings):
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
-        """Fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
+        """Return the fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
 
         ValueError: a constellation has no prior.
         """
@@ -161,7 +161,7 @@ class RiskBudget(Settings):
 
 
 def set_sums(prior: Floats, most: int) -> Floats:
-    """Sums over sets of 0, 1, ..., `most` faults of the product of their priors, shape (T, M) to (T, most + 1).
+    """Return sums over sets of 0, 1, ..., `most` faults of the product of their priors, shape (T, M) to (T, most + 1).
 
     Bounds of the probability of as many faults or more (Newton's identities).
     """
@@ -255,7 +255,7 @@ class _Same:
 def _of_few_epochs(
     risk: _Same, systems: tuple[str, ...], used: bytes, out: bytes, sides: bytes, count: int, wrong_map: bool
 ) -> Allocation:
-    """Allocation of few epochs, kept: nobody writes into it."""
+    """Return the allocation of few epochs, kept: nobody writes into it."""
     channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
     return _allocate(
         np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(), systems, risk.risk, excluded,

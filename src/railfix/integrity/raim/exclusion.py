@@ -123,7 +123,7 @@ def detect(
 
 
 def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Threshold of the statistic by degrees of freedom, of any shape; NaN below 1.
+    """Return the threshold of the statistic by degrees of freedom, of any shape; NaN below 1.
 
     P4: false alarm 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
     """
@@ -137,7 +137,7 @@ def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats
 
 @lru_cache(maxsize=64)
 def _chi_square_table(false_alarm: float, size: int) -> Floats:
-    """Chi-square thresholds of 0 (NaN) to size - 1 degrees of freedom."""
+    """Return the chi-square thresholds of 0 (NaN) to size - 1 degrees of freedom."""
     table = np.full(size, np.nan)
     table[1:] = chdtri(np.arange(1, size), false_alarm)
     table.flags.writeable = False
@@ -251,7 +251,7 @@ def _exclude_block(result: Exclusion, epochs: Indices, model: LinearModel, scale
 
 
 def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _Trial:
-    """Each channel alone left out."""
+    """Return each channel alone left out."""
     n = parts.channel.shape[1]
     share = np.einsum("tii->ti", parts.projector)
     checked = parts.used & (share > LEAST_REDUNDANCY)
@@ -269,7 +269,7 @@ def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) ->
 
 
 def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _Trial:
-    """Each pair of channels left out."""
+    """Return each pair of channels left out."""
     n = parts.channel.shape[1]
     i, j = np.triu_indices(n, 1)
     flat = parts.projector.reshape(len(parts.projector), n * n)
@@ -349,7 +349,7 @@ def _choose(
 
 
 def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
-    """Change of the position by each subset, shape (rows, K, k) [m]."""
+    """Return the change of the position by each subset, shape (rows, K, k) [m]."""
     moves = np.zeros((len(rows), len(trial.members), parts.gain_m.shape[2]))
     for k, own in enumerate(trial.own):
         moves -= parts.gain_m[rows][:, trial.members[:, k]] * own[rows][..., None]

@@ -57,7 +57,7 @@ class LinearModel:
         return len(self.root_weight)
 
     def take(self, epochs: Masks | Indices) -> LinearModel:
-        """The model of some epochs, by mask or index."""
+        """Return the model of some epochs, by mask or index."""
         return LinearModel(
             root_weight=self.root_weight[epochs], clock=self.clock,
             clock_covariance_m2=self.clock_covariance_m2[epochs], design=self.design[epochs],
@@ -66,7 +66,7 @@ class LinearModel:
         )  # fmt: skip
 
     def patch(self, epochs: Indices, part: LinearModel) -> LinearModel:
-        """The model with some epochs, by index, replaced by those of another."""
+        """Return the model with some epochs, by index, replaced by those of another."""
         if len(epochs) == len(self):
             return part
         changed = {}
@@ -128,7 +128,7 @@ class LinearModel:
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
-        """Covariance of the wanted components, shape (T, interest, interest) [m^2].
+        """Return the covariance of the wanted components, shape (T, interest, interest) [m^2].
 
         `scale` multiplies the sigmas of the ranges (and ties), not the map error: of the covariance
         Q, ``Q P Q`` comes from the prior P and ``Q - Q P Q`` from the ranges.
@@ -151,12 +151,12 @@ class Compact:
     gain_m: Floats  #: Shape (T, n, interest).
 
     def take(self, epochs: Indices) -> Compact:
-        """The parts of some epochs, by index."""
+        """Return the parts of some epochs, by index."""
         return Compact(**{item.name: getattr(self, item.name)[epochs] for item in fields(self)})
 
 
 def compact(model: LinearModel) -> Compact:
-    """The residual projector over the channels in use, in their order; (T, n, n) of memory."""
+    """Return the residual projector over the channels in use, in their order; (T, n, n) of memory."""
     n = int(model.used.sum(axis=1).max(initial=0))
     channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
     used = np.take_along_axis(model.used, channel, axis=1)

@@ -107,12 +107,12 @@ def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Fl
 
 @lru_cache(maxsize=1024)
 def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) -> float:
-    """The lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
+    """Return the lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
     return float(chndtrinc(chdtri(freedom, false_alarm), freedom, missed_detection))
 
 
 def _longest_axis(covariance: Floats) -> Floats:
-    """Root of the largest eigenvalue of 1 x 1 or 2 x 2 matrices, shape (T,)."""
+    """Return the root of the largest eigenvalue of 1 x 1 or 2 x 2 matrices, shape (T,)."""
     if covariance.shape[1] == 1:
         return np.asarray(np.sqrt(covariance[:, 0, 0]))
     return np.asarray(np.sqrt(_largest_eigenvalue(covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1])))
@@ -124,7 +124,7 @@ def _largest_eigenvalue(a: Floats, b: Floats, c: Floats) -> Floats:
 
 
 def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floats) -> Floats:
-    """Slopes of single satellites, shape (T, M) [m]."""
+    """Return the slopes of single satellites, shape (T, M) [m]."""
     effect = np.sqrt((model.gain_m**2).sum(axis=2))
     checked = share > LEAST_REDUNDANCY
     unchecked = np.where(effect > _NO_EFFECT * sigma[:, None], np.inf, 0.0)
@@ -134,7 +134,7 @@ def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floa
 
 
 def _pair_slopes(model: LinearModel, scale: Floats, sigma: Floats) -> Floats:
-    """Largest slope by errors of any two satellites, shape (T,) [m]; NaN where fewer than two are used.
+    """Return the largest slope by errors of any two satellites, shape (T,) [m]; NaN where fewer than two are used.
 
     The largest ``|G^T b|^2 / (b^T S_EE b)`` over errors b of the pair: the largest eigenvalue of
     ``G^T S_EE^-1 G`` with the gains G of the two (2 x k).

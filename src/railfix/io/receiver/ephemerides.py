@@ -116,7 +116,7 @@ def _rtcm_record(kind: int, satellite: str, values: Values, time: np.datetime64)
 
 
 def assemble_navigation(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigation:
-    """Navigation data from assembled records."""
+    """Return the navigation data from assembled records."""
     return Navigation(
         kepler=kepler_records([r for r in parts.records if r.system != "R"]),
         glonass=glonass_records([r for r in parts.records if r.system == "R"]),
@@ -147,7 +147,7 @@ class _EphemerisBuilder:
         return False
 
     def result(self, counts: Counter[str]) -> tuple[Assembled, Unfinished]:
-        """The records, with what is counted and what is left unfinished."""
+        """Return the records, with what is counted and what is left unfinished."""
         counts.update(f"{raw.satellite[0]} {why}" for raw, why in self.rejected)
         records = Assembled(
             records=tuple(self.records),
@@ -315,7 +315,7 @@ class _EphemerisBuilder:
 
 
 def merge_records(parts: list[Assembled]) -> Assembled:
-    """Records of several pieces of one stream."""
+    """Return the records of several pieces of one stream."""
     klobuchar: dict[str, np.ndarray] = {}
     leap: int | None = None
     for part in parts:

@@ -62,7 +62,7 @@ class Frames:
         return len(self.start)
 
     def of(self, protocol: str, *kinds: int) -> Indices:
-        """Positions of the frames of a protocol, of some kinds or of all."""
+        """Return the positions of the frames of a protocol, of some kinds or of all."""
         own = self._by_protocol.get(protocol, np.empty(0, dtype=np.intp))
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
@@ -125,7 +125,7 @@ def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
 
 
 def _without_overlap(start: Indices, end: Integers, valid: Masks) -> Indices:
-    """Valid candidates, earliest first, that do not lie inside one accepted before."""
+    """Return the valid candidates, earliest first, that do not lie inside one accepted before."""
     accepted, free = [], 0
     for k in np.flatnonzero(valid).tolist():
         if start[k] >= free:
@@ -135,7 +135,7 @@ def _without_overlap(start: Indices, end: Integers, valid: Masks) -> Indices:
 
 
 def _outside(places: Indices, start: Indices, end: Integers) -> int:
-    """How many places lie in none of the accepted frames."""
+    """Return how many places lie in none of the accepted frames."""
     if not len(start):
         return len(places)
     before = np.searchsorted(start, places, side="right") - 1
@@ -143,12 +143,12 @@ def _outside(places: Indices, start: Indices, end: Integers) -> int:
 
 
 def _at(data: Bytes, index: Indices) -> Integers:
-    """Bytes at some places; 0 beyond the end."""
+    """Return bytes at some places; 0 beyond the end."""
     return np.where(index < len(data), data[np.minimum(index, len(data) - 1)], 0).astype(np.int64)
 
 
 def _pairs(data: Bytes, first: int, second: int) -> Indices:
-    """Places where two bytes follow each other."""
+    """Return places where two bytes follow each other."""
     return np.flatnonzero((data[:-1] == first) & (data[1:] == second)) if len(data) > 1 else np.zeros(0, np.intp)
 
 
@@ -253,13 +253,13 @@ _HEAD_BYTES: Final = 1 << 16  #: Bytes in which a log must show a frame with a v
 
 
 def is_receiver_log(head: bytes) -> bool:
-    """Whether bytes from the beginning of a file hold a UBX, RTCM 3 or SBF frame with a valid checksum."""
+    """Return whether bytes from the beginning of a file hold a UBX, RTCM 3 or SBF frame with a valid checksum."""
     frames = find_frames(np.frombuffer(head, dtype=np.uint8))
     return bool(np.isin(frames.protocol, ["ubx", "rtcm3", "sbf"]).any())
 
 
 def read_head(path: FilePath) -> bytes:
-    """First bytes of a file, unpacked."""
+    """Return the first bytes of a file, unpacked."""
     with open_stream(path, content="bytes") as stream:
         return stream.read(_HEAD_BYTES)
 
@@ -272,7 +272,7 @@ _LONGEST: Final = 62
 
 
 def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
-    """Unsigned integers from a bit field, shape (N,)."""
+    """Return the unsigned integers from a bit field, shape (N,)."""
     if length > _LONGEST:
         raise ValueError(f"a field has at most {_LONGEST} bits, {length} were asked for")
     value = np.zeros(len(bits), dtype=np.int64)
@@ -282,19 +282,19 @@ def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
 
 
 def read_signed(bits: Bytes, first: int, length: int) -> Integers:
-    """Integers in two's complement from a bit field, shape (N,)."""
+    """Return integers in two's complement from a bit field, shape (N,)."""
     value = read_unsigned(bits, first, length)
     return np.where(value >> (length - 1) & 1, value - (1 << length), value)
 
 
 def sign_magnitude(bits: Bytes, first: int, length: int) -> Integers:
-    """Integers as sign and magnitude (GLONASS), shape (N,)."""
+    """Return integers as sign and magnitude (GLONASS), shape (N,)."""
     value = read_unsigned(bits, first + 1, length - 1)
     return np.where(bits[:, first] == 1, -value, value)
 
 
 def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
-    """All fields of a layout, scaled, shape (N,) each, of bits of shape (N, bits)."""
+    """Return all fields of a layout, scaled, shape (N,) each, of bits of shape (N, bits)."""
     values = {}
     for name, (where, length, factor, coding) in layout.items():
         if isinstance(where, tuple):
@@ -323,12 +323,12 @@ class Subframes:
         return len(self.satellite)
 
     def take(self, rows: Integers | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Subframes:
-        """Some of the rows."""
+        """Return some of the rows."""
         return take_rows(self, rows)
 
 
 def join_subframes(first: Subframes, second: Subframes) -> Subframes:
-    """Subframes of two formats of one stream, in its order."""
+    """Return the subframes of two formats of one stream, in its order."""
     if not len(second) and not second.skipped:
         return first
     both = replace(join_rows([first, second]), skipped={**first.skipped, **second.skipped})
@@ -355,7 +355,7 @@ class SbasFrames:
 
 
 def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
-    """SBAS messages among subframes: eight words of 32 bits, left-aligned (UBX-22008968, 3.17.9)."""
+    """Return SBAS messages among subframes: eight words of 32 bits, left-aligned (UBX-22008968, 3.17.9)."""
     rows = np.flatnonzero(np.char.startswith(subframes.satellite, "S"))
     octets = subframes.words[rows, :8].astype(">u4").view(np.uint8).reshape(len(rows), 32).copy()
     octets[:, 31] &= 0xC0

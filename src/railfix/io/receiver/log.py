@@ -99,7 +99,7 @@ def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _mon_rf(data: Bytes) -> tuple[int, float] | None:
-    """Jamming of any band, gain of the first."""
+    """Return the jamming of any band, gain of the first."""
     if len(data) < 4 + _BLOCK or len(data) != 4 + _BLOCK * int(data[1]):
         return None
     blocks = data[4:].reshape(-1, _BLOCK)
@@ -108,14 +108,14 @@ def _mon_rf(data: Bytes) -> tuple[int, float] | None:
 
 
 def _mon_hw(data: Bytes) -> tuple[int, float] | None:
-    """Jamming and gain of receivers up to the M8."""
+    """Return the jamming and gain of receivers up to the M8."""
     if len(data) != _MON_HW_BYTES:
         return None
     return JAMMING * ((int(data[22]) >> 2 & 3) >= _CERTAIN), float(data[18]) + 256.0 * float(data[19])
 
 
 def _sec_sig(data: Bytes) -> tuple[int, float] | None:
-    """Jamming and spoofing, each where its detection is on."""
+    """Return the jamming and spoofing, each where its detection is on."""
     if len(data) >= 12 and data[0] == 1:
         jamming, spoofing = int(data[4]), int(data[8])
     elif len(data) >= 4 and data[0] == 2:
@@ -140,7 +140,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Interference that is not cancelled; signals that mislead or are not authentic."""
+    """Return the interference that is not cancelled; signals that mislead or are not authentic."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -151,7 +151,7 @@ def _rf_status(data: Bytes) -> tuple[int, float] | None:
 
 
 def _receiver_status(data: Bytes) -> tuple[int, float] | None:
-    """Gain of the first front end [dB]."""
+    """Return the gain of the first front end [dB]."""
     if len(data) < _FRONT_ENDS or int(data[20]) < 1 or len(data) < _FRONT_ENDS + int(data[21]):
         return None
     gain = int(data[_FRONT_ENDS + 1 : _FRONT_ENDS + 2].view(np.int8)[0])
@@ -279,7 +279,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
 
 
 def _of_old_kinds(frames: Frames) -> dict[str, int]:
-    """Messages with observations that are not read, counted by kind: RTCM 3 before MSM, u-blox before the M8."""
+    """Return messages with observations that are not read, counted by kind: RTCM 3 before MSM, u-blox before the M8."""
     counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in (*range(1001, 1005), *range(1009, 1013))}
     counts["UBX RXM-RAW"] = len(frames.of("ubx", ubx.RXM_RAW))
     return {what: number for what, number in counts.items() if number}
@@ -304,7 +304,7 @@ def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Int
 
 
 def _of_other_kinds(frames: Frames, kind: str) -> dict[str, int]:
-    """Messages with observations of other kinds than the one taken, counted by kind."""
+    """Return the messages with observations of other kinds than the one taken, counted by kind."""
     counts = {other: len(_places(frames, other)) for other in (_RAWX, _MEAS_EPOCH, _MSM) if other != kind}
     return {f"{other} messages beside {kind}, which is taken": n for other, n in counts.items() if n}
 
@@ -323,13 +323,13 @@ class _Dated(NamedTuple):
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
     def first_after(self, places: Integers) -> Datetimes:
-        """Time of the first one after each place of the stream; NaT where there is none."""
+        """Return the time of the first one after each place of the stream; NaT where there is none."""
         times = np.append(self.times, np.datetime64("NaT", "ns"))
         return np.asarray(times[np.searchsorted(self.places, places)])
 
 
 def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
-    """The receiver's epochs, of messages at places; before the first one, its other messages with a date."""
+    """Return the receiver's epochs, of messages at places; before the first one, its other messages with a date."""
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     if observed:
         return _Dated(epochs_at, raw.time)
@@ -344,7 +344,7 @@ def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: b
 def _navigation(
     frames: Frames, dated: _Dated, msm: _Dated, state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
-    """Ephemerides and SBAS messages of a block; `msm` are the epochs of RTCM 3."""
+    """Return the ephemerides and SBAS messages of a block; `msm` are the epochs of RTCM 3."""
     subframes = join_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
     after = dated.first_after(subframes.order)

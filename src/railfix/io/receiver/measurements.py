@@ -103,7 +103,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
 
 
 def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDArray[Any]:
-    """Values of the epochs that are kept; those of a log without them."""
+    """Return the values of the epochs that are kept; those of a log without them."""
     kind = np.float64 if np.isnan(absent) else np.uint8
     return np.full(int(rising.sum()), absent, dtype=kind) if values is None else values[rising]
 
@@ -111,7 +111,7 @@ def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDA
 def _tracking_after(
     observations: Observations, tracking: Tracking, channels: Strings, lock_s: Floats, polarity: Floats
 ) -> Tracking:
-    """State after a piece: of each channel the last lock time and polarity."""
+    """Return the state after a piece: of each channel the last lock time and polarity."""
     rows = np.where(np.isnan(lock_s), -1, np.arange(len(lock_s))[:, None]).max(axis=0)
     seen = np.flatnonzero(rows >= 0)
     lock = {str(channels[k]): (float(lock_s[rows[k], k]), float(polarity[rows[k], k])) for k in seen.tolist()}
@@ -120,7 +120,7 @@ def _tracking_after(
 
 
 def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
-    """Epochs later than all before them, shape (T,)."""
+    """Return epochs later than all before them, shape (T,)."""
     ns = time.astype(np.int64)
     floor = np.iinfo(np.int64).min if after is None else int(after.astype("datetime64[ns]").astype(np.int64))
     before = np.concatenate([[floor], np.maximum(np.maximum.accumulate(ns), floor)[:-1]]) if len(ns) else ns
@@ -163,7 +163,7 @@ def no_measurements(receiver: str) -> Measurements:
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
-    """Measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
+    """Return the measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
     epoch = np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)])
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
@@ -283,7 +283,7 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def frame_time(values: Values, time: np.datetime64) -> Datetimes:
-    """When the GLONASS frame of a string 1 began, GPS time."""
+    """Return when the GLONASS frame of a string 1 began, GPS time."""
     utc = gpst_to_utc(time)
     return np.asarray(time + (nearest_day(_frame_s(values), utc) - utc))
 
@@ -293,7 +293,7 @@ def _frame_s(values: Values) -> float:
 
 
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
-    """Week of toe, and toc.
+    """Return the week of toe, and toc.
 
     The week that satellites send is that of the transmission: as it ends, toe is in the next one. RTCM 3 has no time of
     transmission; in its place stands the time of week of `time`, when the message was received.
@@ -309,7 +309,7 @@ def _issue(values: Values, *names: str) -> tuple[float, ...]:
 
 
 def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers: Mapping[str, float]) -> RawRecord:
-    """A record in the order of numbers that RINEX has; what the message lacks is NaN."""
+    """Return a record in the order of numbers that RINEX has; what the message lacks is NaN."""
     values = [float(numbers.get(name, np.nan)) for name in list_fields(satellite[0], message)]
     return RawRecord(
         satellite[0], satellite, message, np.asarray(epoch, dtype="datetime64[ns]").reshape(1)[0], values, 3.0
@@ -317,6 +317,6 @@ def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers
 
 
 def _near_week(broadcast: float, time: np.datetime64) -> int:
-    """Full week nearest to a time from a week number of ten bits."""
+    """Return the full week nearest to a time from a week number of ten bits."""
     week = int(to_week(time)[0])
     return week + (int(broadcast) - week + 512) % 1024 - 512

@@ -31,17 +31,17 @@ def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
 
 
 def _with_head(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
-    """Layouts by kind, with the fields that all messages of the family begin with."""
+    """Return layouts by kind, with the fields that all messages of the family begin with."""
     return {kind: head | fields for kind, fields in kinds.items()}
 
 
 def _flags(**lengths: int) -> dict[str, Coding]:
-    """Codings of unsigned numbers without a factor."""
+    """Return the codings of unsigned numbers without a factor."""
     return {name: (length, 1.0, "u") for name, length in lengths.items()}
 
 
 def _klobuchar(first: int) -> dict[str, Field]:
-    """Layout of the ionospheric parameters of GPS, eight bits each from `first` on."""
+    """Return the layout of the ionospheric parameters of GPS, eight bits each from `first` on."""
     factors = (2.0**-30, 2.0**-27, 2.0**-24, 2.0**-24, 2.0**11, 2.0**14, 2.0**16, 2.0**16)
     return {f"ion{k}": (first + 8 * k, 8, factor, "s") for k, factor in enumerate(factors)}
 
@@ -284,7 +284,7 @@ def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple
 
 
 def has_crc(bits: Bytes, checked: int) -> Masks:
-    """Whether the 24 bits after the first `checked` are their CRC-24Q, shape (N,)."""
+    """Return whether the 24 bits after the first `checked` are their CRC-24Q, shape (N,)."""
     before = np.zeros((len(bits), -checked % 8), dtype=np.uint8)
     data = np.packbits(np.concatenate([before, bits[:, :checked]], axis=1), axis=1)
     start = np.arange(len(data)) * data.shape[1]
@@ -293,7 +293,7 @@ def has_crc(bits: Bytes, checked: int) -> Masks:
 
 
 def sisa_m(index: Floats) -> Floats:
-    """Signal-in-space accuracy of Galileo [m] by index; NaN where no prediction is available (ICD, table 89)."""
+    """Return signal-in-space accuracy of Galileo [m] by index; NaN where no prediction is available (ICD, table 89)."""
     i = np.asarray(index)
     value = np.select(
         [i < 50, i < 75, i < 100, i < 126],
@@ -304,7 +304,7 @@ def sisa_m(index: Floats) -> Floats:
 
 
 def glonass_hamming(bits: Bytes) -> Masks:
-    """Whether GLONASS strings of 85 bits pass their Hamming code (ICD, 4.7), shape (N,)."""
+    """Return whether GLONASS strings of 85 bits pass their Hamming code (ICD, 4.7), shape (N,)."""
     # Bit 85 of the ICD is sent first. Its data bits 9 to 85 have the places of a Hamming code that are no powers of
     # two, in this order; check bit k covers the places with bit k set. Check bits are the ICD's bits 1 to 7.
     value = bits[:, 84::-1].astype(np.int64)
@@ -331,7 +331,7 @@ Pages = Iterator[tuple[int, int, Values]]  #: Row, number among those of the sat
 
 
 def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
-    """Decoded pages in the order of the stream: row, satellite, number, fields."""
+    """Return the decoded pages in the order of the stream: row, satellite, number, fields."""
     counts = Counter(subframes.skipped)
     pages: list[tuple[int, str, int, Values]] = []
     letters = subframes.satellite.astype("<U1")
@@ -347,7 +347,7 @@ def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values
 def _of_kinds(
     bits: Bytes, valid: Masks, kind: Integers, layouts: Mapping[int, Mapping[str, Field]], first: int = 0
 ) -> Pages:
-    """Row, number (`first` and the kind) and fields of the valid pages of each kind."""
+    """Return the row, number (`first` and the kind) and fields of the valid pages of each kind."""
     for k, layout in layouts.items():
         rows = np.flatnonzero(valid & (kind == k))
         table = fields(bits[rows], layout)
@@ -358,7 +358,7 @@ def _of_kinds(
 def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
-    """Bits of pages, and which of those `here` have their preamble and CRC; the others count as `fault`."""
+    """Return the bits of pages, and which of those `here` have their preamble and CRC; the others count as `fault`."""
     bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here
@@ -370,7 +370,7 @@ def _with_crc(
 
 
 def _lnav(part: Subframes, counts: Counter[str]) -> Pages:
-    """LNAV and CNAV."""
+    """Return LNAV and CNAV."""
     letter, civil = str(part.satellite[0][0]), part.signal == 0
     cnav = np.isin(part.signal, _CNAV_SIGNALS[letter])
     counts[f"{letter} pages of other messages"] += int(np.count_nonzero(~cnav & ~civil))

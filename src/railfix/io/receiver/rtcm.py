@@ -52,7 +52,7 @@ _GLONASS_RANGE: Final = range(-7, 7)
 
 
 def _lock_table(bits: int) -> Floats:
-    """Least lock time [s] by indicator: DF402 (4 bits), DF407 (10 bits)."""
+    """Return the least lock time [s] by indicator: DF402 (4 bits), DF407 (10 bits)."""
     if bits == 4:
         return np.array([0.0] + [2.0 ** (k + 4) for k in range(1, 16)]) * 1e-3
     steps = np.concatenate([np.ones(64), np.repeat(2.0 ** np.arange(1, 21), 32)])
@@ -68,7 +68,7 @@ class ChannelNews(NamedTuple):
     channel: Integers
 
     def latest(self) -> dict[int, int]:
-        """Last known channel by satellite number."""
+        """Return the last known channel by satellite number."""
         return dict(zip(self.number.tolist(), self.channel.tolist(), strict=True))
 
     def at(self, place: Indices, numbers: Integers) -> Integers:
@@ -82,7 +82,7 @@ class ChannelNews(NamedTuple):
 
 
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
-    """Channels of 1020 messages after those known before; MSM4 and MSM6 carry none themselves."""
+    """Return the channels of 1020 messages after those known before; MSM4 and MSM6 carry none themselves."""
     chosen = frames.of("rtcm3", 1020)
     bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
@@ -151,7 +151,7 @@ def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def take_bits(frames: Frames, chosen: Indices, length: int) -> Bytes:
-    """First bits of some payloads, 0 beyond their ends, shape (N, at least `length`)."""
+    """Return the first bits of some payloads, 0 beyond their ends, shape (N, at least `length`)."""
     octets = np.arange((length + 7) // 8)
     place = frames.start[chosen][:, None] + octets
     inside = octets < (frames.end - frames.start)[chosen][:, None]
@@ -170,7 +170,7 @@ def station_ecef_m(frames: Frames) -> tuple[float, float, float] | None:
 
 
 def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
-    """Whether multiple signal messages are the last ones of their epoch (DF393 is 0), shape (len(chosen),)."""
+    """Return whether multiple signal messages are the last ones of their epoch (DF393 is 0), shape (len(chosen),)."""
     return np.asarray(take_bits(frames, chosen, 56)[:, 54] == 0)
 
 
@@ -285,7 +285,7 @@ def _decode(
 
 
 def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
-    """Epoch times of messages, GPS time."""
+    """Return the epoch times of messages, GPS time."""
     if system == "R":
         day, of_day = read_unsigned(bits, 24, 3), read_unsigned(bits, 27, 27) * 1e-3
         utc_s = day * 86_400.0 + of_day - _MOSCOW_S
@@ -296,7 +296,7 @@ def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
 
 
 def _sequence(codings: Mapping[str, Coding], names: str) -> dict[str, Field]:
-    """A layout from fields that follow each other after the message number."""
+    """Return a layout from fields that follow each other after the message number."""
     lengths = [codings[name][0] for name in names.split()]
     places = np.cumsum([12, *lengths[:-1]]).tolist()
     return layout(codings, **dict(zip(names.split(), places, strict=True)))
@@ -331,7 +331,7 @@ EPHEMERIDES: Final[dict[int, dict[str, Field]]] = {
 
 
 def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float]]]:
-    """Fields of every ephemeris message: place in the stream, message number, values."""
+    """Yield the fields of every ephemeris message: place in the stream, message number, values."""
     for number, sent in EPHEMERIDES.items():
         chosen = frames.of("rtcm3", number)
         needed = max(first + length for first, length, _, _ in sent.values() if isinstance(first, int))

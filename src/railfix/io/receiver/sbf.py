@@ -119,7 +119,7 @@ _WITHOUT_OFFSET: Final = (1, 2)  #: Signals whose C/N0 has no offset of 10 dB-Hz
 
 
 def _names() -> Strings:
-    """Names of satellites by SVID, blank where there is none."""
+    """Return the names of satellites by SVID, blank where there is none."""
     table = np.full(256, "", dtype="<U3")
     for first, last, letter, shift in _NUMBERS:
         for number in range(first, last + 1):
@@ -182,7 +182,7 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, in
 
 
 def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
-    """Measurements of sub-blocks: those of the first type whole, those of the second as offsets from theirs."""
+    """Return measurements of sub-blocks: those of the first type whole, those of the second as offsets from theirs."""
     own = place == master
     first = gather_structures(frames.data, master, _FIRST)
     other = gather_structures(frames.data, np.where(own, 0, place), _OTHER) if len(frames.data) >= 12 else first
@@ -228,7 +228,7 @@ def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
 
 
 def _signal_number(kind: Integers, info: Integers) -> Integers:
-    """Signal number: bits 0 to 4 of Type, or 32 plus bits 3 to 7 of ObsInfo where these are 31."""
+    """Return the signal number: bits 0 to 4 of Type, or 32 plus bits 3 to 7 of ObsInfo where these are 31."""
     low = np.asarray(kind, dtype=np.int64) & 31
     return np.where(low == 31, np.asarray(info, dtype=np.int64) // 8 + 32, low)
 
@@ -277,7 +277,7 @@ def navigation_subframes(frames: Frames) -> Subframes:
 
 
 def _bcnav1_pages(frames: Frames) -> Subframes:
-    """Frames of B-CNAV1 with valid CRCs, each as three pages (`nav_messages.BCNAV1`)."""
+    """Return the frames of B-CNAV1 with valid CRCs, each as three pages (`nav_messages.BCNAV1`)."""
     chosen = frames.of("sbf", BDS_RAW_B1C)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _FRAME.itemsize]
     rows = gather_structures(frames.data, frames.start[chosen], _FRAME)
@@ -302,7 +302,7 @@ def _bcnav1_pages(frames: Frames) -> Subframes:
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Places in the stream of navigation pages with a time, and their times."""
+    """Return the places in the stream of navigation pages with a time, and their times."""
     chosen = frames.of("sbf", *_PAGES, BDS_RAW_B1C)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _TIME.itemsize]
     rows = gather_structures(frames.data, frames.start[chosen], _TIME)
@@ -312,12 +312,12 @@ def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
 
 
 def _align_words(bits: Bytes, length: int) -> Words:
-    """Ten words of a number of bits, right-aligned, from bits put after each other, shape (..., 10 * length)."""
+    """Return ten words of a number of bits, right-aligned, from bits put after each other, shape (..., 10 * length)."""
     return read_unsigned(bits.reshape(-1, length), 0, length).reshape(-1, 10).astype(np.uint32)
 
 
 def _inav_words(words: Words) -> Words:
-    """Even and odd page in four words each, from both joined without the even page's tail."""
+    """Return the even and odd page in four words each, from both joined without the even page's tail."""
     bits = unpack_words(words, drop=0, keep=32)
     pages = np.zeros((len(words), 320), dtype=np.uint8)
     pages[:, :_EVEN_BITS] = bits[:, :_EVEN_BITS]

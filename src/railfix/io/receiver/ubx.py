@@ -74,7 +74,7 @@ _LARGEST_PHASE_STD: Final = 5
 
 
 def _name_table() -> Strings:
-    """Names of satellites by gnssId and svId, blank where there is none; SBAS PRN 120 is S20."""
+    """Return the names of satellites by gnssId and svId, blank where there is none; SBAS PRN 120 is S20."""
     table = np.full((256, 256), "", dtype="<U3")
     for system, letter in SYSTEMS.items():
         shift = 100 if letter == "S" else 0
@@ -133,7 +133,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
 
 
 def gather_structures(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
-    """Structures of one layout at many places of a buffer, shape (N,)."""
+    """Return the structures of one layout at many places of a buffer, shape (N,)."""
     block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
     return np.ascontiguousarray(block).view(layout)[:, 0]
 
@@ -165,7 +165,7 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
 
 
 def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> Masks:
-    """Whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV).
+    """Return whether the parity of all ten words of LNAV subframes is right, shape (N,) (IS-GPS-200, table 20-XIV).
 
     u-blox inverts a word whose predecessor ends in 1; the bit before is then the exclusive or of its last two.
     """
@@ -228,13 +228,13 @@ def find_date(frames: Frames) -> np.datetime64:
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Places in the stream of NAV-PVT with a valid date, and their times."""
+    """Return the places in the stream of NAV-PVT with a valid date, and their times."""
     days, rows, places = _date(frames)
     return places, nearest_week(rows["tow_ms"] * 1e-3, days)
 
 
 def _date(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
-    """Days (UTC), rows and places of NAV-PVT with a valid date."""
+    """Return days (UTC), rows and places of NAV-PVT with a valid date."""
     chosen = frames.of("ubx", NAV_PVT)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
     rows = gather_structures(frames.data, frames.start[chosen], _PVT)

@@ -278,7 +278,7 @@ def _three(text: str) -> Floats:
 
 
 def _place(text: str) -> Floats:
-    """Three coordinates; NaN where they are 0, which means unknown."""
+    """Return three coordinates; NaN where they are 0, which means unknown."""
     xyz = _three(text)
     return xyz if xyz.any() else np.full(3, np.nan)
 

@@ -264,7 +264,7 @@ def _runs(
 
 
 def _first_time(path: str, selection: Selection) -> np.datetime64:
-    """Time of the first epoch of a file whatever the selected span, NaT without any."""
+    """Return the time of the first epoch of a file whatever the selected span, NaT without any."""
     peek = replace(selection, broken_lines="count", systems=None, start_ns=Selection.start_ns, end_ns=Selection.end_ns)
     with closing(BlockReader(path, peek, block_bytes=_PEEK_BYTES).blocks()) as runs:
         return next((run.time[0] for run in runs if len(run)), np.datetime64("NaT", "ns"))
@@ -317,7 +317,7 @@ def without_empty_channels(observations: Observations) -> Observations:
 
 
 def of_channels(observations: Observations, kept: Masks) -> Observations:
-    """Some of the channels, shape (M,)."""
+    """Return some of the channels, shape (M,)."""
     arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
     return replace(
         observations,

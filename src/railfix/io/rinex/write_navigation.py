@@ -204,7 +204,7 @@ def _week_and_transmission(
 
 
 def glonass_numbers(records: GlonassRecords) -> tuple[Datetimes, Floats]:
-    """Time in UTC, and the numbers in file order (kilometres), shape (n, numbers)."""
+    """Return the time in UTC, and the numbers in file order (kilometres), shape (n, numbers)."""
     toe, sent = gpst_to_utc(records.toe), gpst_to_utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
     position, velocity, acceleration = (

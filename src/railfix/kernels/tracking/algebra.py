@@ -39,7 +39,7 @@ def _add_rows_plain(
 
 @intrinsic
 def _add_rows(_: Any, target: Any, origin: Any, by: Any, left: Any, source: Any, places: Any, rows: Any) -> Any:
-    """Sums of rows in vectors of the processor: of loops numba asks at each row whether arrays overlap."""
+    """Return the sums of rows in vectors of the processor: of loops numba asks at each row whether arrays overlap."""
     del places, rows  # of these types
     five = types.UniTuple(types.intp, 5)  # type: ignore[no-untyped-call]
     signature = types.void(target, origin, by, left, source, five, five)
@@ -191,7 +191,7 @@ def insert(ordered: Floats, size: int, value: float) -> None:
 
 @borrowing
 def middle(ordered: Floats, size: int) -> float:
-    """Median of values in rising order."""
+    """Return the median of values in rising order."""
     if size % 2:
         return float(ordered[size // 2])
     return float(0.5 * (ordered[size // 2 - 1] + ordered[size // 2]))
@@ -199,7 +199,7 @@ def middle(ordered: Floats, size: int) -> float:
 
 @borrowing
 def median(values: Floats, h: int, first: int, size: int, ordered: Floats) -> float:
-    """Median of a part of a row; `ordered` is work space."""
+    """Return the median of a part of a row; `ordered` is work space."""
     for i in range(size):
         insert(ordered, i, values[h, first + i])
     return middle(ordered, size)
@@ -216,7 +216,7 @@ def restart(spread: Floats, unknown: int, variance: float, h: int) -> None:
 
 @borrowing
 def log_sum(values: Floats, size: int) -> float:
-    """Logarithm of the sum of exponentials."""
+    """Return the logarithm of the sum of exponentials."""
     largest = values[0]
     for i in range(1, size):
         largest = max(largest, values[i])

@@ -11,7 +11,7 @@ from railfix.kernels.tracking.layout import ARC, LineArrays, Work
 
 @borrowing
 def on_course(line: LineArrays, arc: float) -> float:
-    """Arc length on the line of a place beyond an end of a closed one (`railfix.tracking.line.Line.round_m`)."""
+    """Return arc length on the line of a place beyond an end of a closed one (`railfix.tracking.line.Line.round_m`)."""
     first, last = line.arc_m[0], line.arc_m[-1]
     if arc > last and line.end_turn_m > 0.0:
         return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)
@@ -22,7 +22,7 @@ def on_course(line: LineArrays, arc: float) -> float:
 
 @borrowing
 def nearest_to(line: LineArrays, place: float, to: float) -> float:
-    """Arc length of a place that is nearest to another (`railfix.tracking.line.Line.nearest_m`)."""
+    """Return the arc length of a place that is nearest to another (`railfix.tracking.line.Line.nearest_m`)."""
     inside = on_course(line, to)
     nearest = place
     if line.end_turn_m > 0.0 and place >= line.arc_m[-1] - line.end_turn_m:
@@ -73,7 +73,7 @@ def find_ends(line: LineArrays, now: float, before: float, work: Work) -> None:
 
 @borrowing
 def gradient_at(line: LineArrays, arc: float) -> float:
-    """Gradient of the line, linear between the middles of segments."""
+    """Return the gradient of the line, linear between the middles of segments."""
     middle_m, gradient = line.middle_m, line.gradient
     arc = on_course(line, arc)
     low, high = 0, len(middle_m)

@@ -146,7 +146,7 @@ def write_rows(outputs: Outputs, rows: Rows, work: Work, t: int, best: int, beli
 
 @borrowing
 def code_shift(rows: Rows, work: Work, h: int) -> float:
-    """Shift of the place that the codes of an epoch ask for, over its standard deviation; 0 with too few codes.
+    """Return shift of the place that the codes of an epoch ask for, over its standard deviation; 0 with too few codes.
 
     The score of the innovations against a shift: standard normal and white over epochs where the model holds.
     """

@@ -61,7 +61,7 @@ from railfix.kernels.tracking.layout import (
 def contradiction(
     epochs: Epochs, t: int, line: LineArrays, parameters: Parameters, state: KernelState, work: Work, h: int
 ) -> float:
-    """Square of the velocity against that of the place over its variance; NaN without a velocity.
+    """Return the square of the velocity against that of the place over its variance; NaN without a velocity.
 
     Along the line and across it, at the best of three places that the place's standard deviation allows.
     """

@@ -37,7 +37,7 @@ from railfix.kernels.tracking.layout import (
 
 @borrowing
 def compute_weight(square: float, late: bool, degrees: tuple[float, float]) -> float:
-    """Weight of a measurement by its square over its variance: `railfix.tracking.limits.Tails`."""
+    """Return the weight of a measurement by its square over its variance: `railfix.tracking.limits.Tails`."""
     own = degrees[1] if late else degrees[0]
     return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
 
@@ -227,7 +227,7 @@ def reweight(
 def compute_log_evidence(
     rows: Rows, variance: Floats, degrees: tuple[float, float], log_after: float, work: Work, h: int, to: int
 ) -> float:
-    """Logarithm of the evidence of the measurements of finite variance, for the fit in row `to`."""
+    """Return the logarithm of the evidence of the measurements of finite variance, for the fit in row `to`."""
     residual, change, information = work.residual, work.change, work.information
     nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
     size = nc + COMBINED + rows.counts[3]
@@ -247,7 +247,7 @@ def compute_log_evidence(
 
 @borrowing
 def motion_evidence(rows: Rows, parameters: Parameters, work: Work, h: int, other: int) -> float:
-    """Logarithm of the evidence of all measurements but the codes."""
+    """Return the logarithm of the evidence of all measurements but the codes."""
     nc, count = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3]
     for i in range(count):
         work.masked[i] = math.inf if i < nc else work.variance[i]

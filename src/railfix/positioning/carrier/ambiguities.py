@@ -50,7 +50,7 @@ class PhaseLimits(Settings):
 
 
 def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
-    """Number of the hop that each time lies in."""
+    """Return the number of the hop that each time lies in."""
     nanoseconds = (time.astype("datetime64[ns]") - GPS_EPOCH).astype(np.int64)
     return np.asarray(nanoseconds // round(limits.hop_s * 1e9), dtype=np.int64)
 
@@ -121,7 +121,7 @@ def prepare_start(
 
 
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
-    """Inverse of normal matrices of ambiguities, shape (..., A, A).
+    """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
     A constant common to all, unobservable beside a clock of the phases' own, is fixed by a zero mean of the `held` ones
     (1, others 0; shape (..., A)), which changes no difference between them.

@@ -34,12 +34,12 @@ class ArcState:
 
 
 def channel_code(satellite: str, signal: str) -> int:
-    """A channel's letters as one number: ``G05`` on ``1C``."""
+    """Return a channel's letters as one number: ``G05`` on ``1C``."""
     return int.from_bytes(f"{satellite:<3.3}{signal:<2.2}".encode("ascii"), "big")
 
 
 def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
-    """Satellite and signal of each channel, by which states refer to channels."""
+    """Return the satellite and signal of each channel, by which states refer to channels."""
     return tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
 
 
@@ -52,7 +52,7 @@ def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
 def number_arcs(
     slip: Masks, has_phase: Masks, satellite: Strings, signal: Strings, state: ArcState | None = None
 ) -> tuple[Integers, ArcState]:
-    """Number of the arc of each phase.
+    """Return the number of the arc of each phase.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> In
 
 
 def decode_channel(arc_id: Integers) -> Integers:
-    """Channel code of each arc."""
+    """Return the channel code of each arc."""
     return np.asarray(arc_id >> COUNT_BITS)
 
 
@@ -150,7 +150,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Phases that disagree with the other phases and the line.
+    """Return phases that disagree with the other phases and the line.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ class _ContinuityFit:
 
 
 def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _ContinuityFit:
-    """Least squares of the kept channels of each epoch."""
+    """Return the least squares of the kept channels of each epoch."""
     weight = kept / sigma[:, None] ** 2
     inverse = np.linalg.inv(np.matmul((design * weight[..., None]).swapaxes(1, 2), design) + prior)
     right = np.matmul((weight * change)[:, None, :], design)[:, 0]
@@ -267,7 +267,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Channels kept after rejecting the worst one by one, and the epochs where these agree."""
+    """Return channels kept after rejecting the worst one by one, and the epochs where these agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

@@ -75,7 +75,7 @@ def phase_positions(
     *,
     limits: PhaseLimits | None = None,
 ) -> tuple[PhasePositions, PhaseState]:
-    """Positions of a chunk of epochs, each from its own and earlier observations.
+    """Return the positions of a chunk of epochs, each from its own and earlier observations.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def _fix_epochs(
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
-    """The memory with room for more arcs, sorted by name; known ones keep their first values."""
+    """Return the memory with room for more arcs, sorted by name; known ones keep their first values."""
     new = ~np.isin(ids, memory.arc_id)
     if not new.any():
         return memory
@@ -250,7 +250,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _accumulate(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats, Floats, Memory]:
-    """Normal equations at each epoch, its own part included, and the memory after the last one."""
+    """Return the normal equations at each epoch, its own part included, and the memory after the last one."""
     matrix, right = reduce(lin)
     epochs, count = len(index), len(memory.arc_id)
     row = np.arange(epochs)[:, None]
@@ -267,7 +267,7 @@ def _accumulate(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """The memory at a later hop: arcs not seen for long forgotten, the others a little less certain."""
+    """Return the memory at a later hop: arcs not seen for long forgotten, the others a little less certain."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)
@@ -284,7 +284,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
 
 
 def _without(memory: Memory, ends: Masks) -> Memory:
-    """Normal equations with some arcs eliminated; their information on the others is kept."""
+    """Return the normal equations with some arcs eliminated; their information on the others is kept."""
     runs = ~ends
     if runs.all():
         return memory
@@ -304,7 +304,7 @@ def _without(memory: Memory, ends: Masks) -> Memory:
 
 
 def _join(pieces: list[PhasePositions]) -> PhasePositions:
-    """Segments as a whole; the arcs are those of the last."""
+    """Return segments as a whole; the arcs are those of the last."""
     arrays: dict[str, Any] = {
         item.name: np.concatenate([getattr(p, item.name) for p in pieces])
         for item in fields(PhasePositions)

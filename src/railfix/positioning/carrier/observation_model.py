@@ -52,13 +52,13 @@ class Phases:
     integers: IntegerChannels | None = None  #: None leaves all ambiguities real numbers.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
-        """The phases of some epochs."""
+        """Return the phases of some epochs."""
         arrays = {name: getattr(self, name)[epochs] for name in ("phase_m", "weight", "arc_id")}
         return replace(self, **arrays)
 
 
 def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats, troposphere_m: Floats) -> Floats:
-    """Phase corrected to geometry, receiver clock and a constant, shape (T, M) [m].
+    """Return the phase corrected to geometry, receiver clock and a constant, shape (T, M) [m].
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Values less their weighted mean of each epoch, 0 where the weight is, and the mean."""
+    """Return the values less their weighted mean of each epoch, 0 where the weight is, and the mean."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
@@ -165,7 +165,7 @@ def _ties(ties: ClockTies) -> tuple[Floats, Floats]:
 
 
 def own_clock(lin: Linearised) -> bool:
-    """Whether the phases have a clock of their own."""
+    """Return whether the phases have a clock of their own."""
     return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
 
 

@@ -97,12 +97,12 @@ class Slips:
 
 
 def median_or_zero(values: Floats) -> Floats:
-    """Median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
+    """Return the median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
     return np.where(np.isfinite(values).sum(axis=1) >= _COMMON, medians(values), 0.0)
 
 
 def _before(values: Floats, last: Floats) -> Floats:
-    """Values of the epoch before each one; the first comes from the state."""
+    """Return the values of the epoch before each one; the first comes from the state."""
     return np.concatenate([last[None], values[:-1]])
 
 
@@ -113,7 +113,7 @@ def find_slips(
     frequency_hz: Floats | None = None,
     limits: CycleSlipLimits | None = None,
 ) -> tuple[Slips, CycleSlipState]:
-    """Cycle slips of every channel of a chunk.
+    """Return the cycle slips of every channel of a chunk.
 
     A channel's phase starts a new arc after an epoch without it.
     With fewer than three channels a clock step cannot be told from a slip, and counts as a slip.
@@ -252,14 +252,14 @@ class SmoothingState:
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
-    """Values at the marked epochs held until the next mark, `first` before any; shapes (T, M) and (M,)."""
+    """Return values at the marked epochs held until the next mark, `first` before any; shapes (T, M) and (M,)."""
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
     return np.asarray(np.take_along_axis(np.concatenate([first[None], values]), rows, axis=0))
 
 
 def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
-    """Mean change of code less phase over the channels that run on, 0 where there is none; shape (T,)."""
+    """Return the mean change of code less phase over the channels that run on, 0 where there is none; shape (T,)."""
     change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
     number = np.isfinite(change).sum(axis=1)
     return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))
@@ -276,7 +276,7 @@ def smooth_codes(
     *,
     limits: SmoothingLimits | None = None,
 ) -> tuple[Floats, SmoothingState]:
-    """Codes smoothed by the phase along unbroken arcs.
+    """Return codes smoothed by the phase along unbroken arcs.
 
     Weight of the n-th code of an arc: the greater of 1/n and dt / window. A phase times its
     wavelength is of the order of 1e8 m, where a double steps by 1.5e-8 m; the recursion runs on

@@ -49,7 +49,7 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
+    """Return PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
 
     The choice looks at all messages: make it on recorded messages before the positioning begins. What is
     received while a train runs cannot be judged in advance; there the PRN is given.
@@ -117,7 +117,7 @@ class SbasCorrections:
         )
 
     def _leave_out(self, messages: SbasMessages) -> list[str]:
-        """Notes on what of a whole log is not used."""
+        """Return the notes on what of a whole log is not used."""
         notes = []
         zeros = int((messages.type == 0).sum())
         if zeros:
@@ -129,7 +129,7 @@ class SbasCorrections:
     def satellites(
         self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None
     ) -> SatelliteCorrections:
-        """Fast and long-term corrections of T epochs by K satellites; those that the mask does not know are
+        """Return the fast and long-term corrections of T epochs by K satellites; those that the mask does not know are
         NOT_IN_MASK.
 
         A long-term correction is taken only if a record of `navigation` has its issue of data; the one before it, of
@@ -273,7 +273,7 @@ class SbasState:
         return SbasCorrections(self.messages, prn=self.prn, limits=self.limits)
 
     def drop_before(self, time: np.datetime64) -> SbasState:
-        """The state without the messages that no epoch from `time` on can use."""
+        """Return the state without the messages that no epoch from `time` on can use."""
         kind, age = self.messages.type, seconds(time - self.messages.time)
         if self.band == "L5":  # the newest of each type, and corrections with all indicators since
             newest = len(kind) - 1 - np.unique(kind[::-1], return_index=True)[1]

@@ -175,18 +175,18 @@ def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
 
 
 def find_rows(messages: SbasMessages, *types: int) -> Integers:
-    """Rows of some message types."""
+    """Return the rows of some message types."""
     return np.flatnonzero(np.isin(messages.type, types)).astype(np.int64)
 
 
 def decode(messages: SbasMessages, kind: int) -> Decoded:
-    """Fields of all messages of a type, as its layout has them."""
+    """Return the fields of all messages of a type, as its layout has them."""
     row = find_rows(messages, kind)
     return {"row": row, **read_fields(messages.bits[row], LAYOUTS[f"type {kind}"])}
 
 
 def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
-    """Instants with a time of day that lie nearest to other instants; NaT where it is NaN."""
+    """Return the instants with a time of day that lie nearest to other instants; NaT where it is NaN."""
     midnight = near.astype("datetime64[D]").astype("datetime64[ns]")
     offset = time_of_day_s - seconds(near - midnight)
     return np.asarray(near + timedelta(offset - SECONDS_PER_DAY * np.rint(offset / SECONDS_PER_DAY)), "datetime64[ns]")
@@ -218,12 +218,12 @@ def fast_corrections(messages: SbasMessages, *, type0: Literal["stop", "as_type2
 
 
 def has_data(bits: Bytes) -> Masks:
-    """Whether any data bit of messages is set, shape (n,)."""
+    """Return whether any data bit of messages is set, shape (n,)."""
     return np.asarray(np.unpackbits(np.ascontiguousarray(bits), axis=1)[:, 14:226].any(axis=1))
 
 
 def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
-    """One row a slot of fast corrections."""
+    """Return one row a slot of fast corrections."""
     slot = first[:, None] + np.arange(fields["prc_m"].shape[1])
     message, column = np.nonzero(slot < SLOTS)
     return {
@@ -234,7 +234,7 @@ def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
 
 
 def _join(parts: Sequence[Decoded]) -> Decoded:
-    """Rows of several decoders in the order of the messages, without those of empty slots."""
+    """Return the rows of several decoders in the order of the messages, without those of empty slots."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     kept = np.flatnonzero((joined["slot"] >= 0) & (joined["slot"] < SLOTS))
     order = kept[np.argsort(joined["row"][kept], kind="stable")]
@@ -242,7 +242,7 @@ def _join(parts: Sequence[Decoded]) -> Decoded:
 
 
 def long_term(messages: SbasMessages) -> Decoded:
-    """Both halves of type 25 and that of type 24, one row a satellite; `reference` is NaT without velocity."""
+    """Return both halves of type 25 and that of type 24, one row a satellite; `reference` is NaT without velocity."""
     parts: list[Decoded] = []
     for kind, start in ((25, 14), (25, 120), (24, 120)):
         row = find_rows(messages, kind)
@@ -285,7 +285,7 @@ def covariance_factor(sent: Decoded) -> Floats:
 
 
 def covariance(messages: SbasMessages) -> Decoded:
-    """Both halves of type 28: `slot`, `iodp`, `scale` (n,), `factor` (n, 4, 4), upper triangular, scaled."""
+    """Return both halves of type 28: `slot`, `iodp`, `scale` (n,), `factor` (n, 4, 4), upper triangular, scaled."""
     decoded = decode(messages, 28)
     row, parts = decoded["row"], []
     for start in (16, 121):

@@ -116,7 +116,7 @@ class DfmcCorrections:
     constant: Floats  #: Added to the factor along a line of sight, shape (T, K).
 
     def sigma_along_m(self, line_of_sight: Floats) -> Floats:
-        """Standard deviation of corrected ranges along unit vectors to the satellites, shape (T, K) [m]."""
+        """Return the standard deviation of corrected ranges along unit vectors to the satellites, shape (T, K) [m]."""
         sight = np.concatenate([line_of_sight, np.ones((*self.state.shape, 1))], axis=-1)
         projected = np.einsum("tkij,tkj->tki", self.factor, sight)
         ratio = np.sqrt(np.einsum("tki,tki->tk", projected, projected)) + self.constant
@@ -125,7 +125,7 @@ class DfmcCorrections:
 
 
 def slot_satellite(slot: int) -> str:
-    """Satellite of a slot of the mask; empty where it is reserved."""
+    """Return the satellite of a slot of the mask; empty where it is reserved."""
     for letter, first, last, number in (("G", 1, 32, 1), ("R", 38, 69, 1), ("E", 75, 110, 1), ("S", 120, 158, 20)):
         if first <= slot <= last:
             return f"{letter}{slot - first + number:02d}"
@@ -137,12 +137,12 @@ SLOT_OF: Final = {slot_satellite(slot): slot for slot in range(1, 215) if slot_s
 
 
 def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
-    """Standard deviation that ionosphere-free ranges keep of the ionosphere [m] (ED-259A)."""
+    """Return the standard deviation that ionosphere-free ranges keep of the ionosphere [m] (ED-259A)."""
     return np.asarray(40.0 / (261.0 + elevation_deg**2) + 0.018)
 
 
 def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
-    """Row of the newest of some messages at epochs, -1 without one, and its age, infinite then [s]."""
+    """Return the row of the newest of some messages at epochs, -1 without one, and its age, infinite then [s]."""
     row = np.searchsorted(sent, time, side="right") - 1
     ages = seconds(time - np.append(sent, np.datetime64("NaT", "ns"))[row])
     return row, np.where(row >= 0, ages, np.inf)
@@ -254,12 +254,12 @@ class DfmcService:
         own["growth_m"][good] = np.floor(age / interval) * scale["step_m"][ten, kind] + rate * age
 
     def _newest(self, kind: int, time: Datetimes, longest_s: float) -> Integers:
-        """Row of the newest message of a type, -1 without one that is new enough."""
+        """Return the row of the newest message of a type, -1 without one that is new enough."""
         row, age = _newest(self._time[kind], time)
         return np.where(age <= longest_s, row, -1)
 
     def _slots(self, name: str, mask: Integers) -> tuple[Masks, Integers]:
-        """Whether a satellite is in the mask in force, and its rank among those that are."""
+        """Return whether a satellite is in the mask in force, and its rank among those that are."""
         slot = SLOT_OF.get(name, 0)
         if not slot or not len(self._time[31]):
             return np.zeros(len(mask), dtype=np.bool_), np.zeros(len(mask), dtype=np.int64)
@@ -292,7 +292,7 @@ class DfmcService:
         return time[order], np.concatenate(issues)[order], np.concatenate(values)[order]
 
     def _indicator(self, time: Datetimes, mask: Integers, rank: Integers, sent: tuple[Integers, Floats]) -> Integers:
-        """Indicator in force: of type 32, or of a later message of types 34 to 36; -1 where it is too old."""
+        """Return indicator in force: of type 32, or of a later message of types 34 to 36; -1 where it is too old."""
         row, age = sent
         received, issue, values = self._indicators
         result = np.full(len(time), -1, dtype=np.int64)

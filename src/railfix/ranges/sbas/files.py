@@ -75,7 +75,7 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
 
 
 def parse(path: str, kind: str, lines: Sequence[str], band: Band = "L1") -> Iterator[RawMessage | InputFileError]:
-    """Every message of a file in its order; a broken one as the error that describes it."""
+    """Yield every message of a file in its order; a broken one as the error that describes it."""
     if kind == "rinex":
         yield from _parse_rinex(path, lines, band)
         return
@@ -112,7 +112,7 @@ def _ems(path: str, number: int, line: str, band: Band) -> RawMessage | InputFil
 
 
 def _parse_rinex(path: str, lines: Sequence[str], band: Band) -> Iterator[RawMessage | InputFileError]:
-    """Records of RINEX type B: PRN and epoch, then lines of up to 18 bytes, the type before the first."""
+    """Yield the records of RINEX type B: PRN and epoch, then lines of up to 18 bytes, the type before the first."""
     end = next((i for i, text in enumerate(lines) if text[60:].startswith("END OF HEADER")), None)
     if end is None:
         raise InputFileError(path, "the header has no END OF HEADER; the file is cut, give the whole one")
@@ -172,7 +172,7 @@ def _check_line(path: str, raw: RawMessage, band: Band) -> RawMessage | InputFil
 
 
 def _instant(date: str, second: str) -> int:
-    """Nanoseconds since the GPS epoch of a calendar time in GPS time."""
+    """Return the nanoseconds since the GPS epoch of a calendar time in GPS time."""
     year, month, day, hour, minute = (int(part) for part in date.split())
     year += 0 if year >= 100 else 1900 if year >= 80 else 2000
     value = float(second)
@@ -198,7 +198,7 @@ class _Gathered:
 def read_sbas(
     paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop", band: Band = "L1"
 ) -> SbasMessages:
-    """SBAS messages of one or several files.
+    """Return SBAS messages of one or several files.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
 
 
 def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMessages:
-    """Parity, preamble and order."""
+    """Return the parity, preamble and order."""
     raw = gathered.raw
     text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
     bits = np.frombuffer(bytes.fromhex(text), dtype=np.uint8).reshape(-1, ROW_BYTES).copy()
@@ -322,7 +322,7 @@ def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMes
 
 
 def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
-    """Bits of parity that each message carries: 24 in complete messages, 6 or none in cut ones.
+    """Return the bits of parity that each message carries: 24 in complete messages, 6 or none in cut ones.
 
     A cut message ends with 6 bits that some programs fill with zero (RTKLIB) and some leave as
     they came: in a file of the latter most of them are the first of the parity, by chance 1 in 64.

@@ -40,7 +40,7 @@ _LONG: Final = (-75, -65, *_SHORT, 65, 75)
 
 
 def _band(band: int) -> list[tuple[int, int]]:
-    """Latitude and longitude of the points of a band in the order of their bits (DO-229D, table A-14)."""
+    """Return the latitude and longitude of the points of a band in the order of their bits (DO-229D, table A-14)."""
     if band <= 8:
         west = -180 + 40 * band
         points = []
@@ -61,14 +61,14 @@ def _band(band: int) -> list[tuple[int, int]]:
 
 
 def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.generic]) -> Integers:
-    """Number of grid points; coordinates are multiples of 5 degrees, longitudes of any turn."""
+    """Return the number of grid points; coordinates are multiples of 5 degrees, longitudes of any turn."""
     row = np.rint((np.asarray(latitude_deg, dtype=np.float64) + 90.0) / 5.0).astype(np.int64)
     column = np.rint((np.asarray(longitude_deg, dtype=np.float64) + 180.0) / 5.0).astype(np.int64) % COLUMNS
     return row * COLUMNS + column
 
 
 def _layout() -> tuple[Integers, Integers]:
-    """Point of each bit of each band (-1 without), and the up to two (band, bit) cells of each point (-1)."""
+    """Return point of each bit of each band (-1 without), and the up to two (band, bit) cells of each point (-1)."""
     point = np.full((BANDS, BITS), -1, dtype=np.int64)
     cells = np.full((ROWS * COLUMNS, 2), -1, dtype=np.int64)
     for band in range(BANDS):
@@ -105,7 +105,7 @@ class GridTables:
         self.delays = self._delays(messages)
 
     def _delays(self, messages: SbasMessages) -> Series:
-        """Delays by point: the k-th of a block belongs to the k-th point of the mask of its issue."""
+        """Return delays by point: the k-th of a block belongs to the k-th point of the mask of its issue."""
         decoded = grid_delays(messages)
         kept = np.flatnonzero(decoded["band"] < BANDS)
         time, issue = messages.time[decoded["row"][kept]], 4 * decoded["band"][kept] + decoded["iodi"][kept]
@@ -125,12 +125,12 @@ class GridTables:
         return Series.of(point.ravel(), np.repeat(time, BLOCK), {**columns, "issue": np.repeat(issue, BLOCK)})
 
     def mask_active(self, issue: Integers, time: Datetimes) -> Masks:
-        """Whether the mask of a band and issue (4 band + IODI) is known and not timed out."""
+        """Return whether the mask of a band and issue (4 band + IODI) is known and not timed out."""
         row = self._by_issue.newest(issue, time)
         return self._by_issue.in_force(row, time, self._stops.last(time), self._mask_limit)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
-        """Whether points are in the newest mask of a band of theirs that has not timed out."""
+        """Return whether points are in the newest mask of a band of theirs that has not timed out."""
         inside, stop = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool), self._stops.last(time)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)
@@ -146,7 +146,7 @@ class Spans:
         self._edges = np.unique(np.concatenate(ends)) if len(time) else time
 
     def number(self, time: Datetimes) -> Integers:
-        """Number of the span of instants; an instant that is an edge has a number of its own."""
+        """Return the number of the span of instants; an instant that is an edge has a number of its own."""
         before = np.searchsorted(self._edges, time, side="left")
         return np.asarray(before + np.searchsorted(self._edges, time, side="right"), dtype=np.int64)
 
@@ -173,7 +173,7 @@ def look_up(
     time: Datetimes,
     points: int,
 ) -> NDArray[Answer]:
-    """Value of `answer` at four points and an instant, computed once for each span: shape (M, ...)."""
+    """Return the value of `answer` at four points and an instant, computed once for each span: shape (M, ...)."""
     first, which = distinct_lookups(span, point, points)
     return np.asarray(answer(point[first], time[first])[which])
 
@@ -206,7 +206,7 @@ def pierce_point(
 
 
 def triangle_weights(x: Floats, y: Floats, missing: int) -> Floats:
-    """Weights of SW, NW, SE, NE without one of them, shape (..., 4); one is negative outside the triangle."""
+    """Return weights of SW, NW, SE, NE without one of them, shape (..., 4); one is negative outside the triangle."""
     zero = np.zeros_like(x)
     weights = {
         0: (zero, 1.0 - x, 1.0 - y, x + y - 1.0),
@@ -243,7 +243,7 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Corner points (M, 4), -1 where not used, and the place in the cell (M,), (M,) below 75 degrees."""
+    """Return the corner points (M, 4), -1 where not used, and the place in the cell (M,), (M,) below 75 degrees."""
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
@@ -272,7 +272,7 @@ def _choose(
 
 
 def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats]:
-    """Points and weights at 75 degrees and above; all four are needed."""
+    """Return points and weights at 75 degrees and above; all four are needed."""
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0
@@ -309,7 +309,7 @@ def ionosphere(
     elevation_deg: Floats,
     azimuth_deg: Floats,
 ) -> IonosphereDelays:
-    """Delays at epochs; arguments as `SbasCorrections.ionosphere`."""
+    """Return delays at epochs; arguments as `SbasCorrections.ionosphere`."""
     latitude, longitude, obliquity = pierce_point(latitude_deg, longitude_deg, elevation_deg, azimuth_deg)
     shape = latitude.shape
     t = np.repeat(np.arange(len(time)), shape[1])
@@ -356,7 +356,7 @@ def ionosphere(
 def _judge(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, point: Integers
 ) -> tuple[Integers, Integers]:
-    """Newest delay of each corner, and its `IonosphereState` (M, 4)."""
+    """Return the newest delay of each corner, and its `IonosphereState` (M, 4)."""
     at, delays = time[:, None], grid.delays
     row = delays.newest(point, at)
     received = delays.received(row)
@@ -378,7 +378,7 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Weights of the corners (M, 4), and where they do: four good ones, or three around the place."""
+    """Return the weights of the corners (M, 4), and where they do: four good ones, or three around the place."""
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)

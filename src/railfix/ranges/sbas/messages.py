@@ -33,13 +33,13 @@ def message_parity(bits: Bytes) -> Integers:
 
 
 def carried_parity(bits: Bytes) -> Integers:
-    """The 24 bits after the data bits of each message, shape (N,)."""
+    """Return the 24 bits after the data bits of each message, shape (N,)."""
     tail = bits[:, 28:32].astype(np.int64)
     return ((tail[:, 0] & 0x3F) << 18) | (tail[:, 1] << 10) | (tail[:, 2] << 2) | (tail[:, 3] >> 6)
 
 
 def with_parity(bits: Bytes) -> Bytes:
-    """The same messages with the parity that belongs to them, shape (N, 32); the bits after it are zero."""
+    """Return the same messages with the parity that belongs to them, shape (N, 32); the bits after it are zero."""
     complete = np.zeros((len(bits), ROW_BYTES), dtype=np.uint8)
     complete[:, :29] = bits[:, :29]
     parity = message_parity(complete)
@@ -101,14 +101,14 @@ class SbasMessages:
         return {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
 
     def describe_choice(self, prn: int) -> str:
-        """A sentence on a PRN that was asked for; ValueError where none of the messages is of it."""
+        """Return a sentence on a PRN that was asked for; ValueError where none of the messages is of it."""
         known = ", ".join(map(str, self.prns))
         if prn not in self.prns:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
         return f"SBAS PRN {prn} was asked for; the log has {known}"
 
     def of(self, prn: int) -> SbasMessages:
-        """Messages of one PRN; the counts of rejected messages are those of all PRNs."""
+        """Return the messages of one PRN; the counts of rejected messages are those of all PRNs."""
         return self.take(self.prn == prn)
 
     @classmethod
@@ -119,7 +119,7 @@ class SbasMessages:
         return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
 
     def merge(self, later: SbasMessages) -> SbasMessages:
-        """These messages and others, in the order of reception; counts are added, repeated notes dropped."""
+        """Return these messages and others, in the order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self
         joined = {name: np.concatenate([rows, getattr(later, name)]) for name, rows in self._arrays.items()}
@@ -137,7 +137,7 @@ class SbasMessages:
         )
 
     def repeated(self) -> Masks:
-        """Messages that another receiver has passed on before: the same bits of one PRN within 1 s, shape (N,).
+        """Return messages that another receiver has passed on before: the same bits of one PRN within 1 s, shape (N,).
 
         The preambles of messages that follow each other differ, so that no GEO sends the same 250 bits twice in a row.
         """
@@ -150,5 +150,5 @@ class SbasMessages:
         return again
 
     def take(self, rows: Masks | Integers) -> SbasMessages:
-        """Some of the messages."""
+        """Return some of the messages."""
         return replace(self, **{name: values[rows] for name, values in self._arrays.items()})

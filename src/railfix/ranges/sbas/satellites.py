@@ -78,7 +78,7 @@ def fast_in_force(
 def _factors(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Integers, Floats, Masks]:
-    """Indicator of type 7, the largest of its message, latency; the worst where type 7 is missing."""
+    """Return the indicator of type 7, the largest of its message, latency; the worst where type 7 is missing."""
     table = tables.fast_degradation
     row, worst = table.newest(number, time), len(_ACCELERATION) - 1
     active = table.in_force(row, time, stop, limits.timeout_s("fast_degradation"))
@@ -99,7 +99,7 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Range-rate correction, its degradation per second, time between its two corrections, where there is none.
+    """Return range-rate correction, its degradation per second, time between its two corrections, where there is none.
 
     After an alarm (IODF 3) the earlier of the two is the one nearest to half the time-out before.
     """
@@ -124,7 +124,7 @@ def _rate(
 
 
 def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> Integers:
-    """Earlier row of the same satellite whose time is nearest to `before` ahead of a row; the later of two."""
+    """Return earlier row of the same satellite whose time is nearest to `before` ahead of a row; the later of two."""
     wanted = fast.time[row] - before
     first = fast["fresh"][row]
     low = np.maximum(fast.newest(fast.series[row], wanted), first)
@@ -190,7 +190,7 @@ def long_term_in_force(
 def covariance_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Row of the covariance in force, and where the GEO sends some and this satellite has none."""
+    """Return the row of the covariance in force, and where the GEO sends some and this satellite has none."""
     table, limit, sent_at = tables.covariance, limits.timeout_s("covariance"), tables.covariance_time
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):
@@ -217,7 +217,7 @@ class Growth:
 def degradation_row(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Newest message of type 10 at epochs, and where it is in force."""
+    """Return the newest message of type 10 at epochs, and where it is in force."""
     row = tables.degradation.newest(0, time)
     return row, tables.degradation.in_force(row, time, stop, limits.timeout_s("degradation"))
 
@@ -225,7 +225,7 @@ def degradation_row(
 def growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, fast: FastInForce, long_row: Integers, stop: Datetimes
 ) -> Growth:
-    """Degradation terms of satellites at epochs; times and stops of shape (T, 1)."""
+    """Return the degradation terms of satellites at epochs; times and stops of shape (T, 1)."""
     row, active = degradation_row(tables, limits, time, stop)
     shape, ten = fast.udrei.shape, tables.degradation
     rate = np.where(
@@ -248,7 +248,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Growth of long-term corrections (A.4.5.1.3), and which are older than precision approach allows."""
+    """Return the growth of long-term corrections (A.4.5.1.3), and which are older than precision approach allows."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])
@@ -302,7 +302,7 @@ class ServiceTable:
         return factor, incomplete
 
     def _complete(self, last: int) -> Integers | None:
-        """Rows of the newest complete set at or before a row; None without one."""
+        """Return the rows of the newest complete set at or before a row; None without one."""
         issue, message = self.values["issue"], self.values["message"]
         young = np.flatnonzero(seconds(self.time[last] - self.time[: last + 1]) <= self._limit)
         for row in young[::-1].tolist():
@@ -326,7 +326,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Whether places lie in a region: the rectangle of two corners, or its half at (latitude 1, longitude 2)."""
+    """Return whether places lie in a region: the rectangle of two corners, or its half at (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )
@@ -339,5 +339,5 @@ def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longit
 
 
 def _wrap(angle_deg: Floats | np.float64) -> Floats:
-    """Angle in [-180, 180)."""
+    """Return the angle in [-180, 180)."""
     return np.asarray((angle_deg + 180.0) % 360.0 - 180.0)

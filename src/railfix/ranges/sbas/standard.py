@@ -33,7 +33,7 @@ GEO_PRNS: Final = (*range(120, 159), *range(183, 203))
 
 
 def system_name(prn: int) -> str:
-    """Name of the system that a PRN belongs to ("MSAS"); "SBAS" where it is not assigned."""
+    """Return the name of the system that a PRN belongs to ("MSAS"); "SBAS" where it is not assigned."""
     return _SYSTEM_OF.get(prn, "SBAS")
 
 
@@ -111,7 +111,7 @@ class SbasLimits(Settings):
     message_s: float = Field(default=1.0, ge=0.0, le=2.0)  #: [s] From the first bit of a message to its reception.
 
     def timeout_s(self, kind: str) -> float:
-        """Time-out of a kind of message in this mode [s]."""
+        """Return the time-out of a kind of message in this mode [s]."""
         return TIMEOUT_S[kind][0 if self.mode == "precision" else 1]
 
     @property
@@ -153,7 +153,7 @@ class IonosphereState(IntEnum):
 
 
 def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: int) -> Integers:
-    """Value of the first condition that holds, any shape."""
+    """Return the value of the first condition that holds, any shape."""
     conditions, values = zip(*cases, strict=True)
     return np.asarray(np.select(conditions, values, otherwise), dtype=np.int64)
 
@@ -190,11 +190,11 @@ class SatelliteCorrections(_Frozen):
     covariance: Integers  #: Row of the covariance (type 28) in force, -1 without; shape (T, K).
 
     def take_satellites(self, which: Integers) -> SatelliteCorrections:
-        """The corrections of some satellites, by index."""
+        """Return the corrections of some satellites, by index."""
         return SatelliteCorrections(**{item.name: getattr(self, item.name)[:, which] for item in fields(self)})
 
     def sigma_flt_m(self, delta_udre: Floats | float = 1.0) -> Floats:
-        """Standard deviation after fast and long-term correction, shape (T, K) [m] (DO-229D, A.4.5.1 and J.2.2).
+        """Return standard deviation after fast and long-term correction, shape (T, K) [m] (DO-229D, A.4.5.1 and J.2.2).
 
         `delta_udre` is the factor on sigma UDRE (`SbasCorrections.delta_udre`).
         """

@@ -71,7 +71,7 @@ class Series:
         return self.columns[name]
 
     def add_columns(self, **columns: NDArray[Any]) -> Series:
-        """The same rows with more columns."""
+        """Return the same rows with more columns."""
         return replace(self, columns={**self.columns, **columns})
 
     def newest(self, series: Integers | int, time: Datetimes) -> Integers:
@@ -84,11 +84,11 @@ class Series:
         return np.where(known, at, -1).astype(np.int64)
 
     def received(self, row: Integers) -> Datetimes:
-        """Reception of rows; long ago for -1."""
+        """Return the reception of rows; long ago for -1."""
         return np.where(row >= 0, self.time[row], LONG_AGO)
 
     def in_force(self, row: Integers, time: Datetimes, stop: Datetimes, limit_s: float) -> Masks:
-        """Whether rows, -1 for none, came after a stop of the GEO and are not older than a limit at instants."""
+        """Return whether rows, -1 for none, came after a stop of the GEO and are not older than a limit at instants."""
         received = self.received(row)
         return np.asarray((row >= 0) & (received > stop) & (seconds(time - received) <= limit_s))
 
@@ -103,7 +103,7 @@ class Stops:
         self.time = messages.time[stops]
 
     def last(self, time: Datetimes) -> Datetimes:
-        """Newest stop at or before instants; long ago where there was none."""
+        """Return the newest stop at or before instants; long ago where there was none."""
         if not len(self.time):
             return np.full(np.shape(time), LONG_AGO)
         at = np.searchsorted(self.time, time, side="right") - 1
@@ -125,25 +125,25 @@ class MaskTable:
         self._stops = stops
 
     def resolve(self, iodp: Integers, slot: Integers, time: Datetimes) -> Integers:
-        """Mask number of slots of messages, 0 where the mask leaves the slot out, -1 without an active mask."""
+        """Return mask number of slots of messages, 0 where the mask leaves the slot out, -1 without an active mask."""
         mask = self.by_issue.newest(iodp, time)
         return np.where(self._in_force(self.by_issue, mask, time), self.by_issue["number"][mask, slot], -1)
 
     def active(self, iodp: Integers, time: Datetimes) -> Masks:
-        """Whether a mask of an issue is known and not timed out."""
+        """Return whether a mask of an issue is known and not timed out."""
         return self._in_force(self.by_issue, self.by_issue.newest(iodp, time), time)
 
     def _in_force(self, table: Series, row: Integers, time: Datetimes) -> Masks:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Whether there is an active mask (T,), and whether the newest names the satellites (T, K)."""
+        """Return whether there is an active mask (T,), and whether the newest names the satellites (T, K)."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]
 
     def current(self, slot: Integers, time: Datetimes) -> Integers:
-        """Mask numbers of slots by the newest mask of any issue, for messages that name none; -1 without."""
+        """Return the mask numbers of slots by the newest mask of any issue, for messages that name none; -1 without."""
         rows = self.by_issue.newest(np.arange(4)[None, :], time[:, None])
         issue = np.argmax(self.by_issue.received(rows), axis=1)
         best = np.take_along_axis(rows, issue[:, None], axis=1)[:, 0]
@@ -176,7 +176,7 @@ class SatelliteTables:
         self.degradation = Series.of(np.zeros(len(row), dtype=np.int64), messages.time[row], ten)
 
     def _by_satellite(self, kind: str, messages: SbasMessages, decoded: Decoded) -> Series:
-        """Rows of satellites that an active mask names; the others are counted."""
+        """Return the rows of satellites that an active mask names; the others are counted."""
         time = messages.time[decoded["row"]]
         number = self.masks.resolve(decoded["iodp"], decoded["slot"], time)
         self.unused[f"{kind} without a mask of their IODP"] += int((number < 0).sum())
@@ -231,7 +231,7 @@ def _with_fresh(fast: Series) -> Series:
 
 
 def _with_other(table: Series) -> Series:
-    """Number of the last row of the same satellite with another issue of data."""
+    """Return the number of the last row of the same satellite with another issue of data."""
     number, iode = table.series, table["iode"]
     changed = np.ones(len(number), dtype=bool)
     changed[1:] = (number[1:] != number[:-1]) | (iode[1:] != iode[:-1])

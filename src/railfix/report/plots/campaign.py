@@ -61,7 +61,7 @@ def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
 
 
 def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Floats, quantity: str) -> Chart:
-    """Bars of a quantity by run, from `low` to `high` with a mark at `middle`, each of shape (runs,) [m]."""
+    """Return the bars of a quantity by run, from `low` to `high` with a mark at `middle`, each of shape (runs,) [m]."""
     named, _, colour = _QUANTITIES[quantity]
     top = float(np.nanmax(high[np.isfinite(high)], initial=0.0)) or 1.0
     bars = RangeBars(label=named, colour=colour, names=tuple(names), low=low, mid=middle, high=high)
@@ -73,7 +73,7 @@ def campaign_bars(names: Sequence[str], low: Floats, middle: Floats, high: Float
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
-    """Time an epoch over the run, the mean of each chunk; of ``chunks`` of ``run.json``."""
+    """Return the time an epoch over the run, the mean of each chunk; of ``chunks`` of ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
     spent = np.array(chunks["positioning_s"], dtype=np.float64)

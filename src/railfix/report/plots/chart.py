@@ -199,7 +199,7 @@ class SkyEpochs:
 
 
 def _draw(layer: Layer) -> bool:
-    """Whether a layer has anything to draw; text alone does not count."""
+    """Return whether a layer has anything to draw; text alone does not count."""
     if isinstance(layer, Marks):
         return False
     if isinstance(layer, Cells):
@@ -217,24 +217,24 @@ __all__ = ["find_start", "floats", "nice_step", "points", "since", "words"]
 
 
 def points(table: pl.DataFrame, *names: str) -> Floats:
-    """Columns side by side, shape (rows, columns)."""
+    """Return columns side by side, shape (rows, columns)."""
     return np.stack([floats(table, name) for name in names], axis=1)
 
 
 def words(table: pl.DataFrame, name: str) -> Strings:
-    """A text column, blank where it is null."""
+    """Return a text column, blank where it is null."""
     return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
 
 
 def find_start(table: pl.DataFrame) -> np.datetime64:
-    """Earliest time of a table; ValueError where it is empty."""
+    """Return the earliest time of a table; ValueError where it is empty."""
     if not len(table):
         raise ValueError("the table has no rows")
     return np.datetime64(table["time_gpst"].to_numpy().min(), "ns")
 
 
 def since(table: pl.DataFrame, start: np.datetime64) -> Floats:
-    """Times of a table since a start [s]."""
+    """Return the times of a table since a start [s]."""
     return seconds(table["time_gpst"].to_numpy().astype("datetime64[ns]") - start)
 
 
@@ -294,7 +294,7 @@ def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def counts_sentence(shown: int, total: int) -> str:
-    """A sentence on the thinning, empty if there was none."""
+    """Return a sentence on the thinning, empty if there was none."""
     if shown == total:
         return ""
     return f" {shown:,} of {total:,} points are shown, the extremes among them."

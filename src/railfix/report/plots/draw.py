@@ -53,7 +53,7 @@ def plotter(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
 
 
 def draw_figure(chart: Chart) -> Figure:
-    """A chart as a matplotlib figure: ``figure.savefig("error.png")`` writes it, a notebook shows it."""
+    """Return a chart as a matplotlib figure: ``figure.savefig("error.png")`` writes it, a notebook shows it."""
     from matplotlib.figure import Figure
 
     size = (10.0, 7.0) if chart.equal else (10.0 if chart.width == "wide" else 6.0, 4.2)
@@ -133,7 +133,7 @@ def _scales(chart: Chart, axes: Axes) -> None:
 
 
 def _along(chart: Chart, x: Any) -> Any:
-    """Times instead of seconds if the x axis is time."""
+    """Return the times instead of seconds if the x axis is time."""
     return x if chart.start is None else chart.start + timedelta(x)
 
 

@@ -57,7 +57,7 @@ _SERIES: Final = (
 
 
 def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
-    """Errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
+    """Return errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
 
     Both tables are of one antenna, in order of time; `filtered` is of the filter along the track.
     """
@@ -65,12 +65,12 @@ def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = Non
 
 
 def error_over_chainage(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
-    """Errors over the chainage of the reference (P1 figure 8), of the tables of `error_over_time`."""
+    """Return the errors over the chainage of the reference (P1 figure 8), of the tables of `error_over_time`."""
     return _errors(errors, filtered, None)
 
 
 def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datetime64 | None) -> Chart:
-    """Errors over the time since `start`, or over the chainage without one."""
+    """Return errors over the time since `start`, or over the chainage without one."""
 
     def axis(table: pl.DataFrame) -> Floats:
         return floats(table, "chainage_m") if start is None else since(table, start)
@@ -132,7 +132,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
 
 
 def good_errors(errors: pl.DataFrame, column: str) -> Floats:
-    """Errors of a column, NaN where the standard deviation of the reference exceeds the limit."""
+    """Return the errors of a column, NaN where the standard deviation of the reference exceeds the limit."""
     values = floats(errors, column)
     return np.where(errors["reference_good"].to_numpy(), values, np.nan) if "reference_good" in errors else values
 
@@ -149,7 +149,7 @@ def error_scale(error_m: Floats) -> dict[str, Any]:
 
 
 def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Largest y of each piece of x, NaN between pieces far apart."""
+    """Return the largest y of each piece of x, NaN between pieces far apart."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(rows):
         return np.empty(0), np.empty(0)
@@ -168,7 +168,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
-    """Minimum, mean and maximum error of each run by its name, on the map and conventional (P1 figure 11)."""
+    """Return minimum, mean and maximum error of each run by its name, on the map and conventional (P1 figure 11)."""
     names: list[str] = []
     values: list[Floats] = []
     for run, errors in runs.items():
@@ -260,7 +260,7 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
 
 
 def _regions(diagram: Stanford, top_m: float) -> Marks:
-    """The regions that the axes show, by name and epochs."""
+    """Return the regions that the axes show, by name and epochs."""
     limit = diagram.alarm_limit_m
 
     def place(value: float) -> float:
@@ -277,17 +277,17 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
 
 
 def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
-    """Protection level of one antenna and its parts over time; empty where the run has no levels."""
+    """Return the protection level of one antenna and its parts over time; empty where the run has no levels."""
     return _levels(positions, alarm_limit_m, find_start(positions))
 
 
 def levels_over_chainage(positions: pl.DataFrame, alarm_limit_m: float) -> Chart:
-    """The same over the chainage of the positions; those without a position are left out."""
+    """Return the same over the chainage of the positions; those without a position are left out."""
     return _levels(positions, alarm_limit_m, None)
 
 
 def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 | None) -> Chart:
-    """Levels over the time since `start`, or over the chainage without one."""
+    """Return levels over the time since `start`, or over the chainage without one."""
     layers: list[Layer] = []
     shown = total = 0
     largest = alarm_limit_m
@@ -326,7 +326,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
 
 
 def _count(positions: pl.DataFrame) -> str:
-    """Epochs by status and cause of the level, in words."""
+    """Return the epochs by status and cause of the level, in words."""
     sentences = []
     for column, what in (("protection_status", "Epochs"), ("protection_cause", "What sets the level")):
         if column in positions.columns:

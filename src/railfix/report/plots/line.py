@@ -59,7 +59,7 @@ def plan(
     background: Sequence[Floats] = (),
     title: str = "Plan of the line",
 ) -> Chart:
-    """Positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
+    """Return the positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
 
     No layers without a position. The positions are coloured by `error_m` or `level_m`, shape (rows,), by the size of
     the first that is given, and by their status without either. Of `filtered`, by the filter along the track, those of
@@ -111,7 +111,7 @@ def plan(
 def _filter(
     placed: pl.DataFrame, filtered: pl.DataFrame, frame: LocalFrame, cell: float, start: np.datetime64
 ) -> Iterator[Points]:
-    """Filtered positions of the epochs that have none of their own."""
+    """Yield the filtered positions of the epochs that have none of their own."""
     alone = filtered.join(placed, on="time_gpst", how="anti").filter(pl.col("x_m").is_not_null())
     if len(alone):
         place = frame.plane(points(alone, *ECEF))
@@ -133,7 +133,7 @@ class LocalFrame:
 
     @classmethod
     def around(cls, ecef_m: Floats) -> LocalFrame:
-        """Frame at the mean of points, shape (P, 3)."""
+        """Return the frame at the mean of points, shape (P, 3)."""
         origin = ecef_m.mean(axis=0)
         latitude, longitude, height = (float(value) for value in geodetic_from_ecef(origin))
         axes = enu_axes(latitude, longitude)
@@ -141,7 +141,7 @@ class LocalFrame:
 
     @classmethod
     def at(cls, latitude_deg: float, longitude_deg: float) -> LocalFrame:
-        """Frame at a place on the ellipsoid."""
+        """Return the frame at a place on the ellipsoid."""
         origin, axes = ecef_from_geodetic(latitude_deg, longitude_deg, 0.0), enu_axes(latitude_deg, longitude_deg)
         return cls(
             origin_ecef_m=origin, axes=axes, latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=0.0
@@ -157,7 +157,7 @@ class LocalFrame:
 
 
 def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
-    """Lines of the background within a box."""
+    """Yield the lines of the background within a box."""
     parts: list[Floats] = []
     gap = np.full((1, 2), np.nan)
     for line in lines:
@@ -175,7 +175,7 @@ def _background(lines: Sequence[Floats], frame: LocalFrame, low: Floats, high: F
 def _line(
     track: Track | None, frame: LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
 ) -> Iterator[Curve]:
-    """The line between the first and the last position, and its tunnels."""
+    """Yield the line between the first and the last position, and its tunnels."""
     if track is None:
         yield _line_of_positions(here, chainage_m)
         return
@@ -208,7 +208,7 @@ def _classes(
 
 
 def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
-    """Classes of sizes, from small to large."""
+    """Return the classes of sizes, from small to large."""
     classes = [(unknown, BLACK, np.isnan(size))]
     for low, high, colour in zip((0.0, *edges), (*edges, np.inf), ORDERED, strict=True):
         label = f"{quantity} {low:g} to {high:g} m" if np.isfinite(high) else f"{quantity} {low:g} m and more"
@@ -217,7 +217,7 @@ def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: s
 
 
 def _line_of_positions(here: Floats, chainage_m: Floats) -> Curve:
-    """Line through the positions: the middle of each short piece, broken at wide gaps."""
+    """Return the line through the positions: the middle of each short piece, broken at wide gaps."""
     order = np.argsort(chainage_m, kind="stable")
     chainage, place = chainage_m[order], here[order]
     width = max(float(np.ptp(chainage)) / _TRACK_PIECES, 0.5)
@@ -284,7 +284,7 @@ def interval_over_chainage(table: pl.DataFrame) -> Chart:
 
 
 def interval_distribution(table: pl.DataFrame) -> Chart:
-    """Distribution of the distances from the previous position (P1 figure 12), of the table of `interval`."""
+    """Return distribution of the distances from the previous position (P1 figure 12), of the table of `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)
@@ -315,7 +315,7 @@ def _by(table: pl.DataFrame) -> str:
 
 
 def satellites_over_time(positions: pl.DataFrame) -> Chart:
-    """Satellites used and rejected at each epoch of one antenna."""
+    """Return satellites used and rejected at each epoch of one antenna."""
     start = find_start(positions)
     x = since(positions, start)
     layers: list[Layer] = []

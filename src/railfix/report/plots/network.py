@@ -45,7 +45,7 @@ def plot_network(
 
 
 def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[PlanLog, Matched] | None) -> Chart:
-    """Tracks with their switches and names, findings of the check, and the positions of a run."""
+    """Return tracks with their switches and names, findings of the check, and the positions of a run."""
     latitude, longitude = (
         np.concatenate([getattr(t, name) for t in network.tracks]) for name in ("latitude_deg", "longitude_deg")
     )
@@ -84,7 +84,7 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
 
 
 def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Ranges east and north of the positions with a margin; None without positions."""
+    """Return the ranges east and north of the positions with a margin; None without positions."""
     known = np.isfinite(log.latitude_deg)
     if not known.any():
         return None
@@ -113,7 +113,7 @@ def _names_beside(
 
 
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
-    """Every n-th point of each track and its last one, and where in them a new track begins."""
+    """Return every n-th point of each track and its last one, and where in them a new track begins."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)
     place = np.arange(len(track)) - first[track]
@@ -128,7 +128,7 @@ def _switches(network: Network) -> Indices:
 
 
 def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]:
-    """Positions in classes of the probability of their track, and those on none."""
+    """Return the positions in classes of the probability of their track, and those on none."""
     east, north = frame.to_plane(log.latitude_deg, log.longitude_deg).T
     on, layers, above = matched.track >= 0, [], np.inf
     for low, colour in _CLASSES:

@@ -63,7 +63,7 @@ def draw_screen(
 
 
 def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
-    """Chart of a metric against its limit over T times; `epoch`, shape (T,), gives the time of each row."""
+    """Return the chart of a metric against its limit over T times; `epoch`, shape (T,), gives the time of each row."""
     start = time.min() if len(time) else np.datetime64(0, "ns")
     return _screen(picture, seconds(time - start), epoch, start)
 
@@ -71,12 +71,12 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[
 def screen_over_chainage(
     picture: ScreenPicture, chainage_m: Floats, *, epoch: NDArray[np.integer] | None = None
 ) -> Chart:
-    """The same over the chainage, shape (T,), or (E,) with `epoch` [m]; see `screen_over_time`."""
+    """Return the same over the chainage, shape (T,), or (E,) with `epoch` [m]; see `screen_over_time`."""
     return _screen(picture, chainage_m, epoch, None)
 
 
 def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None, start: np.datetime64 | None) -> Chart:
-    """Metric over the time since `start`, or over the chainage without one."""
+    """Return the metric over the time since `start`, or over the chainage without one."""
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
     rejected = int(np.count_nonzero(picture.reject))
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
@@ -136,14 +136,14 @@ def _blocks(
 
 
 def _join(parts: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Pairs of arrays end to end."""
+    """Return the pairs of arrays end to end."""
     if not parts:
         return np.empty(0), np.empty(0)
     return np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
 
 
 def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
-    """Smallest limit at each distinct x, in rising order of x."""
+    """Return the smallest limit at each distinct x, in rising order of x."""
     known = np.isfinite(x)
     x, limit = x[known], limit[known]
     order = np.argsort(x, kind="stable")
@@ -180,17 +180,17 @@ class _ScreenRows:
     epoch: NDArray[np.int32]
 
     def channels(self, column: str) -> Floats:
-        """One column of the observations in the precision of charts, shape (N, 1)."""
+        """Return one column of the observations in the precision of charts, shape (N, 1)."""
         values = pl.col(column).cast(pl.Float32).fill_null(float("nan"))
         return self.observations.select(values).collect()[column].to_numpy()[:, None]
 
     def rejected(self, reason: Reason) -> Masks:
-        """Observations with a reason, shape (N, 1)."""
+        """Return observations with a reason, shape (N, 1)."""
         flags = self.observations.select((pl.col("reason") & int(reason)) != 0).collect()
         return flags["reason"].to_numpy()[:, None]
 
     def epochs(self, column: str) -> Floats:
-        """One column of the positions, shape (T, 1)."""
+        """Return one column of the positions, shape (T, 1)."""
         return floats(self.positions, column)[:, None]
 
 
@@ -219,7 +219,7 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
 
 
 def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list[str]:
-    """Columns of the screens that tables of an earlier version lack."""
+    """Return the columns of the screens that tables of an earlier version lack."""
     columns = [column for screen in SCREENS for column in screen.columns]
     missing = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
     missing |= {c.name for c in columns if c.table == "observations"} - set(observations.collect_schema())
@@ -250,7 +250,7 @@ class RunScreen:
 
 
 def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
-    """Every screen of a run that tested anything, antenna by antenna, with the settings that were used."""
+    """Yield every screen of a run that tested anything, antenna by antenna, with the settings that were used."""
     antennas = positions["antenna"].unique(maintain_order=True).to_list()
     for antenna in antennas:
         mine = positions.filter(pl.col("antenna") == antenna) if len(antennas) > 1 else positions
@@ -273,7 +273,7 @@ def list_screens(config: Config, positions: pl.DataFrame, observations: pl.LazyF
 
 
 def _pictures(antenna: str, rows: _ScreenRows, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
-    """Pictures of the active screens and of the protection level, with the names of their files."""
+    """Yield the pictures of the active screens and of the protection level, with the names of their files."""
     for screen in SCREENS:
         if screen.name in config.screens:
             for name, picture in screen.pictures(rows, getattr(config, screen.name)):

@@ -49,7 +49,7 @@ def cn0_over_elevation(
     curve: Cn0Curve | None = None,
     mask_deg: float | None = None,
 ) -> list[Chart]:
-    """C/N0 over elevation with mean and thresholds, a chart for each constellation and signal (P1 figure 3)."""
+    """Return C/N0 over elevation with mean and thresholds, a chart for each constellation and signal (P1 figure 3)."""
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
         pl.col("cn0_dbhz").is_finite(),
@@ -75,7 +75,7 @@ def cn0_over_elevation(
 
 
 def open_sky_chart(mean: Cn0Mean, elevation_deg: Floats, cn0_dbhz: Floats, limits: Cn0Limits) -> Chart:
-    """Samples of one constellation and signal under open sky, with their mean and the thresholds."""
+    """Return the samples of one constellation and signal under open sky, with their mean and the thresholds."""
     counts = np.histogram2d(elevation_deg, cn0_dbhz, bins=[_ELEVATION_EDGES, _CN0_EDGES])[0].astype(np.int64)
     return _cn0_chart(mean.kind, mean.signal, counts, (*_open_sky(mean, limits), *_floor(limits)))
 
@@ -98,7 +98,7 @@ def _cn0_chart(
 
 
 def _cell(column: str, edges: Floats) -> pl.Expr:
-    """Number of the cell of a value between edges of equal distance, the last edge in the last cell."""
+    """Return the number of the cell of a value between edges of equal distance, the last edge in the last cell."""
     width, last = float(edges[1] - edges[0]), float(edges[-1])
     number = ((pl.col(column) - float(edges[0])) / width).floor().cast(pl.Int64)
     return pl.when(pl.col(column) == last).then(len(edges) - 2).otherwise(number)
@@ -121,7 +121,7 @@ def _lines(
 
 
 def _open_sky(mean: Cn0Mean, limits: Cn0Limits | None) -> Iterator[Layer]:
-    """Mean of the open sky, and the threshold below it."""
+    """Yield the mean of the open sky, and the threshold below it."""
     at = np.linspace(0.0, 90.0, 181)
     level = mean.at(at)
     yield Curve(label="mean of the open sky", colour=BLUE, x=at, y=level, width=2.0)
@@ -153,7 +153,7 @@ def sky_epochs(
     epochs: int = SKY_EPOCHS,
     title: str = "Sky",
 ) -> SkyEpochs:
-    """Satellites in view of one antenna, each once with the signal that was used, at some epochs, for sky plots.
+    """Return satellites in view of one antenna, each once with the signal that was used, at some epochs, for sky plots.
 
     At most `epochs` epochs, evenly spaced; of these up to half are the `wanted` ones.
     """

@@ -81,7 +81,7 @@ def track_paths(
 
 
 def _carrier(real: Singles, imaginary: Singles, rate_mps: Floats, anchor: Complexes) -> tuple[Floats, Floats]:
-    """Phase of the sum of the paths [rad], and its rate beyond the main path's [m/s], at constant amplitudes."""
+    """Return phase of the sum of the paths [rad], and its rate beyond the main path's [m/s], at constant amplitudes."""
     carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
     angle = np.arctan2(
         quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag
@@ -97,7 +97,7 @@ def _triangle(x: Singles) -> Singles:
 
 
 def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spacing: float) -> Singles:
-    """Zero of the discriminator, in chips from the main path (which is 1 and `late` by 0)."""
+    """Return the zero of the discriminator, in chips from the main path (which is 1 and `late` by 0)."""
     half = 0.5 * spacing
     error = np.zeros(real.shape[1], dtype=np.float32)
     own = (1.0 - follow) * (real**2 + imaginary**2)
@@ -126,7 +126,7 @@ def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
 
 
 def edge_amplitude(v: Floats) -> Floats:
-    """Amplitude behind a knife edge of Fresnel parameter v, positive in the shadow (P.526-15, 4.1).
+    """Return the amplitude behind a knife edge of Fresnel parameter v, positive in the shadow (P.526-15, 4.1).
 
     ``J(v) = 6.9 + 20 log10(sqrt((v - 0.1)^2 + 1) + v - 0.1)`` dB above v = -0.78, else none.
     """
@@ -136,7 +136,7 @@ def edge_amplitude(v: Floats) -> Floats:
 
 
 def strip_field(v: Floats, width_v: Floats) -> Complexes:
-    """Field that a strip removes (Kirchhoff, Babinet): ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over it."""
+    """Return field that a strip removes (Kirchhoff, Babinet): ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over it."""
     sine_1, cosine_1 = fresnel(v - 0.5 * width_v)
     sine_2, cosine_2 = fresnel(v + 0.5 * width_v)
     return np.asarray(0.5 * (1.0 + 1.0j) * ((cosine_2 - cosine_1) - 1.0j * (sine_2 - sine_1)))
@@ -173,6 +173,6 @@ def reflection_amplitude(cosine: Floats, sine_elevation: Floats, antenna: Antenn
 
 
 def cross_polar_gain(sine_elevation: Floats | float, antenna: AntennaSettings) -> Floats:
-    """Amplitude received of left-handed signals over that of right-handed ones."""
+    """Return the amplitude received of left-handed signals over that of right-handed ones."""
     horizon_db, zenith_db = antenna.cross_polar_horizon_db, antenna.cross_polar_zenith_db
     return np.asarray(10.0 ** (-(horizon_db + sine_elevation * (zenith_db - horizon_db)) / 20.0))

@@ -80,7 +80,7 @@ class Conductor:
         return field
 
     def scatter(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Amplitude, extra path [m], and direction (p, q) of the signal scattered to the antenna from behind.
+        """Return amplitude, extra path [m], and direction (p, q) of the signal scattered to the antenna from behind.
 
         A metal cylinder in geometrical optics: sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and
         bistatic angle b; extra path rho c (1 - cos(phi)), c the part of the ray perpendicular to the conductor and
@@ -98,7 +98,7 @@ class Conductor:
         return amplitude * behind, away * plane * (1.0 - cosine), plane * self.p / away, plane * self.q / away
 
     def _share(self, at_m: Floats, scale: Floats) -> Floats:
-        """Share of the conductor that obstructs: 1 between its ends, 0 beyond."""
+        """Return the share of the conductor that obstructs: 1 between its ends, 0 beyond."""
         inside = np.minimum(at_m - self.low_m, self.high_m - at_m) * scale
         return 1.0 - edge_amplitude(inside)
 
@@ -110,7 +110,7 @@ class Electrification:
         self.settings = settings
 
     def _number(self, chainage_m: Floats, every: int) -> Floats:
-        """Chainage of the nearest of every n-th mast."""
+        """Return the chainage of the nearest of every n-th mast."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
 
@@ -232,11 +232,11 @@ class Environment:
         self._conductors = None if settings.electrification is None else Electrification(settings.electrification)
 
     def label_at(self, chainage_m: ArrayLike) -> Strings:
-        """Kind of section at chainages; "open" outside all sections."""
+        """Return the kind of section at chainages; "open" outside all sections."""
         return self.structures.kind_at(np.asarray(chainage_m, dtype=np.float64))
 
     def __call__(self, geometry: SightGeometry) -> Disturbance:
-        """Disturbance of every channel and epoch, shapes (T, M)."""
+        """Return the disturbance of every channel and epoch, shapes (T, M)."""
         shape = geometry.elevation_deg.shape
         code, phase, doppler, cn0 = np.zeros((4, *shape))
         if self.settings.empty:
@@ -286,7 +286,7 @@ class Environment:
         return np.stack([field.astype(np.complex128) for field in fields]), np.stack(extra_m), np.stack(growth)
 
     def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
-        """Reflections by side streets, by both sides one after the other, and by vehicles on parallel tracks."""
+        """Return reflections by side streets, by both sides one after the other, and by vehicles on parallel tracks."""
         settings, antenna = self.settings, self.settings.antenna
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = []
         if (streets := settings.side_streets) is not None:
@@ -328,7 +328,7 @@ class Environment:
         return np.asarray(strength * roughness_loss(rough, rays.z, rays.wavelength_m))
 
     def _reflection(self, r: int, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Amplitude, extra path and growth of the reflection in row r; the incident ray passes the rows of the
+        """Return amplitude, extra path and growth of the reflection in row r; the incident ray passes the rows of the
         satellite's side, the reflected one the nearer rows of the reflecting side.
         """
         image = reflections(self.structures.walls[r], rays)
@@ -359,7 +359,7 @@ class _GainRipple:
         self._phase = dict(zip(ANTENNAS, rng.uniform(0.0, 2.0 * np.pi, (len(ANTENNAS), _HARMONICS)), strict=True))
 
     def at(self, rays: Rays, antenna: str) -> Floats:
-        """Gain over the mean [standard deviations at the horizon], shape (N,)."""
+        """Return the gain over the mean [standard deviations at the horizon], shape (N,)."""
         azimuth = np.arctan2(rays.y, rays.x)
         level = np.sqrt(np.maximum(1.0 - rays.z**2, 0.0))
         order = np.arange(1, _HARMONICS + 1)[:, None]

@@ -71,7 +71,7 @@ TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, los
 def draw_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
-    """Sections with exactly the given shares of a line, which add up to 1, in random order from 0 to its end.
+    """Return sections with exactly the given shares of a line, which add up to 1, in random order from 0 to its end.
 
     `section_length_m` is the approximate range of their lengths; a small share gives one shorter section.
     """
@@ -112,7 +112,7 @@ class Strips:
     value: dict[str, Floats]  #: Properties, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
-        """Index of the nearest structure on a side (0 left, 1 right); both sides always hold at least one."""
+        """Return index of the nearest structure on a side (0 left, 1 right); both sides always hold at least one."""
         low = np.clip(chainage_m, -0.25 * self.reach_m, 0.5 * self.reach_m)
         return np.searchsorted(self.border_m, side * self.reach_m + low, side="right") - 1
 
@@ -128,12 +128,12 @@ class Structures:
     kinds: Strings  #: Kind before the first border, between, and after the last; shape (2 S + 1,).
 
     def kind_at(self, chainage_m: Floats) -> Strings:
-        """Kind of section at chainages."""
+        """Return the kind of section at chainages."""
         return self.kinds[np.searchsorted(self.borders_m, chainage_m, side="right")]
 
 
 def build_structures(sections: Sequence[SectionSettings], line_length_m: float, seed: int) -> Structures:
-    """Walls and roofs of given sections, which rise; the same seed gives the same structures."""
+    """Return the walls and roofs of given sections, which rise; the same seed gives the same structures."""
     ends = np.array([section.to_m for section in sections])
     reach = 4.0 * (max(line_length_m, ends.max(initial=0.0)) + 2.0 * BEYOND_M)
     walls: dict[int, list[list[list[float]]]] = {}
@@ -190,7 +190,7 @@ def tree_rows(settings: Sequence[TreeSettings], line_length_m: float, seed: int)
 def _spans(
     length_m: Between, gap_m: Between, low: float, high: float, rng: np.random.Generator
 ) -> list[tuple[float, float]]:
-    """Plots between two chainages, one after the other."""
+    """Return plots between two chainages, one after the other."""
     spans = []
     at = low + rng.uniform(0.0, 1.0) * gap_m[1]
     while at < high:
@@ -211,7 +211,7 @@ def _row(row: RowSettings, low: float, high: float, rng: np.random.Generator) ->
 
 
 def _strips(sides: list[list[list[float]]], names: tuple[str, ...], reach: float) -> Strips:
-    """Arrays of both sides; an empty side gets a structure without extent far behind the line."""
+    """Return the arrays of both sides; an empty side gets a structure without extent far behind the line."""
     absent = [-0.3 * reach, -0.3 * reach, *([1.0] * (len(names) - 1)), 0.0]
     tables = [np.array([absent, *side]) for side in sides]
     borders = []

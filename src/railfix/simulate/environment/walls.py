@@ -38,12 +38,12 @@ class Rays:
     wavelength_m: Floats  #: Shape (N,).
 
     def take(self, rows: Indices) -> Rays:
-        """Rays of some rows."""
+        """Return the rays of some rows."""
         return take_rows(self, rows)
 
 
 def _slants(across: Floats, z: Floats) -> tuple[Floats, Floats]:
-    """Sines of the angles at which rays pass a level edge and a vertical one, by their component across both."""
+    """Return sines of the angles at which rays pass a level edge and a vertical one, by their component across both."""
     size = np.abs(across)
     return size / np.sqrt(across**2 + z**2), size / np.sqrt(np.maximum(1.0 - z**2, 1e-9))
 
@@ -59,7 +59,7 @@ def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Fl
 
 
 def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
-    """Fresnel parameter of a ray at a wall with level top and vertical ends, positive inside its outline."""
+    """Return Fresnel parameter of a ray at a wall with level top and vertical ends, positive inside its outline."""
     scale = per_metre(far_m, rays.wavelength_m)
     rise, level = _slants(across, rays.z)
     top = (row.value["height_m"][wall] - rays.height_m - z) * rise
@@ -68,7 +68,7 @@ def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m
 
 
 def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | float = 0.0) -> Floats:
-    """Fresnel parameter of the walls of a row that obstruct the satellites from `x0`, `y0`, shape (N,)."""
+    """Return Fresnel parameter of the walls of a row that obstruct the satellites from `x0`, `y0`, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     begin = np.where(rays.y > 0.0, 1.0, -1.0) * y0
@@ -130,7 +130,7 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
 
 
 def roof_amplitude(row: Strips, rays: Rays) -> Floats:
-    """Amplitude left by the level roofs of a row, shape (N,)."""
+    """Return the amplitude left by the level roofs of a row, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     least = np.maximum(rays.z, 0.02)
     # Roofs of one row are at one height nearly always: the one overhead gives the first guess.
@@ -206,7 +206,7 @@ class SideStreets:
 
 
 def side_streets(settings: SideStreetSettings, *, first_m: float, last_m: float, seed: int, side: int) -> SideStreets:
-    """Side streets of one side between two chainages, drawn from the settings."""
+    """Return the side streets of one side between two chainages, drawn from the settings."""
     rng = np.random.default_rng([seed, 7104, side])
     rows, at = [], first_m + rng.uniform() * settings.spacing_m[1]
     while at < last_m:
@@ -289,7 +289,7 @@ _SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of the lateral component of
 
 
 def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
-    """Fresnel parameter of the vehicles on a parallel track, positive where in the way, shape (N,)."""
+    """Return Fresnel parameter of the vehicles on a parallel track, positive where in the way, shape (N,)."""
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     far = settings.lateral_m / lateral
     spacing = settings.spacing_m
@@ -307,14 +307,14 @@ def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats)
 
 
 def neighbour_reflection(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> tuple[Floats, Floats, Floats]:
-    """Amplitude, extra path [m] and growth [m/m] of reflections by the sides of vehicles on a parallel track."""
+    """Return amplitude, extra path [m] and growth [m/m] of reflections by the sides of vehicles on a parallel track."""
     v = neighbour_clearance(settings, replace(rays, y=-rays.y), time_s)
     amplitude = settings.reflection * np.where(rays.y * _SIDE[settings.side] < 0.0, edge_amplitude(-v), 0.0)
     return amplitude, 2.0 * settings.lateral_m * np.abs(rays.y), np.zeros(len(rays.x))
 
 
 def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Floats:
-    """Amplitude left of the direct signal by equipment on the vehicle's own roof, shape (N,)."""
+    """Return the amplitude left of the direct signal by equipment on the vehicle's own roof, shape (N,)."""
     amplitude = np.ones(len(rays.x))
     for part in equipment:
         along = np.maximum(np.abs(rays.x), _LEAST_LATERAL)

@@ -87,14 +87,14 @@ def _matrix(size: int, unknowns: int, parts: Sequence[tuple[Indices, Floats]]) -
 
 
 def _point(first: Indices, factor: Floats) -> list[tuple[Indices, Floats]]:
-    """Parts of the coordinates in columns from `first` on by a matrix, shape (n, size, 3)."""
+    """Return the parts of the coordinates in columns from `first` on by a matrix, shape (n, size, 3)."""
     return [(first + axis, factor[:, :, axis]) for axis in range(3)]
 
 
 def position_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> Equations:
-    """Positions: the row's coordinates and the offset of the run."""
+    """Return positions: the row's coordinates and the offset of the run."""
     rows = np.flatnonzero(np.isfinite(run.ecef_m).all(axis=1))
     white = axes[None] / run.sigma_m[rows][:, :, None]
     value = np.einsum("nij,nj->ni", white, run.ecef_m[rows] - origin)
@@ -146,7 +146,7 @@ def change_equations(
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:
-    """Median of the group of each value: without it what is left of a clock is small."""
+    """Return the median of the group of each value: without it what is left of a clock is small."""
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
     middle = np.minimum((first[:-1] + first[1:]) // 2, len(value) - 1)
@@ -156,7 +156,7 @@ def _group_medians(value: Floats, group: Indices) -> Floats:
 def motion_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, limits: SurveyLimits, unknowns: int
 ) -> Equations:  # fmt: skip
-    """Evenness of the motion: the velocity changes little between neighbouring steps."""
+    """Return the evenness of the motion: the velocity changes little between neighbouring steps."""
     dt = np.diff(run.seconds)
     rows = np.arange(1, len(run) - 1)
     mean = 0.5 * (dt[:-1] + dt[1:])
@@ -174,7 +174,7 @@ def motion_equations(
 
 
 def offset_equations(run: SurveyRun, columns: RunColumns, axes: Floats, unknowns: int) -> Equations:
-    """Offset of a run: zero within the errors that its positions share."""
+    """Return the offset of a run: zero within the errors that its positions share."""
     plan, height = run.common_sigma_m
     white = (axes / np.array([plan, plan, height])[:, None])[None]
     parts = _point(np.array([columns.offset]), white)
@@ -203,7 +203,7 @@ def tie_equations(
 
 
 def bend_equations(line: ReferenceLine, start: int, unknowns: int) -> Equations:
-    """Evenness of the line: it bends as the reference line does."""
+    """Return the evenness of the line: it bends as the reference line does."""
     count = len(line)
     middle = np.arange(count) if line.closed else np.arange(1, count - 1)
     neighbours = line.across[(middle - 1) % count], line.across[(middle + 1) % count]

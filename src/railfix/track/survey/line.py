@@ -106,7 +106,7 @@ def adjust(
 
 
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
-    """Share of each row in an independent position, by the time and the way since the row before, shape (n,)."""
+    """Return share of each row in an independent position, by the time and the way since the row before, shape (n,)."""
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
     by_time = since / np.maximum(2.0 * limits.correlation_s, 1e-9)
@@ -187,7 +187,7 @@ def _line_sigmas(
 
 
 def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
-    """Mean weight of each row, shape (n,)."""
+    """Return the mean weight of each row, shape (n,)."""
     rows = np.flatnonzero(np.isfinite(run.ecef_m).all(axis=1)) if run.signals is None else run.signals.row
     count = np.bincount(rows, minlength=len(run))
     return np.asarray(np.bincount(rows, weights=weight, minlength=len(run)) / np.maximum(count, 1))
@@ -273,7 +273,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
 
 
 def _interpolate_positions(run: SurveyRun) -> Floats:
-    """Positions with those that lack interpolated in time, shape (n, 3) [m]."""
+    """Return positions with those that lack interpolated in time, shape (n, 3) [m]."""
     known = np.isfinite(run.ecef_m[:, 0])
     return np.stack([np.interp(run.seconds, run.seconds[known], run.ecef_m[known, i]) for i in range(3)], axis=1)
 
@@ -286,7 +286,7 @@ def _reference_line(course: Course, origin: Floats, axes: Floats) -> ReferenceLi
 
 
 def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
-    """How often each run passes the place of each of its rows, shape (n,) each."""
+    """Return how often each run passes the place of each of its rows, shape (n,) each."""
     found = []
     for r, run in enumerate(runs):
         mine = ties.run == r
@@ -298,7 +298,7 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Points of an open line without those at its ends that do not lead on: noise of runs that stand there."""
+    """Return points of an open line without those at its ends that do not lead on: noise of runs that stand there."""
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:
@@ -311,7 +311,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Points that lead on from the last by half a spacing or more: where runs stand, noise makes others."""
+    """Return points that lead on from the last by half a spacing or more: where runs stand, noise makes others."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]
@@ -352,7 +352,7 @@ def _notes(
     beside: float,
     apart: float,
 ) -> tuple[str, ...]:
-    """Sentences on the runs and the line of them."""
+    """Return sentences on the runs and the line of them."""
     against = sum(len(each.place) for each in passes if each.sign < 0) / max(sum(len(e.place) for e in passes), 1)
     driven = sum(float(leg.arc_m[-1]) for leg in legs)
     length = float(np.linalg.norm(np.diff(ecef_m, axis=0), axis=1).sum())
