@@ -83,7 +83,7 @@ def test_a_roll_back_counts_whatever_the_clock_of_the_report(
     assert found.trains[1].rear_m == 2495.0
     released, reason = release_train(found, 1, TWO)
     assert reason is None
-    assert after(released, *back[1:]).trains[1].stop is None  # its clock counts anew
+    assert after(released, *back[1:]).trains[1].stop is None  # its clock counts again
     take_out(monkeypatch, "place covered")
     assert after(state, ahead, back[0]).trains[1].rear_m == 2795.0
 

@@ -333,7 +333,7 @@ print(prepare_kernels(), *kernels.missing())
 
 
 def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None:
-    """numba looks at the file of the function alone; here a change of what it calls compiles anew."""
+    """numba looks at the file of the function alone; here a change of what it calls compiles again."""
     room = Path(kernels.__file__).parent
     recursion, stamp = "tracking.recursion", import_module("railfix.kernels.compiling").stamp
     advance = import_module(f"railfix.kernels.{recursion}").advance

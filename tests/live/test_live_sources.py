@@ -303,7 +303,7 @@ def shifted(observations: Observations, by: np.timedelta64) -> Observations:
 
 
 def test_a_receiver_restarted_with_older_tags(tmp_path: Path) -> None:
-    """In a stream of bytes: the engine hears of the older tags, and begins anew after three of them."""
+    """In a stream of bytes: the engine hears of the older tags, and restarts after three of them."""
     observations = railfix.read_observations(demo_files()["front"])[:30]
     early = shifted(observations[20:30], -np.timedelta64(3600, "s"))
     path = tmp_path / "log.ubx"

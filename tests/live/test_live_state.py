@@ -112,7 +112,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
     for name, (content, words, track, says) in cases.items():
         path.write_bytes(content)
         rows, numbers, told = live(parts["rest"], tmp_path, name, "--state", str(path), *words, track=track)
-        assert f"not used, because it {says}; positioning begins anew" in told, name
+        assert f"not used, because it {says}; positioning restarts" in told, name
         assert numbers[0] == 1
         if not words:
             assert np.array_equal(rows["chainage_m"].to_numpy(), fresh["chainage_m"].to_numpy(), equal_nan=True), name

@@ -193,7 +193,7 @@ def test_what_no_bin_knows_is_nan() -> None:
             "something else",
             "is not an error model: format = 'railfix error model 2' was expected",
         ),
-        ("railfix error model 2", "railfix error model 1", "of format 'railfix error model 1', .* make it anew"),
+        ("railfix error model 2", "railfix error model 1", "of format 'railfix error model 1', .* make it again"),
         ('covers = "local"', 'covers = "all"', "entry covers: Input should be 'local' or"),
         ("sectors = 4", "sectors = 3", "entry before.count: 75 values were expected, one a bin, got 100"),
         ("sectors = 4", "sectors = 0", "entry bins.sectors: Input should be greater"),

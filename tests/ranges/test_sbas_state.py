@@ -128,7 +128,7 @@ def test_a_fast_correction_is_not_used_after_twenty_minutes_however_often_type_6
 
 
 def test_notes_count_what_a_whole_log_leaves_out_and_do_not_change_with_every_message() -> None:
-    """What is counted within the messages kept so far would be told anew as they come and go."""
+    """What is counted within the messages kept so far would be told again as they come and go."""
     log = cases.message_log(
         [(1.0, 0, cases.mask(0, [1])), (2.0, 0, cases.integrity(0, [3])), (9.0, 0, cases.integrity(0, [3]))]
     )

@@ -229,7 +229,7 @@ def test_two_workers_of_a_cluster_give_the_same_data_set(folder: Path, tmp_path:
 
 @pytest.mark.slow
 def test_a_killed_campaign_is_continued(folder: Path, tmp_path: Path) -> None:
-    """At fifty random instants; a campaign that was complete is begun anew."""
+    """At fifty random instants; a campaign that was complete is restarted."""
     out = tmp_path / "out"
     words = [sys.executable, "-m", "railfix", "campaign", str(folder / "campaign.toml"), "--out", str(out)]
 

@@ -263,7 +263,7 @@ def slip_line(found: Carried) -> str:
     }
     counts["on track"] = int(np.count_nonzero(found.jumps.jump))
     text = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
-    return f"    phases at {100 * has.sum() / max(used.sum(), 1):.0f} % of the codes; begun anew: {text}"
+    return f"    phases at {100 * has.sum() / max(used.sum(), 1):.0f} % of the codes; restarted: {text}"
 
 
 @dataclass(frozen=True)

@@ -377,7 +377,7 @@ def test_nothing_learnt_outlives_a_reset() -> None:
 
 @pytest.mark.requirement("C6")
 def test_an_improbable_place_hides_no_other() -> None:
-    """Places near a hypothesis are not begun anew, unless it has drifted off them and is as good as excluded."""
+    """Places near a hypothesis are not restarted, unless it has drifted off them and is as good as excluded."""
     case = ride(40, noise=0.5)
     _, state = track(case.epochs.take(slice(0, 30)), case.line)
     for name in ("mean", "covariance", "log_code", "log_least", "log_recent"):

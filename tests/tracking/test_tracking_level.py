@@ -307,7 +307,7 @@ def test_a_satellite_behind_a_bridge_keeps_its_sub_filter_and_one_long_gone_has_
     assert state.bank is not None
     assert str(case.epochs.satellite[2]) in state.bank.without
     assert str(case.epochs.satellite[5]) not in state.bank.without
-    # A sub-filter that had begun anew would ask for K1 times what codes of one epoch tell.
+    # A sub-filter that had restarted would ask for K1 times what codes of one epoch tell.
     assert result.level_m[45:50].max() < 1.5 * result.level_m[35:40].max()
 
 
@@ -387,7 +387,7 @@ def test_cutting_changes_no_level() -> None:
 
 @pytest.mark.requirement("C2")
 def test_cutting_after_a_switch_changes_no_level(recordings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the deep city another place takes over after some seconds, and all sub-filters begin anew."""
+    """In the deep city another place takes over after some seconds, and all sub-filters restart."""
     given = []
 
     def kept(epochs: GnssEpochs, line: Line, state: TrackState | None, **settings: Any) -> tuple[Tracked, TrackState]:

@@ -152,7 +152,7 @@ def benchmark(
 
     `positions` are those of other programs (RTKLIB, NMEA, CSV), moved to the nearest point of the line and judged by
     the same code, as RTKLIB's single point is where `rnx2rtkp` is installed. `scenario` describes the recording as
-    EN 16803-2 asks of record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`.
+    EN 16803-2 requires of record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`.
     A case with `held_out` is for the benchmark alone: settings made from its files are refused.
 
     Into DIR come `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that is

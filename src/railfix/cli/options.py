@@ -42,7 +42,7 @@ LenientOption = Annotated[
 
 
 def overwriting(asked: bool) -> Overwrite:
-    """Return what `OverwriteOption` asks for."""
+    """Return what `OverwriteOption` requests."""
     return "replace" if asked else "refuse"
 
 

@@ -44,7 +44,7 @@ class RunFolder(RunRecord):
     """Results of a run, with one of its tables of positions."""
 
     positions_path: Path  #: The Parquet file of the table, or its CSV file where that is absent.
-    #: One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` tells whether
+    #: One row per epoch and antenna, see `railfix.pipeline.result_columns.POSITION_COLUMNS`; ``observed`` is whether
     #: the antenna has observations.
     positions: pl.DataFrame
     table: str = POSITIONS_TABLE  #: Name of the table: "positions" for the single-epoch positions.

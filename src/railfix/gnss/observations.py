@@ -206,7 +206,7 @@ def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
     """Return which channels have an observation of any kind (T, M) or a loss-of-lock digit, shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
-        used |= ~np.isnan(array[:1]).all(axis=0)  # the first epoch tells it of nearly all
+        used |= ~np.isnan(array[:1]).all(axis=0)  # the first epoch shows it of nearly all
         rest = np.flatnonzero(~used)
         used[rest] = ~np.isnan(array[:, rest]).all(axis=0)
     rest = np.flatnonzero(~used)

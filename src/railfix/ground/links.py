@@ -44,7 +44,7 @@ class LinkLimits(Settings):
     good_s: float = Field(default=30.0, ge=0)  #: Time since the fall-back before the normal link is taken again.
     window: int = Field(default=60, ge=1)  #: Frames of the response rate.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a place of the coverage map.
-    #: A connection without any packet for this time, at most 10 s, is made anew: so the trains of a centre that was
+    #: A connection without any packet for this time, at most 10 s, is made again: so the trains of a centre that was
     #: killed come back.
     idle_s: float = Field(default=5.0, gt=0, le=10)
 

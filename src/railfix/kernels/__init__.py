@@ -61,5 +61,5 @@ def missing() -> list[str]:
 
 
 def suppress_announcement() -> None:
-    """Leave the line that tells of compilation away: the caller has told it."""
+    """Leave out the line on compilation: the caller has printed it."""
     import_module("railfix.kernels.compiling").ANNOUNCEMENT.said = True

@@ -106,7 +106,7 @@ _IS_SUITED: Final = _SUITED[0] <= tuple(int(part) for part in numba.__version__.
 def keep_resolutions() -> Generator[None]:
     """Keep what numba finds for an operator or a function of its own and types of arguments.
 
-    It would ask all implementations anew at each use: a fifth of the time that compiling takes.
+    It would ask all implementations again at each use: a fifth of the time that compiling takes.
     """
     if not _IS_SUITED:
         yield
@@ -145,7 +145,7 @@ def kernel(function: Function) -> Function:
 
     With ``NUMBA_DISABLE_JIT=1`` it stays plain Python. Divisions by zero give infinities and NaN as numpy's do. The
     code is kept beside the source, or in the user's cache folder where that cannot be written, or in
-    ``NUMBA_CACHE_DIR``. It is compiled anew when a file changes that it imports functions from, or the constants:
+    ``NUMBA_CACHE_DIR``. It is compiled again when a file changes that it imports functions from, or the constants:
     numba itself looks at the function's own file alone.
 
     Raises

@@ -116,7 +116,7 @@ def solve_level(
     part_m, k : ndarray, shape (T, kinds)
         The largest ``offset + k sigma`` of a kind; 0 where its hypotheses fit into its share unchecked, then k is -inf.
     worst : ndarray of int, shape (T, kinds)
-        The hypothesis that asks for it, counted within its kind; -1: none.
+        The hypothesis that requires it, counted within its kind; -1: none.
     """
     (epochs, width), kinds = weight.shape, len(bounds) - 1
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)

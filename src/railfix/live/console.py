@@ -148,7 +148,7 @@ class SessionLog:
             self._screen.send(Text(status, no_wrap=True, overflow="ellipsis"))
 
     def close(self) -> None:
-        """Write what is left; lines that the file lacks are told on the screen."""
+        """Write what is left; lines that the file lacks are printed."""
         for handler in self._handlers:
             self._logger.removeHandler(handler)
         self._logger.propagate = True

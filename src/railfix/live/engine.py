@@ -104,7 +104,7 @@ class LiveEngine:
         "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
         "skipped, behind the receivers", "dropped, too many waiting", "tachometer silent" and the like (not heard up to
         the epoch in time).
-    told : deque of str
+    reported : deque of str
         Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
         restarts, what became of a saved state.
     """
@@ -114,7 +114,7 @@ class LiveEngine:
         self.processor = processor
         self.settings = settings
         self.counts: Counter[str] = Counter()
-        self.told: deque[str] = deque(processor.notes, maxlen=100)
+        self.reported: deque[str] = deque(processor.notes, maxlen=100)
         self._notes = processor.received.notes
         self._order, self._ordered_at_m = processor.antenna_order(), float("-inf")
         self._antennas = tuple(processor.trajectories)
@@ -194,7 +194,7 @@ class LiveEngine:
     def resume(self, saved: EngineState) -> None:
         """Continue from a saved state, if the first epoch comes within `LiveSettings.state_age_s` of its last one.
 
-        Otherwise its navigation records, SBAS messages and sequence number alone are used; `told` says which.
+        Otherwise its navigation records, SBAS messages and sequence number alone are used; `reported` says which.
         """
         self._sequence = max(self._sequence, saved.sequence)
         self._saved = saved if saved.done_ns else None
@@ -212,8 +212,8 @@ class LiveEngine:
         if not self._in_order(antenna, waiting.tag_ns):
             return
         skips = self.lag.skips(waiting.tag_ns, now_ns)
-        self.told += self.lag.told
-        self.lag.told.clear()
+        self.reported += self.lag.reported
+        self.lag.reported.clear()
         if skips:
             self.counts["skipped, behind the receivers"] += 1
             return
@@ -230,12 +230,12 @@ class LiveEngine:
         if 0.0 < age_s <= self.settings.state_age_s:
             self._state, self._done_ns, self._last_tag = saved.state, saved.done_ns, dict(saved.last_tag)
             self._samples = self._samples.between(GPS_EPOCH + np.timedelta64(saved.done_ns, "ns"), FOREVER)
-            self.told.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
+            self.reported.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
         else:
             self._state = State(received=saved.state.received)
             side = "before" if age_s > 0.0 else "after"
             allowed = f"up to {self.settings.state_age_s:g} s before it (state_age_s) are allowed"
-            self.told.append(
+            self.reported.append(
                 f"state file: not used but for ephemerides and the sequence number: its last epoch is "
                 f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
             )
@@ -244,7 +244,7 @@ class LiveEngine:
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Whether an epoch is new; a receiver that was restarted with older tags begins anew."""
+        """Whether an epoch is new; a receiver that comes back with older tags restarts."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -268,10 +268,10 @@ class LiveEngine:
         return True
 
     def _restart(self) -> None:
-        """Begin anew after a receiver's restart: only what was received from satellites is kept."""
+        """Restart after a receiver's restart: only what was received from satellites is kept."""
         self.counts["restart"] += 1
         self.lag.reset()
-        self.told.append("a receiver came back with older time tags: positioning begins anew")
+        self.reported.append("a receiver came back with older time tags: positioning restarts")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
         self._samples = SensorSamples()
@@ -403,8 +403,8 @@ class LiveEngine:
     def _tell_changes(self, notes: tuple[str, ...]) -> None:
         """Tell what is used in place of what was asked for since the received data changed, and what no longer is."""
         if notes is not self._notes:
-            self.told.extend(note for note in notes if note not in self._notes)
-            self.told.extend(f"no longer so: {note}" for note in self._notes if note not in notes)
+            self.reported.extend(note for note in notes if note not in self._notes)
+            self.reported.extend(f"no longer so: {note}" for note in self._notes if note not in notes)
             self._notes = notes
 
     def _check_order(self, result: Result) -> None:
@@ -420,5 +420,5 @@ class LiveEngine:
             (front.time, front.chainage_m, front.along_sigma_m), (rear.time, rear.chainage_m, rear.along_sigma_m)
         )
         if new and (note := self._order.note) is not None:
-            self.told.append(note)
+            self.reported.append(note)
             self._order = None

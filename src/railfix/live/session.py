@@ -272,8 +272,8 @@ class _Session:
                 sink.send(output)
             if self.hooks.observe is not None:
                 self.hooks.observe(output)
-        while self.engine.told:
-            _LOG.warning("%s", self.engine.told.popleft())
+        while self.engine.reported:
+            _LOG.warning("%s", self.engine.reported.popleft())
         return outputs
 
     def in_idle_time(self, outputs: Sequence[LiveOutput]) -> None:

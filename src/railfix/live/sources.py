@@ -46,7 +46,7 @@ _HEADER_BYTES = 65_536
 
 @dataclass(frozen=True)
 class Connected:
-    """A connection was opened; `broken` tells how many times it had been lost before."""
+    """A connection was opened; `broken` is how many times it had been lost before."""
 
     broken: int
 
@@ -198,7 +198,7 @@ async def _tcp(
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
     """Yield a mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
 
-    With `LiveSettings.gga_s` it is told where the train is: in the request where that is known (NTRIP 2), and as lines
+    With `LiveSettings.gga_s` it gets the train's position: in the request where that is known (NTRIP 2), and as lines
     from then on, for the virtual station that it makes there.
     """
     parts = urlsplit(source)

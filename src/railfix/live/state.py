@@ -100,7 +100,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        return Loaded(session=None, outcome=f"state file {path}: there is none yet, positioning begins anew")
+        return Loaded(session=None, outcome=f"state file {path}: there is none yet, positioning restarts")
     except OSError as error:
         return _refuse(path, f"cannot be read ({error.strerror})")
     line, _, content = data.partition(b"\n")
@@ -130,7 +130,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
 
 
 def _refuse(path: Path, why: str) -> Loaded:
-    return Loaded(session=None, outcome=f"state file {path}: not used, because it {why}; positioning begins anew")
+    return Loaded(session=None, outcome=f"state file {path}: not used, because it {why}; positioning restarts")
 
 
 class _Plain(pickle.Unpickler):

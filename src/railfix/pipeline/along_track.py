@@ -175,11 +175,11 @@ def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tra
     """Return places with a status of doubt at some epochs; nothing bounds their error there."""
     if not doubtful.any():
         return tracked
-    told = np.where(doubtful, np.int8(status), tracked.status)
+    reported = np.where(doubtful, np.int8(status), tracked.status)
     unbounded = doubtful & ~np.isnan(tracked.level_m)
     names = ("level_m", "ground_level_m", "amount_m")
     levels = {name: np.where(unbounded, np.inf, getattr(tracked, name)) for name in names}
-    return copy_with(tracked, status=told, **levels)
+    return copy_with(tracked, status=reported, **levels)
 
 
 def _run_filter(

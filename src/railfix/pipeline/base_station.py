@@ -65,7 +65,7 @@ class BaseStation:
     Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase where
     available, which reduces the station's own noise. The station's own multipath remains. With "stream" the position is
     that of the headers of its observations; a station that moves by more than a centimetre (the next virtual one)
-    begins anew.
+    restarts.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:

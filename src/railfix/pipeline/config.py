@@ -94,7 +94,7 @@ else:
         "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
     )
 
-#: Time off the map after which the filter gives up its place, or on it begins anew. On the recordings, with a right
+#: Time off the map after which the filter gives up its place, or on it restarts. On the recordings, with a right
 #: map, no two positions in a row are off it.
 OFF_MAP_S: Final = 10.0
 

@@ -129,10 +129,10 @@ def off_map_epochs(
     off, known, since = state.off, state.known, state.since
     result = np.full(len(time), off)
     judged = (on_map | off_map).nonzero()[0]
-    told = off_map[judged]
-    edges = [0, *((told[1:] != told[:-1]).nonzero()[0] + 1).tolist(), len(judged)]
+    states = off_map[judged]
+    edges = [0, *((states[1:] != states[:-1]).nonzero()[0] + 1).tolist(), len(judged)]
     for first, end in pairwise(edges) if len(judged) else ():
-        run, says = judged[first:end], bool(told[first])
+        run, says = judged[first:end], bool(states[first])
         if known and says == off:
             since = _NEVER
             continue
@@ -207,7 +207,7 @@ def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[Gn
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds."""
+    """Place by the filter at its last epoch: what the place by the wheel restarts from every few seconds."""
 
     time: np.datetime64
     #: NaN where the filter has not decided on a place.

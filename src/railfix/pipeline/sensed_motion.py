@@ -54,7 +54,7 @@ class LineFeatures:
     #: shape (V,).
     antenna_m: Floats
     body_m: Floats
-    line: Line  #: Tells whether it is closed.
+    line: Line  #: Shows whether it is closed.
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
@@ -144,7 +144,7 @@ def feature_fixes(
     """Return verdicts on the features that were passed, and the state to pass on.
 
     A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only ways without a slip and faster than
-    1 m/s count: heading and pitch are integrals, and a break begins them anew. `facing`: 1 where the front points to
+    1 m/s count: heading and pitch are integrals, and a break restarts them. `facing`: 1 where the front points to
     rising arc length, else -1; `sigma_m`: of the place by the wheel; `noise`: standard deviations of gradient and
     curvature in one metre.
     """
@@ -339,7 +339,7 @@ def sensed_motion(
     """Return the motion between instants, the rates of the body (None without a sample), and the state to pass on.
 
     Pulses with a direction and inertial samples are from `REACH` before the first of the T + 1 `edges` on. `sine_at`
-    gives the sine of the gradient in rising arc length at arc lengths; the trajectory of the antenna tells which way
+    gives the sine of the gradient in rising arc length at arc lengths; the trajectory of the antenna shows which way
     the front points, and where the body is.
     """
     facing = trajectory.front_sign

@@ -143,7 +143,7 @@ def sensor_epochs(
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
     """Return ways and forces between the epochs, the motion that wheel and inertia agree on, and the state to keep.
 
-    Samples are those since the chunk before, epochs those of the antenna, shape (T,); the trajectory tells which way
+    Samples are those since the chunk before, epochs those of the antenna, shape (T,); the trajectory shows which way
     the front points, `sine_at` the sine of the gradient at arc lengths (the line is unknown without). `sources` names
     which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted, `surroundings` has features of the
     line, ground units and listed balises.

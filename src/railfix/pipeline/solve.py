@@ -239,7 +239,7 @@ def with_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, config: C
     return replace(raim, protection_level_m=np.where(raim.faulty, np.nan, level))
 
 
-#: Below this share of its own error in its residual a range tells nothing of it.
+#: Below this share of its own error in its residual a range shows nothing of it.
 _LEAST_REDUNDANCY: Final = 0.1
 #: Degrees of freedom that are left, so that the rest is still checked.
 _LEAST_FREEDOM: Final = 2

@@ -8,7 +8,7 @@ where I is the error of the modelled ionosphere on the first frequency, and B th
 receiver. The error is a field, alike for neighbouring satellites: an offset and two gradients with the sigma of the
 model as the prior, and a rest of each satellite's own. They and B follow from the means of all satellites by best
 linear prediction. The two codes, less the ionosphere predicted so far, then measure one range: least squares in closed
-form, in which only what the means have not told yet sets the codes apart.
+form, in which only what the means do not show yet sets the codes apart.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def combine_codes(
     prior = of_field + own_m2
     p1, p2 = code_m - ionosphere, second.code_m - bias - second.ratio * ionosphere - delay * rest
     noise = np.minimum(scale, 1.0)[:, None]
-    # what the means have told is in both codes alike
+    # what the means show is in both codes alike
     untold = of_mean / (error + of_bias + lever**2 * of_field)
     share, total = share_of_second(
         scale[:, None] * first, scale[:, None] * other + untold * (delay + of_bias), second.ratio, untold * prior

@@ -228,7 +228,7 @@ def _level_of_filter(track: Mapping[str, Any]) -> str:
     level, noise, apart = (track[f"protection_{name}_m"] for name in ("level", "noise", "separation"))
     if noise is None:
         return "none"
-    parts = f"noise alone asks for {noise:.1f} m"
+    parts = f"noise alone requires {noise:.1f} m"
     if apart is not None:
         parts += f", the sub-filters without one source each lie up to {apart:.1f} m away"
     if level is None or not np.isfinite(level):

@@ -274,7 +274,7 @@ def _notes_of_sensors(
     return (*checks.notes(sensors, units, trajectory, config.sensors), *checks.radar_alarms(sensors.radar))
 
 
-#: What a note asks where positions are off the map and no cause was found.
+#: Question of a note where positions are off the map and no cause was found.
 _TRACK: Final = "is this the right track?"
 #: Satellites left out by the filter that notes name.
 _NAMED: Final = 3

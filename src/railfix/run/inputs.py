@@ -299,7 +299,7 @@ class TrackReading(Settings):
         return {"epoch": self.map_epoch, "plate": self.plate, "parameters": self.jgd_parameters}
 
     cache: Literal["use", "skip"] = option(
-        "Prepare the line anew: neither read nor write the cache folder.", "use", name="--no-cache"
+        "Prepare the line again: neither read nor write the cache folder.", "use", name="--no-cache"
     )
 
 

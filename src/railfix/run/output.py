@@ -1,7 +1,7 @@
 """Outputs of all commands: written under temporary names, moved in place when complete, never over an input.
 
 Staging folders are hidden, and held by a lock. A process that is killed leaves its staging folder behind; the
-operating system releases the lock at the same moment, which tells a leftover from the folder of a living run.
+operating system releases the lock at the same moment, which distinguishes a leftover from the folder of a living run.
 """
 
 from __future__ import annotations

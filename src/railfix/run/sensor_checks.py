@@ -35,7 +35,7 @@ _LEAST_RATE_RADPS: Final = 0.003
 #: A slope of measured over expected values below this is a reversed sign, above that a rate in degrees.
 _REVERSED: Final = -0.3
 _IN_DEGREES: Final = 10.0
-#: Lags that are tried, and the least that is told [s]; what is left unexplained at no lag is more by this factor.
+#: Lags that are tried, and the least that is reported [s]; what is left unexplained at no lag is more by this factor.
 _LONGEST_LAG_S: Final = 20.0
 _LEAST_LAG_S: Final = 2.0
 _LESS_ALIKE: Final = 2.0
@@ -204,7 +204,7 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
 _STEP_NS: Final = 500_000_000
 #: Speeds by satellites are known this near to an instant [s].
 _NEAR_S: Final = 1.5
-#: Scale and lag that are told.
+#: Scale and lag that are reported.
 _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
 #: No worn wheel differs by so much.
@@ -216,7 +216,7 @@ _MOVED_M: Final = 1.0
 _FAR_M: Final = 500.0
 _AHEAD: Final = 0.7
 _LEAST_RANGES: Final = 10
-#: Difference between ranges and satellites that is told: twice what codes are off by for minutes [m].
+#: Difference between ranges and satellites that is reported: twice what codes are off by for minutes [m].
 _RANGE_M: Final = 3.0
 
 

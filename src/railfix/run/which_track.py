@@ -1,7 +1,7 @@
 """Logs of a train at rest to the probability of each track of a network.
 
 A train that was on a known track when it was switched off, and has not moved since, is still there: a
-cold-movement detector or the odometer tells how far it has moved, and misses a move with a probability.
+cold-movement detector or the odometer shows how far it has moved, and misses a move with a probability.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from railfix.tracking.state import CLOCKS
 
 #: Sensors by the kind of their rows.
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
-#: How long a fault common to a constellation lasts until users are told [s] (ARAIM milestone 3 report: an hour).
+#: How long a fault common to a constellation lasts until users are alerted [s] (ARAIM milestone 3 report: an hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
 #: Sources whose probabilities add up to less than this share of the risk need no sub-filter, if there are so many.
 SPARED: Final = 0.1
@@ -65,7 +65,7 @@ class Budget:
     prior : tuple of float
         Probability that a source of each `SourceKind` is faulty or still remembered; 0 needs no sub-filter.
     k_fault : tuple of float
-        Sigmas that noise exceeds on one side with the risk over that probability: what a sub-filter asks for at least.
+        Sigmas that noise exceeds on one side with the risk over that probability: the least that a sub-filter requires.
     k_speed : float
     k_speed_fault : tuple of float
         The same of the bound on the speed, which has `SPEED_SHARE` of the risk on top, in equal parts for all sources.

@@ -35,7 +35,7 @@ class Chunk:
     interval_s : ndarray, shape (T,) [s]
         AccumulatedIncrement the epoch before; 1 for the first.
     apart : ndarray of bool, shape (T,)
-        Epochs so long after the one before that they begin anew.
+        Epochs so long after the one before that they restart.
     satellite : ndarray of str, shape (K,)
     slot : ndarray of int, shape (K,)
         Place of the channel's error among those of the state; -1 for one that is never measured.

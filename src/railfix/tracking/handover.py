@@ -184,14 +184,14 @@ class Handover:
         return mean, variance
 
     def update_epoch(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
-        """Return the update of an epoch, None where nothing was used, and the unknowns that have begun anew."""
+        """Return the update of an epoch, None where nothing was used, and the unknowns that have restarted."""
         work, count, both = self.work, state.hypotheses, self.both
         cut = np.zeros(state.mean.shape, dtype=np.bool_)
         if self.memory.scalars[layout.MEASURED] != self.recursion.epochs.time_s[epoch]:
             return None, cut
-        cut[:, [StateIndex.PHASE_CLOCK, StateIndex.DRIFT]] = work.anew[:count, :2]
+        cut[:, [StateIndex.PHASE_CLOCK, StateIndex.DRIFT]] = work.restarted[:count, :2]
         if self.rows.counts[0]:
-            cut[:, OFFSETS + self.recursion.chunk.offset[self.rows.codes[0]]] = work.anew[:count, 2]
+            cut[:, OFFSETS + self.recursion.chunk.offset[self.rows.codes[0]]] = work.restarted[:count, 2]
         size = int(self.rows.counts[0] + layout.COMBINED + self.rows.counts[3])
         _, prior = _scatter(both, work.mean[:count], work.spread[:count], *self._idle(state, 0.0))
         combine = np.zeros((count, size, state.mean.shape[1]))
@@ -295,7 +295,7 @@ def _work_space(
         "bend": (2,), "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
     }  # fmt: skip
     work = layout.Work(
-        **{name: np.zeros(shape) for name, shape in shapes.items()}, anew=np.zeros((room, 3), dtype=np.bool_),
+        **{name: np.zeros(shape) for name, shape in shapes.items()}, restarted=np.zeros((room, 3), dtype=np.bool_),
         source=np.zeros(sources, dtype=np.bool_), met=np.zeros(sources, dtype=np.bool_),
         ranked=np.empty(room, dtype=np.intp), kept=np.empty(room, dtype=np.intp),
         unknown=np.zeros((room, size, 6), dtype=np.intp),

@@ -98,7 +98,9 @@ def thin_epochs(
     left = copy_with(
         since, start=start, number=int(before[-1]),
         epochs=len(total[rest]) if len(taken) else since.epochs + len(epochs),
-        unbroken=_names(epochs, np.asarray(goes_on[rest].all(axis=0)), anew=len(taken) > 0 and not len(total[rest])),
+        unbroken=_names(
+            epochs, np.asarray(goes_on[rest].all(axis=0)), restarted=len(taken) > 0 and not len(total[rest])
+        ),
         total=total[rest].sum(axis=0), variance=square[rest].sum(axis=0), balises=left_balises,
     )  # fmt: skip
     if not len(taken):
@@ -149,8 +151,8 @@ def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
     return np.array([name in since.unbroken for name in epochs.satellite.tolist()], dtype=np.bool_)
 
 
-def _names(epochs: GnssEpochs, unbroken: Masks, *, anew: bool) -> frozenset[str] | None:
-    return None if anew else frozenset(epochs.satellite[unbroken].tolist())
+def _names(epochs: GnssEpochs, unbroken: Masks, *, restarted: bool) -> frozenset[str] | None:
+    return None if restarted else frozenset(epochs.satellite[unbroken].tolist())
 
 
 def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats) -> SensorEpochs:
@@ -271,15 +273,15 @@ def carried_levels(
     bounded = is_bounded(tracked.status)
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + SCALE_BOUND * np.abs(speed) * tau)
-    told = _status(tracked.status, status, level)
+    reported = _status(tracked.status, status, level)
     # In doubt the sub-filter furthest off may be the one that is right; else one that the standard deviation does not
     # explain.
-    doubt = (told == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
-    explained = np.where(is_bounded(told), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
+    doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
+    explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
     tracked = copy_with(
-        tracked, status=told, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=level,
+        tracked, status=reported, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=level,
         ground_level_m=widened(ground, straight), level_noise_m=np.where(known, noise, np.nan),
         level_speed_mps=np.where(known, of_speed, np.nan), separation_m=np.where(known, separation, np.nan),
         amount_m=np.where(known, amount, np.nan),

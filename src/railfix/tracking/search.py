@@ -116,7 +116,7 @@ def begin(
     line : Line
     limits : TrackingLimits
     known : tuple of ndarray, shapes (N,) and (N, N), optional
-        Mean and covariance of a lost track: what it knew of the sensors is kept, clocks and satellites begin anew.
+        Mean and covariance of a lost track: what it knew of the sensors is kept, clocks and satellites restart.
     """
     width = SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))

@@ -57,7 +57,7 @@ class Step:
     ----------
     dt : float [s]
     cut : ndarray of bool, shape (H, N)
-        Unknowns that have begun anew at this epoch.
+        Unknowns that have restarted at this epoch.
     satellite : ndarray of str, shape (N - SATELLITES,)
     mean, covariance : ndarray, shapes (H, N), (H, N, N)
         After the epoch.

@@ -57,7 +57,7 @@ OFFSETS: Final = len(StateIndex)
 SATELLITES: Final = OFFSETS + len(CLOCKS)
 #: Bounds of the speed where nothing is known of it [m/s].
 ANY_SPEED: Final = (-np.inf, np.inf)
-#: Unknowns that begin anew at every epoch: clock of the codes, displacements of the map.
+#: Unknowns that restart at every epoch: clock of the codes, displacements of the map.
 FRESH: Final = slice(StateIndex.CODE_CLOCK, StateIndex.MAP_LENGTH_ERROR + 1)
 
 
@@ -200,7 +200,7 @@ class TrackState:
         )
 
     def reset(self) -> None:
-        """Begin anew: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
+        """Restart: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.log_probability = self.log_code = self.log_least = self.log_recent = self.origin_m = np.empty(0)

@@ -106,7 +106,7 @@ class InterferenceLimits(Settings):
     #: Standard deviation of the wheel's circumference, before positions determine it; and of its change after (creep).
     wheel_scale: float = Field(default=0.01, gt=0)
     wheel_change: float = Field(default=0.001, gt=0)
-    #: A wheel that changes its speed faster has slipped: the comparison begins anew. Adhesion gives 1 to 1.5.
+    #: A wheel that changes its speed faster has slipped: the comparison restarts. Adhesion gives 1 to 1.5.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
     #: How long a suspicion stays after its last sign: a jump is over in one epoch, what it began is not.
     jamming_release_s: float = Field(default=10.0, ge=0)

@@ -137,7 +137,7 @@ def along_track_level(
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
     """
     if model.interest != 1:
-        raise ValueError("a level along the track asks for a model on the line (constrained_model)")
+        raise ValueError("a level along the track needs a model on the line (constrained_model)")
     risk, overbound, map_error = risk or RiskBudget(), overbound or RangeBounds(), map_error or MapDeviation()
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:

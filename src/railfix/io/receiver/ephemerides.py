@@ -51,7 +51,7 @@ _FRAME_S: Final = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """What the subframes left: `latest`, what tells the last record (`issued`), GLONASS satellites `waiting`."""
+    """What the subframes left: `latest`, what identifies the last record (`issued`), GLONASS satellites `waiting`."""
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -300,7 +300,7 @@ class _EphemerisBuilder:
             return None
         # All of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1 may have come
         # before the receiver's first epoch, so that its time of reception is not known; where epochs are lost or rare,
-        # the first one after all strings tells that no later frame can have begun.
+        # the first one after all strings shows that no later frame can have begun.
         began = frame_time(parts[0], time)
         if within is None:
             received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")

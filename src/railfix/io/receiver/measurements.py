@@ -176,7 +176,7 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-Record = tuple[RawRecord, tuple[float, ...]]  #: A record, and what tells it from the satellite's next one.
+Record = tuple[RawRecord, tuple[float, ...]]  #: A record, and what distinguishes it from the satellite's next one.
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356

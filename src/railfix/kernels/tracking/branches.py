@@ -108,7 +108,7 @@ def leading(state: KernelState, count: int) -> int:
 def keep_hypotheses(state: KernelState, parameters: Parameters, work: Work, count: int) -> int:
     """Order the hypotheses, join twins, drop the improbable; return how many are left, `work.kept` by their old rows.
 
-    Improbable ones are dropped once the first has travelled far enough for motion to have told them apart.
+    Improbable ones are dropped once the first has travelled far enough for motion to have distinguished them.
     """
     mean, covariance, log_probability = state.mean, state.covariance, state.log_probability
     origin, ranked, kept, joined = state.origin_m, work.ranked, work.kept, work.joined

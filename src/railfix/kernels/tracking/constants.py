@@ -103,7 +103,7 @@ FREED_SIGMAS: Final = 3.0
 #: Fewer codes of an epoch do not tell a shift from clocks.
 MISFIT_CODES: Final = 4
 #: A single epoch counts with at most so many standard deviations; beyond `STEP_SIGMAS` it is a step of all codes and
-#: tells nothing of the map.
+#: shows nothing of the map.
 MISFIT_CLIPPED: Final = 3.0
 MISFIT_MOST: Final = 20.0
 #: Time constant of learning [s], and the largest logarithm: beyond 1.6 m in the square root of a metre nothing changes.
@@ -117,7 +117,7 @@ SPEED_SIGMAS: Final = 4.0
 # Branches.
 #: How much more probable another place must be to be gone by: near-equal ones would take turns.
 SWITCH: Final = 3.0
-#: Among laps within so many `map_branch_m` of each other, which nothing tells apart for good, the filter goes by the
+#: Among laps within so many `map_branch_m` of each other, which nothing distinguishes for good, the filter goes by the
 #: one that codes have preferred lately: a mean of so many seconds, of odds whose logarithm is no larger than this.
 ALIKE: Final = 1.5
 RECENT_S: Final = 30.0
@@ -184,7 +184,7 @@ JOINED: Final = 0.05
 #: Newton's steps for the level end when one is smaller than this [m].
 PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
-#: A pair of satellites that asks for less than this share of the risk has it taken off, in place of a term of its own.
+#: A pair of satellites that requires less than this share of the risk has it taken off, in place of a term of its own.
 PAIR_SHARE: Final = 1e-3
 #: Less than this share of what is known of the place, without both of a pair, is nothing.
 PAIR_LEFT: Final = 1e-3

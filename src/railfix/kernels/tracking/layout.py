@@ -36,7 +36,7 @@ WHOLE, PREDICTION, REST, REST_LOST = 0, 1, 2, 3
 class Epochs(NamedTuple):
     """T prepared epochs of K channels (`railfix.tracking.chunk.Chunk`) and sensors.
 
-    `begins` marks epochs before which the state begins anew; `singer` is the row of `step` and `noise` of each
+    `begins` marks epochs before which the state restarts; `singer` is the row of `step` and `noise` of each
     interval; columns of `sensor` and `sensor_sigma`: wheel, radar, force, place, two of balises, and R ranges to ground
     units by a unit at `lever_m` along the line, to the right and up; NaN without a measurement. Those from the place on
     were measured `sensor_age_s` before, shape (T, 3 + R).
@@ -242,7 +242,7 @@ class Work(NamedTuple):
     code_evidence: Floats
     branch: Floats
     beyond: Floats
-    anew: Masks
+    restarted: Masks
     ranked: Indices
     kept: Indices
     joined: Floats

@@ -2,7 +2,7 @@
 
 The innovation of a code over its standard deviation has a mean near 0 over a minute, reflections included: they come
 and go. A clock record that is wrong, or a reflection that lasts, keeps its sign. The mean of the innovations, each
-clipped to a standard deviation, so that single large ones count little, tells one from the other: such a satellite's
+clipped to a standard deviation, so that single large ones count little, distinguishes them: such a satellite's
 codes are left out (`is_faulty`).
 """
 

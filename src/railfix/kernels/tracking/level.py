@@ -149,7 +149,7 @@ def _update(inputs: Inputs, t: int, rows: Rows, best: int, work: Work, h: int) -
     epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
     mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
     for kind in range(3):
-        if work.anew[best, kind]:
+        if work.restarted[best, kind]:
             unknown = n + PHASE_CLOCK if kind == 0 else DRIFT
             if kind == 2:
                 unknown = active.offset[epochs.offset[rows.codes[0]]]
@@ -190,8 +190,8 @@ def advance_subfilters(
     """Do an epoch of all sub-filters; `best` has the equations, `h` is free.
 
     Each has equations of its own about its place: where the line bends between the two, those of the filter are none
-    of it. One that its own measurements contradict has settled somewhere else and begins anew. The filter itself is
-    one without a source that it has not met. Where all begin anew, so does one with all satellites in view, until it
+    of it. One that its own measurements contradict has settled somewhere else and restarts. The filter itself is
+    one without a source that it has not met. Where all restart, so does one with all satellites in view, until it
     has become the filter: pairs are compared with it.
     """
     epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
@@ -252,7 +252,7 @@ def advance_subfilters(
             bank.weak_s[b] += dt
         elif nc > 0:
             bank.weak_s[b] = 0.0
-        if not math.isfinite(work.new_mean[h, ARC]):  # it begins anew, and bounds nothing before
+        if not math.isfinite(work.new_mean[h, ARC]):  # it restarts, and bounds nothing before
             bank.weak_s[b] = parameters.lost_motion_s + parameters.level_doubt_s
         for c in range(n):
             bank.mean[b, c] = work.new_mean[h, c]
@@ -386,7 +386,7 @@ def _solve(
 ) -> float:
     """Level at which all hypotheses together have the risk; `which` is the column of distances of branches and pairs.
 
-    Newton's steps of its logarithm within a bracket, from the largest that one hypothesis alone asks for: they must
+    Newton's steps of its logarithm within a bracket, from the largest that one hypothesis alone requires: they must
     not begin where a branch makes it flat.
     """
     place, sigma, level = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC]), start

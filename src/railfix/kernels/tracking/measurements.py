@@ -125,7 +125,7 @@ def _start_code_clocks(epochs: Epochs, active: Active, state: KernelState, rows:
     if not some:
         unknown = active.offset[first]
         work.spread[h, unknown, unknown] = FIRST_OFFSET_M2
-        work.anew[h, 2] = True
+        work.restarted[h, 2] = True
     size = 0
     for i in range(nc):
         if known[epochs.offset[rows.codes[i]]]:
@@ -156,10 +156,10 @@ def _start_code_clocks(epochs: Epochs, active: Active, state: KernelState, rows:
 
 @borrowing
 def start_clocks(epochs: Epochs, active: Active, state: KernelState, rows: Rows, work: Work, h: int) -> None:
-    """Take the median of each kind of innovation into its clock; clocks that have stepped begin anew."""
+    """Take the median of each kind of innovation into its clock; clocks that have stepped restart."""
     mean, spread, value = work.mean, work.spread, work.value
     n = mean.shape[1] - OF_EPOCH
-    work.anew[h, 0] = work.anew[h, 1] = work.anew[h, 2] = False
+    work.restarted[h, 0] = work.restarted[h, 1] = work.restarted[h, 2] = False
     if rows.counts[0] > 0:
         _start_code_clocks(epochs, active, state, rows, work, h)
     begin = rows.counts[0]
@@ -176,5 +176,5 @@ def start_clocks(epochs: Epochs, active: Active, state: KernelState, rows: Rows,
                 for i in range(begin, end):
                     value[h, i] -= away
                 restart(spread, unknown, UNKNOWN_CLOCK**2, h)
-                work.anew[h, kind - 1] = True
+                work.restarted[h, kind - 1] = True
         begin = end

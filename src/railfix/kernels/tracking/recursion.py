@@ -340,7 +340,7 @@ def _advance(
             write_variances(epochs, t, state, rows, work.variance)
             shift = _update(inputs, t, state, rows, work)
         if not possible(parameters, state, rows, work, dt, measured):
-            # What no train can do is not believed: the prediction goes on, made anew as the clocks in it were moved.
+            # What no train can do is not believed: the prediction goes on, made again as the clocks in it were moved.
             measured = False
             scalars[WEAK_MOTION] += dt
             write_rows(outputs, rows, work, t, 0, 0.0)

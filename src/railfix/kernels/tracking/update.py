@@ -317,7 +317,7 @@ def _whiten_motion(rows: Rows, variance: Floats, work: Work, h: int) -> None:
     """Write six rows that say what phases and Dopplers say at their weights, each with a variance of 1.
 
     The factor of their normal matrix, over the standard deviations of the combinations, into `motion`, and behind it
-    the values. Clocks come first: where one begins anew, its variance is in one row alone. A row of what is not
+    the values. Clocks come first: where one restarts, its variance is in one row alone. A row of what is not
     measured is 0.
     """
     root, motion, normal, nc = work.root, work.motion, work.normal, rows.counts[0]

@@ -33,7 +33,7 @@ _COMMON: Final = 3  #: Channels needed for a median to stand for the clock.
 
 
 class SlipReason(IntFlag):
-    """Why the phase of an epoch and channel begins anew. 0 = joined to the epoch before."""
+    """Why the phase of an epoch and channel restarts. 0 = joined to the epoch before."""
 
     JOINED = 0
     NO_PHASE = 1 << 0  #: No phase at this epoch: nothing begins.
@@ -116,7 +116,7 @@ def find_slips(
     """Return the cycle slips of every channel of a chunk.
 
     A channel's phase starts a new arc after an epoch without it.
-    With fewer than three channels a clock step cannot be told from a slip, and counts as a slip.
+    With fewer than three channels a clock step cannot be distinguished from a slip, and counts as a slip.
 
     Parameters
     ----------

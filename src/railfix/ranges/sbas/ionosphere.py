@@ -160,7 +160,7 @@ def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indi
     # Runs of one span have one number; that a span has two where it comes twice does no harm.
     key = np.cumsum(np.r_[False, span[1:] != span[:-1]])[: len(span)].astype(np.int64)
     pairs = (point[:, ::2] + 1) * (points + 1) + point[:, 1::2] + 1
-    # Numbered anew half-way, so that the keys stay small however long the log is.
+    # Numbered again half-way, so that the keys stay small however long the log is.
     _, key = np.unique(key * (points + 1) ** 2 + pairs[:, 0], return_inverse=True)
     _, first, which = np.unique(key * (points + 1) ** 2 + pairs[:, 1], return_index=True, return_inverse=True)
     return first, which

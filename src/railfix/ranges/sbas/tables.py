@@ -32,7 +32,7 @@ ALARM: Final = 3  #: IODF of an alarm.
 _SPAN: Final = np.int64(2**43)
 _MS: Final = np.int64(1_000_000)
 _OLDEST_MS: Final = np.int64(1000.0 * OLDEST_S)
-_NO_SERIES: Final = 2**19  #: Series of the placeholder row of an empty table, which no search asks for.
+_NO_SERIES: Final = 2**19  #: Series of the placeholder row of an empty table, which no search looks for.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +224,7 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """A row after one that was not monitored, or the first of its satellite, begins anew."""
+    """A row after one that was not monitored, or the first of its satellite, restarts."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
