@@ -172,11 +172,6 @@ class LiveEngine:
         else:
             self._from_satellites.append(item)
 
-    @property
-    def uses_sbas(self) -> bool:
-        """Whether the settings ask for the SBAS messages of the streams."""
-        return self.processor.config.sbas == "stream"
-
     def start(self, *, now_ns: int) -> None:
         """Start the clock: from here on every period has a message, also before the first epoch."""
         self._due_ns = now_ns if self._due_ns is None else self._due_ns

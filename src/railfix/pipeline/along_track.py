@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, copy_with
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, copy_with, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -233,7 +233,7 @@ def _run_filter(
         state = copy_with(state, track=after, level=level, sensors=kept, fixed=fixed)
         parts.append(tracked)
         motions.append(sensed)
-    return _join(parts), SensedMotion.concatenate(motions), tuple(replays), state
+    return join_rows(parts), join_rows(motions), tuple(replays), state
 
 
 def _gate(
@@ -297,13 +297,6 @@ def _find_fix(tracked: Tracked) -> FilterFix:
     arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
     sigma = float(tracked.sigma_m[-1])
     return FilterFix(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
-
-
-def _join(parts: list[Tracked]) -> Tracked:
-    """Return the places of one stretch after the other."""
-    if len(parts) == 1:
-        return parts[0]
-    return Tracked(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Tracked)})
 
 
 def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:

@@ -8,13 +8,13 @@ other, also where it backs.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import field, replace
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, dataclass, join_rows
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises
@@ -166,19 +166,13 @@ def find_passings(
     rows = np.flatnonzero(np.isfinite(tracked.arc_m))
     values = np.stack([getattr(tracked, name)[rows] for name in _VALUES], axis=1)
     time, values = np.concatenate([state.time, tracked.time[rows]]), np.concatenate([state.values, values])
+    readings = join_rows([state.waiting, readings])
     if not len(time):
-        return (), replace(state, waiting=_join_readings(state.waiting, readings))
-    state, wrong = _judge(
-        _join_readings(state.waiting, readings), listed, arcs, trajectory.turn_m, time, values, state, limits
-    )
+        return (), replace(state, waiting=readings)
+    state, wrong = _judge(readings, listed, arcs, trajectory.turn_m, time, values, state, limits)
     passed, state = _pass(listed, arcs, trajectory.turn_m, time, values, state)
     found = sorted([*wrong, *passed], key=lambda passing: passing.time)
     return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=state.right[-1:])
-
-
-def _join_readings(before: BaliseReadings, after: BaliseReadings) -> BaliseReadings:
-    names = [f.name for f in fields(BaliseReadings)]
-    return BaliseReadings(**{n: np.concatenate([getattr(before, n), getattr(after, n)]) for n in names})
 
 
 def _judge(
@@ -219,8 +213,7 @@ def _judge(
             here = "" if np.isnan(real).all() else str(listed.name[np.nanargmin(real)])
             chainage = float(listed.chainage_m[mark])
             wrong.append(replace(own, verdict=CONTRADICTS, chainage_m=chainage, read_error_m=error, here=here))
-    waiting = BaliseReadings(**{f.name: getattr(readings, f.name)[~heard] for f in fields(BaliseReadings)})
-    return replace(state, read=read, waiting=waiting, right=tuple(right)), wrong
+    return replace(state, read=read, waiting=readings.take(~heard), right=tuple(right)), wrong
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Masks, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Masks, dataclass, join_rows
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
@@ -179,16 +179,9 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
             found, later = smooth_steps(trace, before or TrackState.empty(), later, limits)
             arc = found.arc_m + line.round_m(found.arc_m)
             parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
-    parts.reverse()
-    empty = {"time": np.empty(0, dtype="datetime64[ns]")}
-    return SmoothedTrack(
-        **{
-            f.name: np.concatenate([getattr(part, f.name) for part in parts])
-            if parts
-            else empty.get(f.name, np.empty(0))
-            for f in fields(SmoothedTrack)
-        }
-    )
+    nothing = np.empty(0)
+    empty = SmoothedTrack(time=nothing.astype("M8[ns]"), arc_m=nothing, sigma_m=nothing, speed_mps=nothing)
+    return join_rows([*reversed(parts), empty])
 
 
 def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:

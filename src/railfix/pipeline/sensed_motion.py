@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import field, fields, replace
+from collections.abc import Callable
+from dataclasses import field, replace
 from typing import Final
 
 import numpy as np
@@ -290,13 +290,6 @@ class SensedMotion:
     curvature_1pm: Floats
     cant_m: Floats
     under_m: Floats
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
-        """Return parts one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container
-from dataclasses import field, fields, replace
+from dataclasses import field, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -308,5 +308,4 @@ def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
 
 def _latest(samples: Samples, first: int) -> Samples:
     """Return samples from an index on."""
-    start = max(int(first), 0)
-    return type(samples)(**{f.name: getattr(samples, f.name)[start:] for f in fields(samples)})
+    return samples.take(slice(max(int(first), 0), None))

@@ -53,17 +53,7 @@ def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def positions_table(result: Result) -> pl.DataFrame:
-    """Return one row an epoch and antenna, in order of time, then of the antennas as given.
-
-    Parameters
-    ----------
-    result : Result
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `POSITION_COLUMNS`.
-    """
+    """Return one row an epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
@@ -89,17 +79,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 
 def observations_table(result: Result) -> pl.DataFrame:
-    """Return one row an epoch, antenna and channel that was observed, in order of time, antenna, satellite.
-
-    Parameters
-    ----------
-    result : Result
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `OBSERVATION_COLUMNS`.
-    """
+    """Return `OBSERVATION_COLUMNS`: a row an epoch, antenna and channel that was observed, in the order of these."""
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
@@ -341,14 +321,7 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
 def train_table(result: Result) -> pl.DataFrame:
     """Return the positions of the filter along the track, one row per epoch and antenna in order of time.
 
-    Parameters
-    ----------
-    result : Result
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
+    Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
     """
     parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
     return in_time_order(parts) if parts else pl.DataFrame()

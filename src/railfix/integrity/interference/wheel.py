@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, dataclass, join_rows
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
@@ -24,7 +24,7 @@ _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
 @dataclass(frozen=True, kw_only=True)
-class WheelSamples:
+class WheelSamples(RowArrays):
     """Positions and distances once a second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
@@ -35,16 +35,6 @@ class WheelSamples:
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))  #: What it may have rolled at speeds too slow for it.
     #: The same where the wheel has turned without slip or a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-    def join(self, later: WheelSamples) -> WheelSamples:
-        """Return these and later ones."""
-        return WheelSamples(
-            **{name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in vars(self)}
-        )
-
-    def take(self, rows: Masks | Integers) -> WheelSamples:
-        """Return some of them."""
-        return WheelSamples(**{name: values[rows] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +95,7 @@ def wheel_signs(
     usable = due & np.isfinite(arc_m) & (sigma_m <= limits.largest_sigma_m)
     every = replace(rolled, arc_m=arc_m, sigma_m=np.hypot(sigma_m, _LEAST_M))
     before = len(state.samples.time)
-    samples = state.samples.join(every.take(usable))
+    samples = join_rows([state.samples, every.take(usable)])
     difference, bound, beyond = _compare(samples, before, limits, signed=signed)
     latest = np.cumsum(usable)
     of_epoch = np.concatenate([[state.difference_m], difference])[latest]
