@@ -134,7 +134,7 @@ class PassingState:
     read: Datetimes  #: Last reading, shape (M,).
     #: Not yet compared, as the epoch after them is to come.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Readings that were right, the last before the chunk first, with the place of the filter [m].
+    #: Readings that were right, the last one `_APART_S` before the chunk's end first, with the filter's place [m].
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -173,7 +173,9 @@ def find_passings(
     )
     passed, state = _pass(listed, arcs, trajectory.turn_m, time, values, state)
     found = sorted([*wrong, *passed], key=lambda passing: passing.time)
-    return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=state.right[-1:])
+    earlier = [k for k, (at, _) in enumerate(state.right) if seconds(time[-1] - at) > _APART_S]
+    right = state.right[earlier[-1] if earlier else 0 :]
+    return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=right)
 
 
 def _join_readings(before: BaliseReadings, after: BaliseReadings) -> BaliseReadings:

@@ -182,7 +182,7 @@ def feature_fixes(
         behind = body - sense * HALF_LENGTH_M
         passed = float(behind[-1])
         known = done if done == done else float(behind[0])
-        for feature in line.features:
+        for feature in line.features[:: int(sense)]:
             if not 0.0 < sense * (feature.arc_m - known) <= sense * (passed - known):
                 continue
             tick = begin + 1 + int(np.argmax(sense * (behind - feature.arc_m) >= 0.0))
