@@ -83,7 +83,7 @@ def balise_epochs(
 #: Verdicts on a place or a reading.
 VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
-#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the way since the last balise read.
+#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the distance since the last balise read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
 #: Epochs further apart have nothing between them [s]; a reading may be so far outside of the interval of its passing.
 _APART_S: Final = 2.0
