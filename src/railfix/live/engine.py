@@ -33,7 +33,7 @@ from railfix.ranges.sbas import SbasMessages
 END_NS: Final = 1 << 62
 #: Epochs of one antenna that may wait; more than that means the other antenna's clock is elsewhere.
 _LONGEST_QUEUE = 100
-#: Way after which the order of the antennas is looked at again [m].
+#: Distance after which the order of the antennas is looked at again [m].
 _ORDER_STEP_M = 10.0
 
 

@@ -131,7 +131,7 @@ def _against_wheel(
 ) -> tuple[WheelSigns, WheelState]:
     """Compare positions with the distance that the wheel has rolled."""
     parts = [(replay.epochs.time, replay.sensors.wheel_m) for replay in replays]
-    rolled = np.concatenate([np.full(len(time), np.nan) if way is None else way for time, way in parts])
+    rolled = np.concatenate([np.full(len(time), np.nan) if distance is None else distance for time, distance in parts])
     return wheel_signs(
         np.concatenate([time for time, _ in parts]), arc_m, sigma_m, rolled, state, config.interference,
         signed=all(replay.sensors.wheel_sign == "measured" for replay in replays if replay.sensors.wheel_m is not None),
@@ -246,12 +246,12 @@ def _gate(
     config: Config,
 ) -> tuple[GnssEpochs, ReturnState]:
     """Return epochs without the codes that an outage makes doubtful."""
-    way = np.full(len(epochs), np.nan)
+    distance = np.full(len(epochs), np.nan)
     for other in (sensors.radar_m, sensors.wheel_m):
         if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
-            way = np.where(np.isfinite(other), other, way)
+            distance = np.where(np.isfinite(other), other, distance)
     observed = np.asarray(np.isfinite(epochs.code_m).any(axis=1))
-    refused, gate = gated_codes(epochs.time, observed, way, place_m, sigma_m, state.gate, line, config.sensors)
+    refused, gate = gated_codes(epochs.time, observed, distance, place_m, sigma_m, state.gate, line, config.sensors)
     return (
         replace(epochs, code_m=np.where(refused[:, None], np.nan, epochs.code_m)) if refused.any() else epochs
     ), gate
@@ -288,7 +288,7 @@ def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
     if sensors.motion.tick:
         motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
         sensors = replace(sensors, motion=motion)
-    gate = replace(state.gate, place_m=fixed.arc_m, sigma_m=fixed.sigma_m, way_m=0.0)
+    gate = replace(state.gate, place_m=fixed.arc_m, sigma_m=fixed.sigma_m, distance_m=0.0)
     return replace(state, sensors=sensors, anchor=fixed, gate=gate)
 
 

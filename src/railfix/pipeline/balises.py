@@ -83,7 +83,7 @@ def balise_epochs(
 #: Verdicts on a place or a reading.
 VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
-#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the way since the last balise read.
+#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the distance since the last balise read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
 #: Epochs further apart have nothing between them [s]; a reading may be so far outside of the interval of its passing.
 _APART_S: Final = 2.0
@@ -134,7 +134,7 @@ class PassingState:
     read: Datetimes  #: Last reading, shape (M,).
     #: Not yet compared, as the epoch after them is to come.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Readings that were right, the last before the chunk first, with the place of the filter [m].
+    #: Readings that were right, the last one `_APART_S` before the chunk's end first, with the filter's place [m].
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -172,7 +172,9 @@ def find_passings(
     state, wrong = _judge(readings, listed, arcs, trajectory.turn_m, time, values, state, limits)
     passed, state = _pass(listed, arcs, trajectory.turn_m, time, values, state)
     found = sorted([*wrong, *passed], key=lambda passing: passing.time)
-    return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=state.right[-1:])
+    earlier = [k for k, (at, _) in enumerate(state.right) if seconds(time[-1] - at) > _APART_S]
+    right = state.right[earlier[-1] if earlier else 0 :]
+    return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=right)
 
 
 def _judge(

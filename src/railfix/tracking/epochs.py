@@ -147,9 +147,9 @@ class SensorEpochs:
     wheel_m, wheel_sigma_m : ndarray or None [m]
         Way since the epoch before by the wheel, + toward rising chainage.
     wheel_sign : {"measured", "unknown"}
-        "unknown": the way has no sign and takes that of the speed.
+        "unknown": the distance has no sign and takes that of the speed.
     radar_m, radar_sigma_m : ndarray or None [m]
-        The same by the radar: over a way the swings of the body cancel (P2 3.2).
+        The same by the radar: over a distance the swings of the body cancel (P2 3.2).
     force_mps2, force_sigma_mps2 : ndarray or None [m/s2]
         Mean specific force along rising chainage since the epoch before, gravity on the gradient included.
     place_m, place_sigma_m : ndarray or None [m]

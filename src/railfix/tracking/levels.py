@@ -46,7 +46,7 @@ class AccumulatedIncrement:
     unbroken : frozenset of str or None
         Satellites whose carrier phase went on at all of them; None where there was no epoch.
     total, variance : ndarray, shape (3,)
-        Sums over them of the ways by wheel and radar [m] and of the force [m/s2], and of the variances.
+        Sums over them of the distances by wheel and radar [m] and of the force [m/s2], and of the variances.
     balises : BaliseEpochs or None
         Read since then, as one epoch.
     """

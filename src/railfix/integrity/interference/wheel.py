@@ -31,7 +31,7 @@ class WheelSamples(RowArrays):
     #: By satellites.
     arc_m: Floats = field(default_factory=lambda: np.empty(0))
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    way_m: Floats = field(default_factory=lambda: np.empty(0))  #: Of the wheel since its beginning.
+    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Of the wheel since its beginning.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))  #: What it may have rolled at speeds too slow for it.
     #: The same where the wheel has turned without slip or a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -45,7 +45,7 @@ class WheelState:
     samples: WheelSamples = field(default_factory=WheelSamples)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last epoch.
     #: Of the wheel there; the speed NaN where unknown.
-    way_m: float = 0.0
+    distance_m: float = 0.0
     doubt_m: float = 0.0
     speed_mps: float = float("nan")
 
@@ -126,14 +126,14 @@ def _wheel_distances(
     held_rail = np.abs(speed - last) <= limits.wheel_acceleration_mps2 * span + _SLOW_MPS
     new = np.where(known, ~held_rail & np.isfinite(last), ~slow) | (span > limits.longest_gap_s)
     part = state.part + np.cumsum(new)
-    way = state.way_m + np.cumsum(np.where(known, wheel_m, 0.0))
+    distance = state.distance_m + np.cumsum(np.where(known, wheel_m, 0.0))
     doubt = state.doubt_m + np.cumsum(np.where(slow, _SLOW_MPS * span, 0.0))
     none = np.full(len(time), np.nan)
     after = replace(
-        state, time=time[-1], way_m=float(way[-1]), doubt_m=float(doubt[-1]), part=int(part[-1]),
+        state, time=time[-1], distance_m=float(distance[-1]), doubt_m=float(doubt[-1]), part=int(part[-1]),
         speed_mps=float(np.concatenate([[state.speed_mps], speed])[row[-1]]),
     )  # fmt: skip
-    return WheelSamples(time=time, arc_m=none, sigma_m=none, way_m=way, doubt_m=doubt, part=part), after
+    return WheelSamples(time=time, arc_m=none, sigma_m=none, distance_m=distance, doubt_m=doubt, part=part), after
 
 
 def _compare(
@@ -149,21 +149,21 @@ def _compare(
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
         """Distance by satellites less that of the wheel, the wheel's, and the variance without the second position."""
-        arc, way = samples.arc_m[b] - samples.arc_m[a], samples.way_m[b] - samples.way_m[a]
+        arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
-            arc, way = np.abs(arc), np.abs(way)
+            arc, distance = np.abs(arc), np.abs(distance)
         doubt = samples.doubt_m[b] - samples.doubt_m[a]
-        return arc - way, way, samples.sigma_m[a] ** 2 + doubt**2
+        return arc - distance, distance, samples.sigma_m[a] ** 2 + doubt**2
 
-    difference, way, at_beginning = apart(begun, now)
+    difference, distance, at_beginning = apart(begun, now)
     earlier, rolled, noise = apart(start, begun)
     prior = limits.wheel_scale**-2.0
     weight = rolled**2 / (noise + samples.sigma_m[begun] ** 2)
     ratio = np.where(rolled != 0.0, earlier / np.where(rolled != 0.0, rolled, 1.0), 0.0)
     scale = weight * ratio / (prior + weight)
     variance = 1.0 / (prior + weight) + limits.wheel_change**2
-    left = difference - scale * way
-    by_wheel = at_beginning + way**2 * variance
+    left = difference - scale * distance
+    by_wheel = at_beginning + distance**2 * variance
     sigma = np.sqrt(by_wheel + samples.sigma_m[now] ** 2)
     beyond = long_enough & (np.abs(left) >= limits.wheel_m) & (np.abs(left) >= limits.wheel_sigmas * sigma)
     bound = np.abs(left) + limits.wheel_level_sigmas * np.sqrt(by_wheel)
