@@ -91,8 +91,8 @@ class Tracked:
     #: Of the error along the line; of the straight distance, all branches and a map aside included; without faults and
     #: branches; and the largest separation of a sub-filter. NaN where levels are off; shape (T,).
     separation_m: Floats
-    #: Over- and under-reading amount: the level, and never less than the bound of the scale times the distance since codes
-    #: were used (SUBSET-026 3.6.8); shape (T,).
+    #: Over- and under-reading amount: the level, and never less than the bound of the scale times the distance since
+    #: codes were used (SUBSET-026 3.6.8); shape (T,).
     amount_m: Floats
     used: Integers  #: Measurements of each kind with a weight of more than a half; shape (T, len(Kind)).
     innovation: Floats  #: Before the update, of codes, phases and Dopplers; shape (T, 3, K).
