@@ -13,7 +13,7 @@ from pipeline_cases import clean_trajectories, demo_observations
 from railfix.core.reasons import Status
 from railfix.core.timescale import timedelta
 from railfix.io.rinex import read_navigation
-from railfix.pipeline.along_track import checked
+from railfix.pipeline.along_track import apply_spacing_verdict
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import (
     AlongTrack,
@@ -170,7 +170,7 @@ def test_antennas_that_disagree_are_doubted_for_a_time_however_the_log_is_cut(cu
         if disagree[rows].any():
             spacing = Screened(metric=np.where(disagree, 9.0, 0.5)[rows], reject=disagree[rows])
         result = AlongTrack.create(lambda _: {}, tracked=tracked, spacing_error_m=np.full(last - first, np.nan))
-        found, state = checked(result, spacing, state, 3.0)
+        found, state = apply_spacing_verdict(result, spacing, state, 3.0)
         parts.append(found.tracked)
     status, level = (np.concatenate([getattr(part, name) for part in parts]) for name in ("status", "level_m"))
     assert np.flatnonzero(status == TrackStatus.ANTENNAS_DISAGREE).tolist() == [15, 16, 17, 18]

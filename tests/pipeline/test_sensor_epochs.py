@@ -13,7 +13,7 @@ from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.timescale import timedelta
 from railfix.motion.features import LineSeries, map_features
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
-from railfix.pipeline.along_track import _begun_anew, _fixed, _gated_ranges
+from railfix.pipeline.along_track import _find_fix, _gated_ranges, _restart_state
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import FilterFix, FilterState, ReturnState
 from railfix.pipeline.sensed_motion import FeatureState, LineFeatures, RateSeries, feature_fixes
@@ -220,14 +220,14 @@ def _ridden(
     slides = slid_m * np.diff(np.sign(arc_m - 1000.0)) / 2.0
     when = START + timedelta(0.1 * np.arange(len(steps)))
     rates = RateSeries(
-        time=when, known=when, way_m=np.cumsum(steps + slides), arc_m=arc_m[1:] + 2.0,
+        time=when, known=when, distance_m=np.cumsum(steps + slides), arc_m=arc_m[1:] + 2.0,
         turned_rad=0.5 * (curvature[1:] + curvature[:-1]) * steps, climbed_rad=np.diff(pitch), speed_mps=10.0 * steps,
         rolls=np.ones(len(steps), dtype=bool),
     )  # fmt: skip
     state, found = FeatureState(), []
     for first, last in pairwise([0, *cuts, len(steps)]):
         part = replace(rates, **{f.name: getattr(rates, f.name)[first:last] for f in fields(RateSeries)})
-        part = replace(part, way_m=part.way_m - (rates.way_m[first - 1] if first else 0.0))
+        part = replace(part, distance_m=part.distance_m - (rates.distance_m[first - 1] if first else 0.0))
         fixes, state = feature_fixes(part, line, facing, 6.0, state, noise=(1e-3, 1e-4))
         found += [(fix.tick + first, fix.located.verdict, fix.correction_m) for fix in fixes]
     return found
@@ -285,10 +285,10 @@ def test_ranges_are_held_against_the_place_of_the_unit_on_the_vehicle() -> None:
 def test_what_sensors_carry_begins_from_a_place_that_the_filter_has_decided_on(status: TrackStatus) -> None:
     empty = Tracked.empty(EPOCHS[:2], 0)
     values = {name: np.full(2, value) for name, value in (("arc_m", 7.0), ("sigma_m", 2.0), ("speed_mps", 3.0))}
-    fixed = _fixed(replace(empty, status=np.full(2, status, dtype=np.int8), **values))
+    fixed = _find_fix(replace(empty, status=np.full(2, status, dtype=np.int8), **values))
     decided = status in (TrackStatus.TRACKING, TrackStatus.COASTING)
     assert fixed.arc_at(EPOCHS[2]) == pytest.approx(10.0 if decided else np.nan, nan_ok=True)
     assert (fixed.time, fixed.sigma_m) == (EPOCHS[1], 2.0)
-    again = _begun_anew(replace(FilterState(), gate=ReturnState(place_m=1.0, sigma_m=9.0, way_m=5.0)), fixed)
-    assert (again.anchor, again.gate.sigma_m, again.gate.way_m) == (fixed, 2.0, 0.0)
+    again = _restart_state(replace(FilterState(), gate=ReturnState(place_m=1.0, sigma_m=9.0, distance_m=5.0)), fixed)
+    assert (again.anchor, again.gate.sigma_m, again.gate.distance_m) == (fixed, 2.0, 0.0)
     assert again.gate.place_m == pytest.approx(fixed.arc_m, nan_ok=True)

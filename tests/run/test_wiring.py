@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from railfix.core.arrays import changed
+from railfix.core.arrays import copy_with
 from railfix.core.reasons import Reason, Status
 from railfix.core.tables import Table, listing
 from railfix.evaluate.tables import _ERRORS
@@ -186,7 +186,9 @@ def test_columns_of_what_few_runs_have_are_the_quantities_that_they_name(result:
     second = SimpleNamespace(cn0_dbhz=numbers(len(front.columns)))
     rare: Any = {"araim": araim, "phase": phase, "interference": signs, "combined": combined, "second": second}
     rare_track: Any = {"wheel": SimpleNamespace(difference_m=numbers())}
-    made = replace(result, antennas={"front": changed(front, **rare)}, fusion={"front": changed(track, **rare_track)})
+    made = replace(
+        result, antennas={"front": copy_with(front, **rare)}, fusion={"front": copy_with(track, **rare_track)}
+    )
     expected = {
         "araim_level_m": araim.along.level_m[:, 0], "araim_horizontal_m": araim.horizontal_m,
         "araim_vertical_m": araim.space.level_m[:, 2], "integers_fixed": phase.n_fixed,

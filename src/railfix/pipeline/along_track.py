@@ -211,7 +211,7 @@ def _run_filter(
     for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
         part = epochs if last - first == len(epochs) else epochs.take(slice(first, last))
         if len(part) and state.fixed is not None and _stretch(part.time[0]) != _stretch(state.fixed.time):
-            state = _begun_anew(state, state.fixed)
+            state = _restart_state(state, state.fixed)
         before = state.sensors
         sensors, sensed, kept = sensor_epochs(
             samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
@@ -282,7 +282,7 @@ def _stretch(time: np.datetime64) -> int:
     return int(time.astype(np.int64)) // _STRETCH_NS
 
 
-def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
+def _restart_state(state: FilterState, fixed: FilterFix) -> FilterState:
     """Return the state at the beginning of a stretch: what the sensors carry begins from the place of the filter."""
     sensors = state.sensors
     if sensors.motion.tick:
