@@ -108,6 +108,15 @@ def test_misuse_ends_with_one_sentence_and_its_code(
     assert {path.name for path in tmp_path.iterdir()} == {"line.csv", "far.csv"}, "nothing half-written"
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("check", "--plan-sigma"), ("features", "--plan-sigma"), ("check", "--no-cache"), ("network", "--no-cache")],
+)
+def test_options_without_an_effect_are_not_offered(command: str, option: str, tmp_path: Path) -> None:
+    code, printed = call(command, line(tmp_path), *((option,) if option == "--no-cache" else (option, "2")))
+    assert (code, "No such option" in printed) == (2, True)
+
+
 def test_map_from_positions_says_what_became_of_them(tmp_path: Path, recordings: Path) -> None:
     log = next((recordings / "kinematic").glob("japan_mosaic*")) / "rtklib_rtk_ref_l1_GE.pos"
     code, printed = call("from-positions", log, "--out", tmp_path / "course.csv", "--name", "course")

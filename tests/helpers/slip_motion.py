@@ -37,10 +37,10 @@ class Motion:
         )[0]  # fmt: skip
 
     def way_error_m(self, found: SlipResult, begin_s: float, end_s: float) -> float:
-        """Way found less the true way between two instants."""
+        """Way found less the true distance between two instants."""
         k, m = np.searchsorted(self.time_s, [begin_s, end_s])
         true = np.trapezoid(self.speed[k : m + 1], self.time_s[k : m + 1])
-        return float(found.way_m[m] - found.way_m[k] - true)
+        return float(found.distance_m[m] - found.distance_m[k] - true)
 
 
 def motion(

@@ -23,6 +23,7 @@ from railfix.integrity.protection.araim import (
     araim_levels,
     read_integrity_support,
 )
+from railfix.pipeline import level_stage
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import with_map
 from railfix.pipeline.processor import EpochProcessor, Models
@@ -260,6 +261,40 @@ def test_positions_of_a_run_have_levels_along_the_track_and_in_space_whatever_th
     error = np.abs(found.chainage_m - pipeline_cases.true_chainage("front")[::100])
     assert (error < along)[located].all()
     assert np.median(along[located]) < np.median(space[located])
+
+
+@pytest.mark.requirement("C5")
+def test_a_run_takes_ura_for_integrity_ure_for_accuracy_and_half_of_the_risk_east_and_north(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, given = tmp_path / "ism.toml", list[tuple[AraimGeometry, list[float], list[float]]]()
+    path.write_text(MESSAGE, encoding="utf-8")
+    levels = level_stage.araim_levels
+
+    def seen(geometry: AraimGeometry, phmi: list[float], false_alarm: list[float], budget: AraimBudget) -> AraimLevels:
+        given.append((geometry, phmi, false_alarm))
+        return levels(geometry, phmi, false_alarm, budget)
+
+    monkeypatch.setattr(level_stage, "araim_levels", seen)
+    support = read_integrity_support(path)
+    processor = EpochProcessor(
+        parse_config({"filter": "off", "systems": ("G", "E")}),
+        {"front": pipeline_cases.clean_trajectories()["front"]},
+        navigation=pipeline_cases.clean_navigation(),
+        models=Models(support=support),
+    )
+    found = processor.process({"front": pipeline_cases.clean_observations()["front"][:1]})[0]["front"]
+    used = (found.reason[:, found.columns] == 0).any(axis=0)
+    names = found.satellite[found.columns][used].tolist()
+    stated = support.arrays(names)
+    apart = stated.sigma_ura_m**2 - stated.sigma_ure_m**2
+    assert (apart > 0.1).all()
+    (on_line, *along), (in_air, *space) = given
+    for geometry, count in ((on_line, len(names)), (in_air, len(names))):
+        squares = geometry.sigma_int_m[0, :count] ** 2 - geometry.sigma_acc_m[0, :count] ** 2
+        np.testing.assert_allclose(squares, apart, rtol=1e-9)
+    assert along == [[9.8e-8], [3.9e-6]]
+    np.testing.assert_allclose(space, [[1e-9, 1e-9, 9.8e-8], [4.5e-8, 4.5e-8, 3.9e-6]])
 
 
 @pytest.mark.requirement("C5")

@@ -7,6 +7,7 @@ import sensed_ride
 import signal_attacks
 from railfix.integrity.interference import InterferenceLimits, WheelSigns, WheelState, wheel_signs
 from railfix.simulate.scenario_file import load_recipe
+from railfix.tracking import TrackStatus
 
 pytestmark = pytest.mark.requirement("B8")
 LIMITS = InterferenceLimits()
@@ -93,6 +94,12 @@ def test_the_level_of_the_filter_covers_a_pull_where_asked_for() -> None:
         bounded = np.isfinite(found.tracked.level_m)
         assert bounded[:140].mean() > 0.9
         over[use] = int((np.abs(ride.error_m(found)) > found.tracked.level_m)[bounded].sum())
+        if use == "off":  # in one piece: once the pull is seen nothing bounds the place
+            assert found.wheel is not None
+            seen = found.wheel.parted
+            assert seen[149:].all()
+            assert (found.tracked.status[seen] == TrackStatus.SPOOFING_SUSPECTED).sum() > 20
+            assert not np.isfinite(found.tracked.level_m[seen]).any()
     assert over["on"] == 0
     assert over["off"] > 20
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,18 +14,21 @@ from pipeline_cases import clean_trajectories, demo_observations
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.rinex import read_navigation
-from railfix.io.train_message import MessageStatus
-from railfix.live.engine import LiveEngine, LiveOutput
-from railfix.live.forms import nmea_bytes, tpv_bytes
+from railfix.io.train_message import MessageStatus, Source, SuspectedInterference
+from railfix.live.console import Metrics
+from railfix.live.engine import EngineState, LiveEngine, LiveOutput
+from railfix.live.forms import gga_sentence, nmea_bytes, tpv_bytes
 from railfix.live.message import create_message
+from railfix.live.session import Hooks, _Session
 from railfix.live.settings import LiveSettings
-from railfix.live.stream import single_epochs
-from railfix.motion.samples import SensorSamples, TachometerPulses
+from railfix.live.stream import FOREVER, Sensed, SensorLines, single_epochs
+from railfix.motion.samples import RadarSpeeds, SensorSamples, TachometerPulses
+from railfix.motion.slip import MotionState
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.results import Result
+from railfix.pipeline.results import Result, State
 from railfix.simulate.demonstration import demo_files
-from railfix.tracking import TrackStatus
+from railfix.tracking import Kind, TrackStatus
 
 
 @pytest.mark.requirement("A8")
@@ -147,3 +151,106 @@ def test_nothing_from_before_a_restart_of_the_receiver_is_used() -> None:
     assert not engine._samples
     tags = [o.result.antennas["front"].time[-1] for o in engine.poll(now_ns=10**12) if o.result is not None]
     assert tags == [epochs[2].time[0]]
+
+
+@pytest.mark.requirement("A8", "E5")
+def test_a_sample_goes_to_the_first_epoch_after_it_and_to_none_that_a_restart_has_behind_it() -> None:
+    """A whole table is there from the beginning: each epoch has the samples since the one before."""
+    processor = EpochProcessor(
+        parse_config({"filter": "off"}),
+        {"front": clean_trajectories()["front"]},
+        navigation=read_navigation(demo_files()["nav"]),
+    )
+    process, given = processor.process, []
+
+    def spied(*arguments: Any, sensors: SensorSamples, **options: Any) -> Any:
+        given.append(sensors.radar.speed_mps.tolist())
+        return process(*arguments, sensors=sensors, **options)
+
+    processor.process = spied  # type: ignore[method-assign]
+    epochs = single_epochs(demo_observations()["front"][:8])
+    tags = [int((epoch.time[0] - GPS_EPOCH).astype(np.int64)) for epoch in epochs]
+    time = epochs[0].time[0] + np.arange(20) * np.timedelta64(50, "ms")
+    radar = SensorSamples(radar=RadarSpeeds(time=time, speed_mps=np.arange(20.0)))
+    expected = [[0.0], *([2.0 * k - 1.0, 2.0 * k] for k in range(1, 8))]
+    for first in (0, 4):
+        engine = LiveEngine(processor, LiveSettings(), ("radar",))
+        engine.add_samples(Sensed(sensor="radar", samples=radar, until=FOREVER))
+        if first:
+            engine.resume(EngineState(state=State(), done_ns=tags[first - 1], last_tag={}, sequence=1))
+        given.clear()
+        for epoch, tag in zip(epochs[first:], tags[first:], strict=True):
+            engine.push("front", epoch, now_ns=tag)
+            engine.poll(now_ns=tag)
+        assert given == expected[first:]
+
+
+@pytest.mark.requirement("A8")
+def test_interference_is_the_worst_of_both_antennas_and_satellites_are_the_most(filtered: Result) -> None:
+    for front, rear in ((0, 2), (2, 0), (1, 2)):
+        antennas = {
+            name: replace(
+                filtered.antennas[name],
+                interference=SimpleNamespace(suspicion=np.array([0, 0, found])),
+                n_used=np.array([0, 0, 5 + found]),
+            )
+            for name, found in (("front", front), ("rear", rear))
+        }
+        both = replace(filtered, antennas=antennas)
+        message = create_message(both, LiveSettings())
+        assert message.interference == SuspectedInterference(2)
+        gga = nmea_bytes(LiveOutput(message=message, result=both)).decode().split(",")
+        assert gga[7] == "07"
+    assert create_message(filtered, LiveSettings()).interference == SuspectedInterference(0)
+
+
+@pytest.mark.requirement("A8", "E5")
+def test_a_way_that_inertia_carries_is_of_the_inertial_unit(filtered: Result) -> None:
+    used = np.zeros_like(filtered.fusion["front"].tracked.used)
+    used[-1, Kind.WHEEL] = 1
+    for state, expected in ((MotionState.NORMAL, Source.TACHOMETER), (MotionState.INERTIAL_SLIDE, Source.INERTIAL)):
+        sensed = replace(filtered.fusion["front"].sensed, state=np.full(3, state, dtype=np.int8))
+        message = create_message(with_track(filtered, "front", tracked={"used": used}, sensed=sensed), LiveSettings())
+        assert message.sources == Source.FRONT_RECEIVER | expected
+
+
+@pytest.mark.requirement("A8")
+def test_speeds_of_forms_are_without_a_sign_and_carried_places_are_estimates(filtered: Result) -> None:
+    """10 m/s toward falling chainage are 19.44 knots; quality 6 of NMEA is an estimated position."""
+    one = with_track(filtered, "front", tracked={"speed_mps": np.full(3, -10.0)})
+    message = create_message(one, LiveSettings())
+    assert message.speed_cmps == -1000
+    for status, quality, valid in (
+        (MessageStatus.POSITION, "1", "A"), (MessageStatus.COASTING, "6", "A"), (MessageStatus.DOUBTFUL, "0", "V"),
+    ):  # fmt: skip
+        output = LiveOutput(message=message.replaced(status=status), result=one)
+        gga, rmc, _ = (line.split(",") for line in nmea_bytes(output).decode().splitlines())
+        assert (gga[6], rmc[2], rmc[7]) == (quality, valid, "19.44")
+        assert json.loads(tpv_bytes(output))["speed"] == 10.0
+
+
+@pytest.mark.requirement("A12")
+def test_a_caster_keeps_the_last_valid_place_while_there_is_none(filtered: Result) -> None:
+    one = with_track(filtered, "front")
+    good = LiveOutput(message=create_message(one, LiveSettings()).replaced(status=MessageStatus.POSITION), result=one)
+    bad = LiveOutput(message=good.message.replaced(status=MessageStatus.DOUBTFUL), result=one)
+    polled = [[good], [bad], []]
+    engine: Any = SimpleNamespace(poll=lambda **_: polled.pop(0), settings=LiveSettings(gga_s=10.0), reported=[])
+    session = _Session(engine=engine, sinks=[], metrics=Metrics(), hooks=Hooks())
+    while polled:
+        session.emit(0, None)
+        assert session.place == gga_sentence(good)
+    assert session.place.startswith(b"$GPGGA")
+
+
+@pytest.mark.requirement("A8", "E5")
+def test_a_row_of_a_time_alone_is_heard_and_a_line_cut_by_a_break_is_none() -> None:
+    lines = SensorLines(sensor="tachometer", source="test")
+    sensed = lines.take(b"time_gpst,pulse,direction\n2024-03-05T03:10:01,4,1\n2024-03-05T03:10:04,,\n")
+    assert sensed.until == np.datetime64("2024-03-05T03:10:04")
+    assert sensed.samples.tachometer.pulse.tolist() == [4]
+    assert lines.take(b"2024-03-05T03:10:03,5,1\n").skipped == 1  # nothing was measured until 04
+    lines.take(b"2024-03-05T03:10:05,6,1\n2024-03-05T03:1")
+    lines.after_break()
+    sensed = lines.take(b"2024-03-05T03:10:07,9,1\n")
+    assert (sensed.skipped, sensed.samples.tachometer.pulse.tolist()) == (0, [9])

@@ -93,24 +93,24 @@ def test_ranges_that_are_too_long_are_told_apart_from_a_displaced_device() -> No
 RADIUS_M, CLIMB, SECONDS = 1500.0, 0.01, 320.0
 
 
-def way_m(t: np.ndarray) -> np.ndarray:
+def distance_m(t: np.ndarray) -> np.ndarray:
     return 12.0 * t + 6.0 * 80.0 / (2.0 * np.pi) * (1.0 - np.cos(2.0 * np.pi * t / 80.0))
 
 
 def circle(t: np.ndarray, noise_m: float = 0.0) -> pl.DataFrame:
     """Places at these seconds, with a white error along the line."""
-    way = way_m(t) + noise_m * np.random.default_rng(1).standard_normal(len(t))
-    return pl.DataFrame({"time_gpst": START + (t * 1e9).astype("timedelta64[ns]"), "chainage_m": way})
+    distance = distance_m(t) + noise_m * np.random.default_rng(1).standard_normal(len(t))
+    return pl.DataFrame({"time_gpst": START + (t * 1e9).astype("timedelta64[ns]"), "chainage_m": distance})
 
 
 def round_line() -> Trajectory:
     """The circle, its points 5 m apart."""
-    way = np.arange(-50.0, way_m(np.array([SECONDS]))[0] + 50.0, 5.0)
-    angle = way / RADIUS_M  # heading, from east to the south
+    distance = np.arange(-50.0, distance_m(np.array([SECONDS]))[0] + 50.0, 5.0)
+    angle = distance / RADIUS_M  # heading, from east to the south
     flat = np.cos(angle)[:, None] * -SOUTH + np.sin(angle)[:, None] * EAST
-    ecef = ORIGIN + RADIUS_M * (flat + SOUTH) + CLIMB * way[:, None] * UP
+    ecef = ORIGIN + RADIUS_M * (flat + SOUTH) + CLIMB * distance[:, None] * UP
     line = Trajectory.from_track(Track.from_ecef(ecef, name="circle"))
-    return replace(line, chainage_m=way)
+    return replace(line, chainage_m=distance)
 
 
 def on_the_circle(facing: float) -> SensorSamples:
@@ -121,8 +121,8 @@ def on_the_circle(facing: float) -> SensorSamples:
     gained = 6.0 * 2.0 * np.pi / 80.0 * np.cos(2.0 * np.pi * t / 80.0)
     nothing = np.zeros_like(t)
     force = np.column_stack([facing * (gained + 9.80665 * CLIMB), facing * speed**2 / RADIUS_M, nothing - 9.80665])
-    pulse = np.arange(0.0, way_m(t[-1:])[0], TachometerLimits().pulse_m)
-    at = np.interp(pulse, way_m(t), t)
+    pulse = np.arange(0.0, distance_m(t[-1:])[0], TachometerLimits().pulse_m)
+    at = np.interp(pulse, distance_m(t), t)
     return SensorSamples(
         inertial=InertialSamples(
             time=time, force_mps2=force, rate_radps=np.column_stack([nothing, nothing, speed / RADIUS_M])
@@ -201,7 +201,7 @@ def test_exchanged_axes_are_told_and_nothing_else_rests_on_them() -> None:
     assert "inertial: gravity is in force_forward_mps2, not in force_down_mps2; swap the columns" in notes[0]
     assert not any("tachometer" in note for note in notes)
     right = checks.notes(on_the_circle(1.0), None, round_line(), SensorLimits())
-    assert any("tachometer: the way of its wheel" in note for note in right)
+    assert any("tachometer: the distance of its wheel" in note for note in right)
 
 
 @pytest.mark.requirement("E4")

@@ -95,7 +95,7 @@ def test_a_body_that_comes_to_rest_after_braking_does_not_roll_away(permille: fl
     force = np.where(t < 1.0, -1.0, 0.0) + GRAVITY_MPS2 * swing
     found, _ = find_slips(MotionSamples(t, wheel, np.where(t < 0.7, -1.0, np.nan), force, np.zeros(len(t))))
     assert (found.state[t > 3.0] == MotionState.STANDING).all()
-    assert found.way_m[-1] == pytest.approx(found.way_m[np.searchsorted(t, 1.1)], abs=0.2)
+    assert found.distance_m[-1] == pytest.approx(found.distance_m[np.searchsorted(t, 1.1)], abs=0.2)
 
 
 @pytest.mark.requirement("E1")

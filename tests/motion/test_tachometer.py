@@ -1,4 +1,4 @@
-"""Speeds and ways from the instants of pulses, against closed forms."""
+"""Speeds and distances from the instants of pulses, against closed forms."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from railfix.motion.samples import TachometerPulses
 from railfix.motion.tachometer import (
     TachometerLimits,
     check_speeds,
+    distance_m,
     pulse_acceleration,
     pulse_speeds,
     tooth_faults,
-    way_m,
 )
 
 START = np.datetime64("2026-03-01T06:00:00", "ns")
@@ -28,9 +28,9 @@ def _pulses(instants_s: np.ndarray, direction: int = 1) -> TachometerPulses:
     )
 
 
-def _even(v0: float, a: float, way: float) -> np.ndarray:
+def _even(v0: float, a: float, distance: float) -> np.ndarray:
     """Instants of the pulses of an even acceleration: root of v0 t + a t^2 / 2 = n p."""
-    s = np.arange(1, int(way / LIMITS.pulse_m)) * LIMITS.pulse_m
+    s = np.arange(1, int(distance / LIMITS.pulse_m)) * LIMITS.pulse_m
     return s / v0 if a == 0 else (np.sqrt(v0**2 + 2.0 * a * s) - v0) / a
 
 
@@ -82,8 +82,8 @@ def test_way_is_that_of_the_motion_and_its_sign_that_of_the_direction() -> None:
     instants = _even(8.0, 0.4, 80.0)
     asked = [2.0, 4.0, 6.0]
     truth = 8.0 * np.array(asked) + 0.2 * np.array(asked) ** 2
-    np.testing.assert_allclose(way_m(_pulses(instants), _at(asked), limits=LIMITS), truth, atol=0.01)
-    np.testing.assert_allclose(way_m(_pulses(instants, -1), _at(asked), limits=LIMITS), -truth, atol=0.01)
+    np.testing.assert_allclose(distance_m(_pulses(instants), _at(asked), limits=LIMITS), truth, atol=0.01)
+    np.testing.assert_allclose(distance_m(_pulses(instants, -1), _at(asked), limits=LIMITS), -truth, atol=0.01)
 
 
 @pytest.mark.requirement("E2")

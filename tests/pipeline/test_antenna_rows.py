@@ -6,6 +6,7 @@ import gc
 import weakref
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline import processor as processing
+from railfix.pipeline.antennas import filter_verdicts, position_verdicts
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.processor import EpochProcessor, Models
@@ -24,6 +26,7 @@ from railfix.positioning.antenna_rows import EVERY, AntennaRows, join_rows, stac
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import ErrorModel
 from railfix.run.processor import make_processor
+from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
@@ -259,3 +262,33 @@ def test_frequencies_of_glonass_that_one_log_alone_states_count_for_both() -> No
         rows, parts = stack_observations(logs)
         assert [part.stop for part in parts] == [2, 4]
         assert rows.header.glonass_channel == {"R05": 1, "R06": -4}
+
+
+@pytest.mark.requirement("B3")
+def test_verdicts_on_pairs_go_to_the_epochs_of_each_antenna() -> None:
+    """The rear log has an epoch more before, and one between: pairs are of other rows of the two."""
+
+    def judge(front: np.ndarray, rear: np.ndarray, *_: object) -> Screened:
+        return Screened(metric=front - rear, reject=front - rear > 25.0)
+
+    def judge_filtered(front: FilteredMotion, rear: FilteredMotion, *_: object) -> Screened:
+        return judge(front.chainage_m, rear.chainage_m)
+
+    screen = SimpleNamespace(name="spacing", status=9, judge=judge, judge_filtered=judge_filtered)
+    chainage = {"front": np.array([100.0, 110.0, 120.0, 130.0]), "rear": np.array([70.0, 75.0, 90.0, 95.0, 110.0])}
+    nowhere, along = np.zeros((3, 3)), np.full(3, 20.0)
+    pair = PairedEpochs(
+        front_epoch=np.array([1, 2, 3]), rear_epoch=np.array([0, 2, 4]), front_ecef_m=nowhere, rear_ecef_m=nowhere,
+        along_m=along,
+    )  # fmt: skip
+    published = position_verdicts([(screen, None)], pair, chainage)
+    motions = {name: FilteredMotion(values, values, values, values) for name, values in chainage.items()}
+    filtered = filter_verdicts([(screen, None)], pair, motions)
+    for name, rows in (("front", [1, 2]), ("rear", [0, 2])):
+        (verdict,) = published[name]
+        assert (verdict.name, verdict.status) == ("spacing", 9)
+        for screened in (verdict.screened, filtered[name]):
+            assert np.flatnonzero(screened.reject).tolist() == rows
+            known = np.isfinite(screened.metric)
+            assert np.flatnonzero(known).tolist() == {"front": [1, 2, 3], "rear": [0, 2, 4]}[name]
+            assert screened.metric[known].tolist() == [40.0, 30.0, 20.0]

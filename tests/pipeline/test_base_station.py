@@ -111,6 +111,28 @@ def test_a_position_of_the_stream_is_taken_from_its_headers(drive: Drive) -> Non
     assert len(errors) == 1  # the one before was of another place
 
 
+def test_a_virtual_station_that_has_moved_begins_anew_with_its_smoothing(drive: Drive) -> None:
+    """As the first epoch of a log does: what its codes were smoothed by belongs to the place before."""
+    moved, found = with_place(drive.base[6:7], PLACE + 1.0), []
+    for before in ((0, 6), None):
+        processor = EpochProcessor(
+            parse_config({"filter": "off", "protection": "off"}),
+            {"front": drive.trajectory},
+            navigation=drive.navigation,
+            stations=Stations(base_ecef_m="stream"),
+        )
+        state = None
+        if before is not None:
+            rows = slice(*before)
+            _, state = processor.process({"front": drive.train[rows]}, base=with_place(drive.base[rows], PLACE))
+        _, state = processor.process({"front": drive.train[6:7]}, state, base=moved)
+        errors = base_errors(state)
+        assert errors is not None
+        found.append(errors)
+    np.testing.assert_array_equal(found[0].satellite, found[1].satellite)
+    np.testing.assert_allclose(found[0].code_m, found[1].code_m, atol=1e-6)
+
+
 @pytest.mark.requirement("A12")
 def test_integers_of_two_antennas_on_a_roof_are_right(recordings: Path) -> None:
     """Also where the first places are off by decimetres, as codes are; the map is stated as 0.05 m and right."""

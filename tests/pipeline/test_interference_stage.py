@@ -149,3 +149,20 @@ def test_at_10_hz_it_is_looked_for_once_a_second_whatever_the_chunks() -> None:
         parts.append(result["front"].interference)
     np.testing.assert_array_equal(np.concatenate([part.causes for part in parts]), whole.causes)
     np.testing.assert_allclose(np.concatenate([part.power.fall_db for part in parts]), whole.power.fall_db)
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_clock_that_steps_after_a_break_between_two_looks_is_no_sign_whatever_the_chunks(broken: bool) -> None:
+    log = pipeline_cases.clean_observations()["front"][:45]
+    step = np.where(np.arange(len(log)) >= 18, 2000.0, 0.0)
+    begins = broken & (np.arange(len(log)) == 18)
+    log = replace(log, code_m=log.code_m + step[:, None], break_before=log.break_before | begins)
+    processor = pipeline_cases.processor({"filter": "off"})
+    for cuts in ((), (19,), (18, 20)):
+        state, parts = None, []
+        for part in np.split(np.arange(len(log)), cuts):
+            result, state = processor.process({"front": log[part[0] : part[-1] + 1]}, state)
+            parts.append(result["front"].interference.causes)
+        jumped = (np.concatenate(parts) & int(Sign.CLOCK_JUMP)) != 0
+        assert np.flatnonzero(jumped).tolist() == ([] if broken else list(range(20, 45)))

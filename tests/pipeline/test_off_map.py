@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,12 +13,22 @@ from pipeline_cases import clean_trajectories, demo_observations
 from railfix.core.reasons import Status
 from railfix.core.timescale import timedelta
 from railfix.io.rinex import read_navigation
+from railfix.pipeline.along_track import apply_spacing_verdict
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.filter_result import OffMapState, off_map_epochs
+from railfix.pipeline.filter_result import (
+    AlongTrack,
+    FilterState,
+    OffMapState,
+    ReturnState,
+    gated_codes,
+    off_map_epochs,
+)
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.screens import Screened
 from railfix.simulate.demonstration import demo_files
-from railfix.tracking import Tracked, TrackStatus, track
+from railfix.tracking import Line, Tracked, TrackStatus, track
 from test_wrong_map import moved
 from tracking_cases import part, ride
 
@@ -122,3 +133,45 @@ def test_what_was_seen_off_the_map_says_nothing_of_the_map() -> None:
     status = result.antennas["front"].status
     assert (status[:10] == Status.MAP_OFFSET).all()
     assert not np.isin(status[11:], [Status.OFF_MAP, Status.MAP_OFFSET]).any()
+
+
+CUTS = [(), (16,), (17, 19), (3, 15, 18, 21), tuple(range(1, 30))]
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("cuts", CUTS)
+def test_codes_after_an_outage_count_from_the_third_that_agrees_however_the_log_is_cut(cuts: tuple[int, ...]) -> None:
+    """Ten seconds without codes; of those after it, the first and the fourth are 100 m aside."""
+    k = np.arange(30)
+    time, line = START + timedelta(k.astype(np.float64)), Line.of(clean_trajectories()["front"])
+    observed, place = (k < 5) | (k > 14), 10.0 * k + np.where((k == 15) | (k == 18), 100.0, 0.0)
+    state, parts = ReturnState(place_m=-10.0, sigma_m=1.0), []
+    for first, last in pairwise((0, *cuts, 30)):
+        rows, n = slice(first, last), last - first
+        refused, state = gated_codes(
+            time[rows], observed[rows], np.full(n, 10.0), place[rows], np.full(n, 1.0), state, line, SensorLimits()
+        )
+        parts.append(refused)
+    assert np.flatnonzero(np.concatenate(parts)).tolist() == [15, 16, 17, 18, 19, 20]
+
+
+@pytest.mark.requirement("B3", "E5")
+@pytest.mark.parametrize("cuts", CUTS)
+def test_antennas_that_disagree_are_doubted_for_a_time_however_the_log_is_cut(cuts: tuple[int, ...]) -> None:
+    """At the 16th epoch, for 3 s; a chunk without pairs of epochs has no verdict of its own."""
+    time = START + timedelta(np.arange(30.0))
+    empty = Tracked.empty(time, 0)
+    whole = replace(empty, status=np.full(30, TrackStatus.TRACKING, dtype=np.int8), level_m=np.full(30, 5.0))
+    disagree, state, parts = np.arange(30) == 15, FilterState(), []
+    for first, last in pairwise((0, *cuts, 30)):
+        rows = slice(first, last)
+        tracked = Tracked(**{f.name: getattr(whole, f.name)[rows] for f in fields(Tracked)})
+        spacing = None
+        if disagree[rows].any():
+            spacing = Screened(metric=np.where(disagree, 9.0, 0.5)[rows], reject=disagree[rows])
+        result = AlongTrack.create(lambda _: {}, tracked=tracked, spacing_error_m=np.full(last - first, np.nan))
+        found, state = apply_spacing_verdict(result, spacing, state, 3.0)
+        parts.append(found.tracked)
+    status, level = (np.concatenate([getattr(part, name) for part in parts]) for name in ("status", "level_m"))
+    assert np.flatnonzero(status == TrackStatus.ANTENNAS_DISAGREE).tolist() == [15, 16, 17, 18]
+    assert np.flatnonzero(np.isinf(level)).tolist() == [15, 16, 17, 18]

@@ -8,13 +8,24 @@ import numpy as np
 import pytest
 
 from railfix.motion.samples import BaliseReadings, ListedBalises
-from railfix.pipeline.balises import VERDICTS, BaliseLimits, Passing, PassingState, balise_notes, find_passings
+from railfix.pipeline.balises import (
+    VERDICTS,
+    BaliseLimits,
+    BaliseState,
+    Passing,
+    PassingState,
+    arcs_of_balises,
+    balise_epochs,
+    balise_notes,
+    find_passings,
+)
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Tracked, TrackStatus
 
 START = np.datetime64("2026-05-12T03:00:00", "ns")
 LIMITS = BaliseLimits()
+SECOND = np.timedelta64(1, "s")
 
 
 def line(length_m: float = 2000.0) -> Trajectory:
@@ -142,6 +153,39 @@ def test_the_odometer_has_five_metres_and_a_twentieth_of_the_way_since_the_last_
     passings = found(places(20.0 * np.arange(60)), marks, read((10.0, "B1"), (35.0, "B2")))
     assert np.isnan(passings[0].odometer_m)
     assert passings[-1].odometer_m == pytest.approx(5.0 + 0.05 * 500.0, abs=0.1)
+    late = listed(200.0, 705.0, virtual=False)  # its passing is in the chunk after its reading
+    for cuts in ((), (36,)):
+        passings = found(places(20.0 * np.arange(60)), late, read((10.0, "B1"), (34.9, "B2")), cuts)
+        assert passings[-1].odometer_m == pytest.approx(5.0 + 0.05 * 500.0, abs=0.5)
     virtual = replace(marks, virtual=np.array([False, True]))
     passings = found(places(20.0 * np.arange(60)), virtual, read((10.0, "B1")))
     assert passings[-1].odometer_m == pytest.approx(5.0 + 0.05 * 500.0, abs=0.1)
+
+
+@pytest.mark.requirement("E7")
+@pytest.mark.parametrize("cuts", [(), (30,), (31, 41), tuple(range(1, 110))])
+def test_an_identity_read_again_is_the_same_passing_and_balises_take_turns_however_the_log_is_cut(
+    cuts: tuple[int, ...],
+) -> None:
+    readings = read((10.2, "B1"), (30.2, "B1"), (40.2, "B2"), (99.7, "B2"), (101.3, "B2"), (103.1, "X9"), (104.5, "B1"))
+    marks, epochs, state, parts = listed(205.0, 805.0, virtual=False), at(0.0) + np.arange(110) * SECOND, None, []
+    for rows in np.split(np.arange(1, 110), [cut - 1 for cut in cuts]):
+        if len(rows):
+            edges = epochs[rows[0] - 1 : rows[-1] + 1]
+            mine = (readings.time > edges[0]) & (readings.time <= edges[-1])
+            given = BaliseReadings(**{f.name: getattr(readings, f.name)[mine] for f in fields(BaliseReadings)})
+            found_ones, state = balise_epochs(given, edges, marks, line(), state or BaliseState(), LIMITS)
+            parts.append(found_ones)
+    place = np.concatenate([part.place_m for part in parts])
+    epoch, column = np.nonzero(np.isfinite(place))
+    assert (epoch + 1).tolist() == [11, 41, 102, 105]
+    assert column.tolist() == [0, 1, 0, 1]
+    np.testing.assert_allclose(place[epoch, column], [205.0, 805.0, 805.0, 205.0], atol=0.01)
+
+
+@pytest.mark.requirement("E7")
+def test_the_reader_is_ahead_of_the_antenna_where_the_front_looks() -> None:
+    for facing, expected in (("rising", 493.0), ("falling", 517.0)):
+        path = replace(line(), facing=facing)  # type: ignore[arg-type]
+        found_at = arcs_of_balises(listed(505.0), path, BaliseLimits(ahead_m=12.0))
+        assert found_at == pytest.approx(expected, abs=0.01)

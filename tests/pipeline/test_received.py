@@ -138,6 +138,27 @@ def test_skipped_records_of_all_receptions_are_counted() -> None:
     assert after.navigation.skipped == {"SBAS": 3, "IRNSS": 4, "CNAV": 3}
 
 
+@pytest.mark.requirement("A8")
+def test_the_newest_coefficients_are_used_and_of_expired_records_the_newest_of_each_kind_is_kept() -> None:
+    """Galileo broadcasts two kinds of records: one does not take the place of the other."""
+    config, whole = parse_config({"filter": "off"}), clean_navigation()
+    kepler = rows(whole, np.char.startswith(whole.kepler.satellite, "E")).kepler
+    both = [rows(replace(whole, kepler=kepler), np.arange(len(kepler)) == 0).kepler for _ in range(4)]
+    for k, (hours, kind) in enumerate(((0, "INAV"), (1, "INAV"), (0, "FNAV"), (-1, "FNAV"))):
+        both[k] = replace(both[k], toe=both[k].toe + np.timedelta64(hours, "h"), message=np.array([kind]))
+    table = type(kepler)(**{f.name: np.concatenate([getattr(b, f.name) for b in both]) for f in fields(kepler)})
+    old, new = (whole.klobuchar["G"] * factor for factor in (1.0, 2.0))
+    start = known_from_start(config, navigation=replace(whole, klobuchar={"G": old}))
+    later = replace(whole, kepler=table, klobuchar={"G": new})
+    after = receive(start, config, table.toe.max() + np.timedelta64(2, "D"), navigation=later)
+    np.testing.assert_array_equal(after.klobuchar, new)
+    mine = after.navigation.kepler.satellite == table.satellite[0]
+    kept = sorted(zip(after.navigation.kepler.message[mine].tolist(), after.navigation.kepler.toe[mine], strict=True))
+    assert [kind for kind, _ in kept] == ["FNAV", "INAV"]
+    assert kept[0][1] == table.toe[2]
+    assert kept[1][1] >= table.toe[1]
+
+
 def lock(value: Any) -> None:
     """Make every array in a value read-only, however deep; frozen dataclasses keep the array itself."""
     if isinstance(value, np.ndarray):

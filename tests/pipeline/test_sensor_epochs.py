@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,15 @@ import pytest
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.timescale import timedelta
+from railfix.motion.features import LineSeries, map_features
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
+from railfix.pipeline.along_track import _find_fix, _gated_ranges, _restart_state
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.filter_result import FilterFix, FilterState, ReturnState
+from railfix.pipeline.sensed_motion import FeatureState, LineFeatures, RateSeries, feature_fixes
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, ranging_lever_m, sensor_epochs
 from railfix.run.sensors import read_sensors, read_units, units_of_ranges
+from railfix.tracking import Line, RangeEpochs, Tracked, TrackStatus
 from tracking_cases import START, bent_line
 
 LIMITS = SensorLimits()
@@ -200,3 +207,88 @@ def test_ranges_and_ground_units_are_read_and_held_against_each_other(tmp_path: 
     units.write_text("unit,x_m,y_m\nA,1.0,2.0\n")
     with pytest.raises(InputFileError, match="has no column z_m"):
         read_units(units)
+
+
+def _ridden(
+    line: LineFeatures, arc_m: np.ndarray, facing: float, cuts: list[int], slid_m: float = 0.0
+) -> list[tuple[int, str, float]]:
+    """Verdicts on features along places of a body, 0.1 s apart, in chunks that end at ticks; a slide is at 1000 m."""
+    series = line.series
+    curvature = np.interp(arc_m, series.arc_m, series.curvature_1pm)
+    pitch = facing * np.arctan(np.interp(arc_m, series.arc_m, series.gradient))
+    steps = np.diff(arc_m)
+    slides = slid_m * np.diff(np.sign(arc_m - 1000.0)) / 2.0
+    when = START + timedelta(0.1 * np.arange(len(steps)))
+    rates = RateSeries(
+        time=when, known=when, distance_m=np.cumsum(steps + slides), arc_m=arc_m[1:] + 2.0,
+        turned_rad=0.5 * (curvature[1:] + curvature[:-1]) * steps, climbed_rad=np.diff(pitch), speed_mps=10.0 * steps,
+        rolls=np.ones(len(steps), dtype=bool),
+    )  # fmt: skip
+    state, found = FeatureState(), []
+    for first, last in pairwise([0, *cuts, len(steps)]):
+        part = replace(rates, **{f.name: getattr(rates, f.name)[first:last] for f in fields(RateSeries)})
+        part = replace(part, distance_m=part.distance_m - (rates.distance_m[first - 1] if first else 0.0))
+        fixes, state = feature_fixes(part, line, facing, 6.0, state, noise=(1e-3, 1e-4))
+        found += [(fix.tick + first, fix.located.verdict, fix.correction_m) for fix in fixes]
+    return found
+
+
+@pytest.mark.requirement("E3")
+@pytest.mark.parametrize("facing", [1.0, -1.0])
+@pytest.mark.parametrize("falling", [False, True])
+def test_features_are_placed_alike_however_the_ride_is_cut_and_the_vehicle_faces(facing: float, falling: bool) -> None:
+    """The wheel has the body 2 m too far; two ends of a curve, a top and a dip are on the way."""
+    arc = np.arange(0.0, 2000.0)
+    slope = 0.02 / (1.0 + np.exp(-(arc - 800.0) / 4.0)) - 0.015 / (1.0 + np.exp(-(arc - 1200.0) / 4.0))
+    series = LineSeries(arc_m=arc, gradient=slope, curvature_1pm=np.where((arc > 500.0) & (arc < 1500.0), 2e-3, 0.0))
+    features = tuple(map_features(series))
+    line = LineFeatures(series=series, features=features, antenna_m=arc, body_m=arc, line=Line.of(bent_line()))
+    way = np.arange(300.0, 1750.0, 1.3)
+    way = way[::-1] if falling else way
+    whole = _ridden(line, way, facing, [])
+    assert [verdict for _, verdict, _ in whole] == ["accepted"] * 4
+    np.testing.assert_allclose([correction for *_, correction in whole], -2.0, atol=0.5)
+    for cuts in ([300], [130, 131, 500, 800], list(range(40, 1100, 40))):
+        cut = _ridden(line, way, facing, cuts)
+        assert [found[:2] for found in cut] == [found[:2] for found in whole]
+        np.testing.assert_allclose([found[2] for found in cut], [found[2] for found in whole], atol=1e-6)
+        slid = _ridden(line, way, facing, cuts, 15.0)
+        assert [verdict for _, verdict, _ in slid] == ["accepted", "accepted", "none", "none"]
+
+
+@pytest.mark.requirement("E4", "E5")
+def test_ranges_are_held_against_the_place_of_the_unit_on_the_vehicle() -> None:
+    """Its unit is 3 m ahead, 4 m to the right and 6 m below the antenna; echoes come late, and nothing comes early."""
+    line, lever = Line.of(bent_line()), np.array([3.0, 4.0, -6.0])
+    time = START + timedelta(np.array([1.0, 2.0]))
+    fixed = FilterFix(time=START, arc_m=500.0, sigma_m=0.05, speed_mps=10.0)
+    age = np.array([[0.25, 0.0], [0.0, 0.5]])
+    at = fixed.arc_m + 10.0 * (np.array([[1.0], [2.0]]) - age)
+    point, axes = line.at((at + lever[0]).ravel())
+    own = point + lever[1] * axes[:, 1] + lever[2] * axes[:, 2]
+    unit = own + 25.0 * axes[:, 1] + 5.0 * axes[:, 2] + 8.0 * axes[:, 0]
+    distance = np.linalg.norm(unit - own, axis=1).reshape(2, 2)
+    config = parse_config({"tracking": {"acceleration_mps2": 0.01}})
+    state = replace(FilterState(), anchor=fixed)
+    for error, kept in ((0.0, True), (0.5, True), (1.0, False), (-1.0, False)):
+        ranges = RangeEpochs(
+            range_m=distance + error, sigma_m=np.full((2, 2), 0.1), age_s=age, unit_ecef_m=unit.reshape(2, 2, 3),
+            lever_m=lever,
+        )  # fmt: skip
+        gated = _gated_ranges(ranges, time, line, state, config)
+        assert (np.isfinite(gated.range_m) == kept).all(), error
+        assert np.isnan(_gated_ranges(ranges, time, line, FilterState(), config).range_m).all()
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("status", list(TrackStatus))
+def test_what_sensors_carry_begins_from_a_place_that_the_filter_has_decided_on(status: TrackStatus) -> None:
+    empty = Tracked.empty(EPOCHS[:2], 0)
+    values = {name: np.full(2, value) for name, value in (("arc_m", 7.0), ("sigma_m", 2.0), ("speed_mps", 3.0))}
+    fixed = _find_fix(replace(empty, status=np.full(2, status, dtype=np.int8), **values))
+    decided = status in (TrackStatus.TRACKING, TrackStatus.COASTING)
+    assert fixed.arc_at(EPOCHS[2]) == pytest.approx(10.0 if decided else np.nan, nan_ok=True)
+    assert (fixed.time, fixed.sigma_m) == (EPOCHS[1], 2.0)
+    again = _restart_state(replace(FilterState(), gate=ReturnState(place_m=1.0, sigma_m=9.0, distance_m=5.0)), fixed)
+    assert (again.anchor, again.gate.sigma_m, again.gate.distance_m) == (fixed, 2.0, 0.0)
+    assert again.gate.place_m == pytest.approx(fixed.arc_m, nan_ok=True)

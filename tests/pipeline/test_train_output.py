@@ -100,7 +100,6 @@ def test_samples_of_sensors_count_once_however_the_log_is_cut(tmp_path: Path) ->
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.requirement("E5")
 def test_reflections_of_some_tenths_of_a_second_move_the_train_nowhere(tmp_path: Path) -> None:
     """At 03:12:28 Dopplers and phases of the rear antenna are reflected for 0.4 s, 10 s after the tunnel.
 

@@ -10,6 +10,7 @@ import pytest
 
 import carrier_score
 from railfix.evaluate import Score, score
+from railfix.run.processor import make_processor
 
 
 @cache
@@ -77,6 +78,21 @@ def test_in_towns_it_does_no_harm(recordings, name, p50):
     assert got["live"].p95_m < 1.05 * got["code"].p95_m
     assert got["hatch"].p50_m < 1.0 * got["code"].p50_m
     assert got["hatch"].p95_m < 1.05 * got["code"].p95_m
+
+
+@pytest.mark.requirement("A5")
+def test_chunks_of_a_telephone_give_the_same(recordings):
+    """Arcs begin at three epochs of four."""
+    case = next(c for c in carrier_score.recordings(recordings) if c.name == "gsdc_pixel5_a")
+    processor = make_processor(case.config.replaced(carrier="float"), case.navigation, {"front": case.trajectory})
+    places = []
+    for size in (len(case.observations), 300, 50):
+        state, parts = None, []
+        for first in range(0, len(case.observations), size):
+            result, state = processor.process({"front": case.observations[first : first + size]}, state)
+            parts.append(result.antennas["front"].arc_m)
+        places.append(np.concatenate(parts))
+    assert np.nanmax(np.abs(np.diff(places, axis=0))) < 1e-9
 
 
 @pytest.mark.requirement("A5")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from scipy.stats import binom
 from typer.testing import CliRunner
@@ -13,12 +15,20 @@ from typer.testing import CliRunner
 from network_made import made_network
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
 from railfix.run.standstill import StandstillCodes, standstill_codes
-from railfix.run.which_track import decide_track, prior_of_interlocking, prior_of_last_place, write_last_place
+from railfix.run.which_track import (
+    WhichTrackInputs,
+    WhichTrackOptions,
+    decide_track,
+    prior_of_interlocking,
+    prior_of_last_place,
+    which_track_files,
+    write_last_place,
+)
 from railfix.simulate.demonstration import demo_files
 from yard_made import RISKS, SPACING_M, decided, made_tracks, to_geojson
 
@@ -280,6 +290,49 @@ def test_a_train_that_comes_back_is_a_moving_one() -> None:
     log = read_observations(files["front"])[::10]
     with pytest.raises(MismatchError, match="standstill"):
         standstill_codes(log, read_navigation(files["nav"]), Config(filter="off"))
+
+
+def test_breaks_and_half_cycles_of_either_receiver_are_in_the_phases() -> None:
+    """At rest, the rear antenna as the base station: a break, a slip that the receiver names, half a cycle."""
+    files = demo_files()
+    front, rear = (read_observations(files[name])[:30] for name in ("front", "rear"))
+    breaks, locks = front.break_before.copy(), [obs.loss_of_lock.copy() for obs in (front, rear)]
+    breaks[10] = True
+    channel = int(np.flatnonzero(np.isfinite(front.phase_cycles).all(axis=0))[0])
+    name = (front.satellite[channel], front.signal[channel])
+    other = int(np.flatnonzero((rear.satellite == name[0]) & (rear.signal == name[1]))[0])
+    locks[0][15, channel], locks[1][20, other], locks[1][25, other] = 2, 1, 2
+    front, rear = replace(front, break_before=breaks, loss_of_lock=locks[0]), replace(rear, loss_of_lock=locks[1])
+    place = np.asarray(front.header.approximate_ecef_m)
+    codes = standstill_codes(front, read_navigation(files["nav"]), Config(filter="off"), base=(rear, place))
+    phases = codes.phases
+    assert phases is not None
+    assert phases.lost[10].all()
+    known = np.isfinite(phases.difference_m)
+    (own,) = np.flatnonzero(~known[15] & ~known[25] & known[14] & known[20])
+    assert np.flatnonzero(phases.lost[:, own]).tolist() == [10, 20]
+    assert not phases.lost[11:, np.arange(known.shape[1]) != own].any()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_the_front_log_is_of_the_antenna_ahead(tmp_path: Path, turned: bool) -> None:
+    """At rest on a track that rises to where the train faces, and on one that falls."""
+    files = demo_files()
+    truth = pl.read_csv(files["truth"])
+    places = [truth.filter(pl.col("antenna") == name).select("x_m", "y_m", "z_m").row(0) for name in ("front", "rear")]
+    front, rear = (np.array(place) for place in places)
+    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef((front + rear) / 2.0))
+    east, north = enu_axes(latitude, longitude)[:2] @ (front - rear)
+    azimuth = float(np.degrees(np.arctan2(east, north))) + 180.0 * turned
+    (tmp_path / "y.geojson").write_text(to_geojson(made_tracks(1, azimuth, np.zeros(2), 0), latitude, longitude))
+    inputs = WhichTrackInputs(
+        front=(files["front"],), rear=(files["rear"],), nav=(files["nav"],), map=(tmp_path / "y.geojson",)
+    )
+    spacing, end = float(np.linalg.norm(front - rear)), datetime(2024, 3, 5, 3, 10, 3)
+    options = WhichTrackOptions(spacing=spacing, end=end, same_frame="yes")
+    posterior = which_track_files(inputs, options, Config(filter="off")).posteriors[-1]
+    rising = float(posterior.with_rising[0] / posterior.probability[0])
+    assert rising == pytest.approx(0.0 if turned else 1.0, abs=0.01)
 
 
 # --- what is known beforehand ------------------------------------------------

@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from railfix.core.arrays import copy_with
 from railfix.core.reasons import Reason, Status
 from railfix.core.tables import Table, listing
 from railfix.evaluate.tables import _ERRORS
@@ -164,6 +165,52 @@ def test_a_column_of_observations_is_the_quantity_that_it_names(result: Result) 
         np.testing.assert_array_equal(found[judged], values[epoch, order[np.minimum(inner, len(order) - 1)]][judged])
 
 
+@pytest.mark.requirement("A5", "B8", "C6")
+def test_columns_of_what_few_runs_have_are_the_quantities_that_they_name(result: Result) -> None:
+    """ARAIM, integers, interference, two frequencies, the wheel against the satellites."""
+    front, track, random = result.antennas["front"], result.fusion["front"], np.random.default_rng(5)
+    size = len(front.time)
+
+    def numbers(*shape: int) -> np.ndarray:
+        return random.uniform(1.0, 2.0, (size, *shape))
+
+    araim = SimpleNamespace(
+        along=SimpleNamespace(level_m=numbers(1)), space=SimpleNamespace(level_m=numbers(3)), horizontal_m=numbers()
+    )
+    phase = SimpleNamespace(n_fixed=np.arange(size), integer_risk=numbers())
+    signs = SimpleNamespace(
+        power=SimpleNamespace(fall_db=numbers()), suspicion=np.arange(size) % 3, causes=np.zeros(size, dtype=np.int64)
+    )
+    names = ("share", "ionosphere_m", "difference_m")
+    combined = SimpleNamespace(**{name: numbers(len(front.columns)) for name in names})
+    second = SimpleNamespace(cn0_dbhz=numbers(len(front.columns)))
+    rare: Any = {"araim": araim, "phase": phase, "interference": signs, "combined": combined, "second": second}
+    rare_track: Any = {"wheel": SimpleNamespace(difference_m=numbers())}
+    made = replace(
+        result, antennas={"front": copy_with(front, **rare)}, fusion={"front": copy_with(track, **rare_track)}
+    )
+    expected = {
+        "araim_level_m": araim.along.level_m[:, 0], "araim_horizontal_m": araim.horizontal_m,
+        "araim_vertical_m": araim.space.level_m[:, 2], "integers_fixed": phase.n_fixed,
+        "integer_risk_ppm": 1e6 * phase.integer_risk, "cn0_fall_db": signs.power.fall_db,
+    }  # fmt: skip
+    positions, rows, train = positions_table(made), observations_table(made), train_table(made)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(positions[name].to_numpy(), values, err_msg=name)
+    words = ("none", "jamming_suspected", "spoofing_suspected")
+    assert positions["interference"].to_list() == [words[k % 3] for k in range(size)]
+    np.testing.assert_array_equal(train["wheel_difference_m"].to_numpy(), rare_track["wheel"].difference_m)
+    columns = {
+        "second_share": combined.share, "ionosphere_measured_m": combined.ionosphere_m,
+        "metric_two_frequencies_m": combined.difference_m, "second_cn0_dbhz": second.cn0_dbhz,
+    }  # fmt: skip
+    observed = (front.reason & Reason.NOT_OBSERVED) == 0
+    for name, values in columns.items():
+        full = np.full(front.reason.shape, np.nan)
+        full[:, front.columns] = values
+        np.testing.assert_array_equal(rows[name].fill_null(np.nan).to_numpy(), full[observed], err_msg=name)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
     options = RunOptions(start=datetime(2024, 3, 5, 3, 10, 5), end=datetime(2024, 3, 5, 3, 10, 25))
@@ -201,6 +248,25 @@ def test_a_reason_alone_is_counted_apart_from_one_among_others() -> None:
     told = tally.as_dict()
     assert told["observations_rejected_by_first_reason"] == {"elevation_mask": 3, "cn0_floor": 2}
     assert told["observations_rejected_by_one_reason_alone"] == {"elevation_mask": 1, "cn0_floor": 2}
+
+
+@pytest.mark.requirement("B6")
+def test_span_and_offset_of_the_map_are_of_all_chunks() -> None:
+    """Of the map the window that contradicts it most, and the least and the largest that any finds."""
+    tally = AntennaTally()
+    for k, (statistic, detectable) in enumerate((([1.0, 9.0], [3.0, 5.0]), ([4.0, np.nan], [2.0, np.nan]))):
+        chunk: Any = result_of([[0], [0]], ["G01"], [Status.OK] * 2)
+        chunk.time += k * np.timedelta64(10, "s")
+        ones = {name: np.full(2, 1.0 + k) for name in ("across_m", "up_m", "across_sigma_m", "up_sigma_m")}
+        found = np.column_stack([detectable, 2.0 * np.array(detectable)])
+        chunk.map_offset = SimpleNamespace(statistic=np.array(statistic), detectable_m=found, **ones)
+        tally.add(chunk)
+    begin = np.datetime64("2024-01-01", "ns")
+    assert (tally.first, tally.last) == (begin, begin + np.timedelta64(11, "s"))
+    np.testing.assert_array_equal(tally.map_detectable_m, [[2.0, 4.0], [5.0, 10.0]])
+    assert tally.map_offset is not None
+    assert (tally.map_offset.time, tally.map_offset.statistic) == (begin + np.timedelta64(1, "s"), 9.0)
+    assert tally.map_offset.across_m == 1.0
 
 
 @pytest.mark.requirement("D2")

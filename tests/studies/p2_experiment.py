@@ -24,7 +24,7 @@ from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import InertialSamples, SensorSamples, TachometerPulses
 from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips
-from railfix.motion.tachometer import TachometerLimits, pulse_speeds, way_m
+from railfix.motion.tachometer import TachometerLimits, distance_m, pulse_speeds
 from railfix.pipeline import sensed_motion as stage
 from railfix.run.locate import find_features
 from railfix.simulate import Scenario, Simulation
@@ -110,7 +110,7 @@ def sense(
         time_s=t,
         true_m=np.abs(chainage - chainage[0]),
         true_mps=np.abs(speed),
-        wheel_m=way_m(samples.tachometer, when, limits=tachometer),
+        wheel_m=distance_m(samples.tachometer, when, limits=tachometer),
         wheel_mps=np.nan_to_num(pulse_speeds(samples.tachometer, when, limits=tachometer).speed_mps),
         found=found,
         intervals=intervals,
@@ -176,10 +176,12 @@ def braking(simulation: Simulation, least_mps: float) -> tuple[float, float]:
 
 
 def way_error(sensed: Sensed, begin_s: float, end_s: float) -> tuple[float, float]:
-    """Error of the way between two instants, by the wheel and by the slip detection [m]."""
+    """Error of the distance between two instants, by the wheel and by the slip detection [m]."""
     k, m = np.searchsorted(sensed.time_s, [begin_s, end_s])
     true = sensed.true_m[m] - sensed.true_m[k]
-    return abs(sensed.wheel_m[m] - sensed.wheel_m[k]) - true, abs(sensed.found.way_m[m] - sensed.found.way_m[k]) - true
+    return abs(sensed.wheel_m[m] - sensed.wheel_m[k]) - true, abs(
+        sensed.found.distance_m[m] - sensed.found.distance_m[k]
+    ) - true
 
 
 def slide_lines() -> Iterator[str]:
@@ -190,13 +192,13 @@ def slide_lines() -> Iterator[str]:
     slips = [{"start_s": float(s), "end_s": float(s) + 2.5, "ratio": -0.3} for s in starts]
     simulation = Simulation(scenario_with("commercial-run", 400.0, slips=slips))
     samples, _ = sensors_of(simulation)
-    yield f"{len(slips)} slides of 30 % in a braking of {end - begin:.0f} s: largest error of speed, error of the way"
-    ways = (
+    yield f"{len(slips)} slides of 30 % in a braking of {end - begin:.0f} s: largest error of speed and distance"
+    rules = (
         ("P2's rule", {"rule": "p2"}, False),
         ("rule of railfix, no map", {}, False),
         ("rule of railfix", {}, True),
     )
-    for k, (name, limits, line) in enumerate(ways):
+    for k, (name, limits, line) in enumerate(rules):
         sensed = sense(simulation, samples, SlipLimits.model_validate(limits), line=line)
         part = (sensed.time_s > begin) & (sensed.time_s < end)
         if k == 0:
@@ -246,7 +248,7 @@ def start_lines() -> Iterator[str]:
 
 
 def measured(seed: int) -> tuple[pl.DataFrame, stage.SensedMotion]:
-    """What a run over the test line measures of it, by the way of the wheel alone."""
+    """What a run over the test line measures of it, by the distance of the wheel alone."""
     simulation = Simulation(scenario_with("p1-test-line", 180.0, seed))
     samples, _ = sensors_of(simulation)
     whole = sense(simulation, samples, SlipLimits())
@@ -299,7 +301,7 @@ def feature_lines(seeds: Sequence[int] = (1, 2)) -> Iterator[str]:
 
 
 def radar_lines() -> Iterator[str]:
-    """The way through slips: tachometer, tachometer and inertial unit, a radar in the tachometer's place."""
+    """The distance through slips: tachometer, tachometer and inertial unit, a radar in the tachometer's place."""
     slips = {"slip_chance": 0.6, "slide_chance": 0.6}
     simulation = Simulation(scenario_with("commercial-run", 900.0, drawn_slips=slips))
     samples, _ = sensors_of(simulation)
@@ -307,23 +309,23 @@ def radar_lines() -> Iterator[str]:
     assert samples.radar is not None
     t = seconds(samples.radar.time - simulation.scenario.start)
     speed = np.nan_to_num(samples.radar.speed_mps)
-    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))])
-    radar_m = np.interp(sensed.time_s, t, way)
+    distance = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))])
+    radar_m = np.interp(sensed.time_s, t, distance)
     true = np.abs(simulation.motion.at(t)[1])
     heard, moves = np.isfinite(samples.radar.speed_mps), true > 1.0
     yield (
         f"  radar: a speed at {100 * heard[moves].mean():.1f} % of the instants faster than 1 m/s, "
         f"error {np.std((speed - true)[heard & moves]):.3f} m/s"
     )
-    yield "  error of the way over 60 s [m]      p50    p95    largest"
+    yield "  error of the distance over 60 s [m]      p50    p95    largest"
     step = 3000
-    for name, way in (
+    for name, distance in (
         ("tachometer", sensed.wheel_m),
-        ("tachometer, inertial unit, map", sensed.found.way_m),
+        ("tachometer, inertial unit, map", sensed.found.distance_m),
         ("radar in the tachometer's place", radar_m),
     ):
         error = np.abs(
-            np.abs(way[step::250] - way[:-step:250]) - (sensed.true_m[step::250] - sensed.true_m[:-step:250])
+            np.abs(distance[step::250] - distance[:-step:250]) - (sensed.true_m[step::250] - sensed.true_m[:-step:250])
         )
         yield f"  {name:33s}{np.median(error):6.2f} {np.quantile(error, 0.95):6.2f} {error.max():10.2f}"
 

@@ -4,7 +4,7 @@
 The runs are those of the scenario `commercial-run` with other seeds, a body that pitches (0.15 degrees at random, 0.3
 degrees a m/s2) and vibration (0.3 m/s2), and slips and slides at 60 % of the accelerations and brakings. The place for
 the line's gradient begins from the ground truth with an error of 2 m every 5 s, as from the filter. Three rules: P2's
-own, the line's gradient, and the same with the pitch gyro. "Way" is the error of the way from 1 s before a slip to 3 s
+own, the line's gradient, and the same with the pitch gyro. "Distance" is its error from 1 s before a slip to 3 s
 after it, against what a wheel that rolls counts there: its diameter, off by 0.09 % in this scenario, is the filter's.
 The table of the runs so far goes to stderr after each run, a minute's work or less.
 """
@@ -21,7 +21,7 @@ import numpy as np
 import paths  # noqa: F401
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips
-from railfix.motion.tachometer import way_m
+from railfix.motion.tachometer import distance_m
 from railfix.pipeline import sensed_motion as stage
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
 from railfix.simulate import Simulation
@@ -47,7 +47,7 @@ class Score:
     missed: list[tuple[float, float]] = field(default_factory=list)
     late_s: list[float] = field(default_factory=list)
     flagged: list[float] = field(default_factory=list)
-    way_m: list[float] = field(default_factory=list)
+    distance_m: list[float] = field(default_factory=list)
     alarms: int = 0
     #: Of these, carries that the end of a slip has not released within 5 s.
     held: int = 0
@@ -114,15 +114,17 @@ def scored(simulation: Simulation, scores: dict[str, Score]) -> None:
                     heard, np.array([time]), trajectory, state,
                     limits=given, sine_at=sine_at, sources=("wheel", "force"),
                 )  # fmt: skip
-        found_state, way = (np.concatenate([getattr(r, n) for r in kept]) for n in ("state", "way_m"))
+        found_state, distance = (np.concatenate([getattr(r, n) for r in kept]) for n in ("state", "distance_m"))
         t = float(edges_s[0]) + 0.02 * np.arange(1, len(found_state) + 1)
-        count(scores[name], t, found_state, way, simulation, slips)
-    rolled = way_m(samples.tachometer, begin + timedelta(t))
+        count(scores[name], t, found_state, distance, simulation, slips)
+    rolled = distance_m(samples.tachometer, begin + timedelta(t))
     count(scores["wheel itself"], t, np.zeros(len(t)), np.asarray(rolled), simulation, slips)
     assert abs(float(seconds(begin - scenario.start))) < 1e-9
 
 
-def count(score: Score, t: np.ndarray, state: np.ndarray, way: np.ndarray, simulation: Simulation, slips: list) -> None:
+def count(
+    score: Score, t: np.ndarray, state: np.ndarray, distance: np.ndarray, simulation: Simulation, slips: list
+) -> None:
     """Add one rule's answer on one run."""
     wheel = simulation.scenario.sensors.tachometer  # type: ignore[union-attr]
     rolling = wheel.wheel_diameter_m / (wheel.wheel_diameter_m + wheel.diameter_error_m)  # type: ignore[union-attr]
@@ -146,7 +148,7 @@ def count(score: Score, t: np.ndarray, state: np.ndarray, way: np.ndarray, simul
         score.flagged.append(float(flagged[inside].mean()))
         k, m = np.searchsorted(t, [slip.start_s - 1.0, slip.end_s + 3.0])
         chainage = simulation.motion.at(t[[k, m]])[0]
-        score.way_m.append(float(abs(way[m] - way[k]) - rolling * abs(chainage[1] - chainage[0])))
+        score.distance_m.append(float(abs(distance[m] - distance[k]) - rolling * abs(chainage[1] - chainage[0])))
     raised = np.flatnonzero(np.diff((flagged & ~covered).astype(int)) == 1)
     score.alarms += len(raised)
     score.held += int(np.count_nonzero(flagged[raised]))
@@ -168,14 +170,15 @@ def main() -> int:
 def table(scores: dict[str, Score], file: TextIO) -> None:
     """Print one line a rule for the hours so far, and its first five misses."""
     for name, score in scores.items():
-        way = np.abs(score.way_m)
+        distance = np.abs(score.distance_m)
         late = f"{np.median(score.late_s):.2f}" if score.late_s else "-"
         print(
             f"{name:13s} {score.slips} slips in {score.hours:.1f} h: missed {len(score.missed)}, found after {late} s, "
             f"instants flagged {100 * np.mean(score.flagged):3.0f} %, false alarms {score.alarms} "
             f"({score.alarms / score.hours:.2f} an hour; {score.held} are carries not released), "
-            f"way p50 {np.median(way):.2f} p95 {np.percentile(way, 95):.2f} largest {way.max():.2f} m, "
-            f"within 0.15 m {100 * np.mean(way <= 0.15):.0f} %",
+            f"distance p50 {np.median(distance):.2f} p95 {np.percentile(distance, 95):.2f} "
+            f"largest {distance.max():.2f} m, "
+            f"within 0.15 m {100 * np.mean(distance <= 0.15):.0f} %",
             file=file,
             flush=True,
         )

@@ -17,6 +17,16 @@ import paths
 DOCUMENTS = paths.ROOT / "docs"
 #: First words of names that end in -ed and are none, and participles that do not.
 NOT_PARTICIPLES = {"need", "feed", "speed", "seed", "embed", "exceed", "bed"}
+#: Standard verbs of docstrings.
+VERBS = set(
+    "add advance append apply assemble build check choose collect combine compare compute connect convert copy "
+    "correct count create decode describe detect draw encode estimate evaluate exclude fill find fit follow format "
+    "generate get give handle hold insert interpolate join judge keep leave list load locate map match measure "
+    "merge move note open parse plot position predict prepare print process put raise read receive record register "
+    "reject remove replace report require reset resolve restore return rotate run save scale search select send "
+    "serve set show simulate smooth solve sort split start stop store take test track update validate wait warn "
+    "wrap write yield".split()
+)
 IRREGULAR = set("told given taken made found known written left sent held kept drawn chosen".split())
 
 
@@ -53,6 +63,16 @@ def is_participle(name: str) -> bool:
     return (first.endswith("ed") and first not in NOT_PARTICIPLES) or first in IRREGULAR
 
 
+def is_property(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    """Whether a function is read like a field, so that its docstring is a noun."""
+    return any("property" in ast.unparse(each) for each in function.decorator_list)
+
+
+def first_words(function: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    """Return the words of the docstring of a function."""
+    return re.findall(r"\w+", ast.get_docstring(function) or "")
+
+
 def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """How many parameters a function has, but for `self` and `cls`."""
     given = function.args
@@ -84,6 +104,9 @@ def main() -> int:
     print(f"dataclasses     {sum('dataclass' in ast.dump(d) for c in classes for d in c.decorator_list)}")
     print(f"__post_init__   {sum(node.name == '__post_init__' for node, _ in functions)}")
     print(f"participles     {len(participles)} of {len(functions)} functions")
+    print(f"..._of          {sum(node.name.endswith('_of') for node, _ in functions)}")
+    first = [words[0].lower() for node, _ in functions if not is_property(node) and (words := first_words(node))]
+    print(f"verbs first     {sum(word in VERBS for word in first)} of {len(first)} docstrings of functions")
     print(f"class names     {len(twice)} in several files: {', '.join(twice)}")
     print("longest files")
     for path, size in sorted(sizes.items(), key=lambda item: -item[1])[:8]:

@@ -9,11 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plain_kernels import plain
+from plain_kernels import named_tuple, parameters, plain, work_space
 from railfix.core.arrays import copy_with
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.kernels.tracking import layout
-from railfix.kernels.tracking.constants import FORCE_WALK_MPS2, RADAR_WALK, WHEEL_WALK
+from railfix.kernels.tracking.constants import (
+    FORCE_WALK_MPS2,
+    FREEDOM_PLACE_M2,
+    FREEDOM_SPEED_M2PS2,
+    RADAR_WALK,
+    WHEEL_WALK,
+)
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.filter import Recursion
@@ -261,6 +267,83 @@ def test_what_is_no_number_in_a_sub_filter_bounds_nothing_and_in_the_filter_begi
     found, _ = track(part(case.epochs, slice(30, 60)), case.line, lost, levels=True)
     assert np.abs(found.arc_m - case.arc_m[30:])[-10:].max() < 4.0
     assert TrackStatus.TRACKING in found.status
+
+
+def _made_epoch(counts: tuple[int, int, int, int]) -> tuple[layout.Rows, layout.Work, np.ndarray]:
+    """Random measurements of an epoch in work space, and the covariance of what they are combinations of."""
+    random, work = np.random.default_rng(7), work_space(1)
+    rows = named_tuple(layout.Rows, counts=np.array(counts))
+    size = counts[0] + layout.COMBINED + counts[3]
+    mixed = random.normal(size=(size, 2 * size))
+    covariance = mixed @ mixed.T
+    work.root[0, :size] = np.sqrt(np.diagonal(covariance))
+    work.own[0, :size, :size] = covariance / np.outer(work.root[0, :size], work.root[0, :size])
+    work.information[0, :size, :size] = np.linalg.inv(work.own[0, :size, :size])
+    work.design[:] = random.normal(size=work.design.shape)
+    work.sensed[:] = random.normal(size=work.sensed.shape)
+    work.value[:] = 20.0 * random.normal(size=work.value.shape) + 7.0
+    work.variance[:] = random.uniform(1.0, 4.0, work.variance.shape)
+    return rows, work, covariance
+
+
+def _expected_weights(
+    rows: layout.Rows,
+    work: layout.Work,
+    covariance: np.ndarray,
+    degrees: tuple[float, float],
+    free: tuple[float, float],
+) -> np.ndarray:
+    """Student's weights of innovations less the median of their kind, the clock of the kind known."""
+    (nc, nph, nd, ns), (usual, late) = rows.counts.tolist(), degrees
+    shift, d = work.value[0].copy(), work.design[0]
+    kinds, first = np.split(np.arange(nc + nph + nd), [nc, nc + nph]), nc + 1
+    for kind in kinds:
+        shift[kind] -= np.median(shift[kind])
+    way_right_up, right_up_speed = first + np.array([0, 2, 3]), first + np.array([2, 3, 4])
+    spread = np.concatenate([
+        np.diagonal(covariance)[:nc] + free[0] * d[kinds[0], 0] ** 2,
+        [x[[0, 2, 3]] @ covariance[np.ix_(way_right_up, way_right_up)] @ x[[0, 2, 3]] + free[0] * x[0] ** 2
+         for x in d[kinds[1]]],
+        [x[:3] @ covariance[np.ix_(right_up_speed, right_up_speed)] @ x[:3] + free[1] * x[2] ** 2 for x in d[kinds[2]]],
+        np.diagonal(covariance)[len(covariance) - ns :]
+        + free[0] * work.sensed[0, :ns, 0] ** 2 + free[1] * work.sensed[0, :ns, 2] ** 2,
+    ])  # fmt: skip
+    size = len(spread)
+    own = np.where((np.arange(size) < nc) & (shift[:size] > 0.0), late, usual)
+    return (usual + 1.0) / usual * own / (own + shift[:size] ** 2 / (spread + work.variance[:size]))
+
+
+@pytest.mark.requirement("E5")
+def test_first_weights_are_students_with_the_clock_of_each_kind_known() -> None:
+    rows, work, covariance = _made_epoch((4, 3, 4, 2))
+    plain("tracking.update").first_weights(rows, work.variance, (4.0, 1.5), 50.0, 3.0, work, 0, 1)
+    expected = _expected_weights(rows, work, covariance, (4.0, 1.5), (50.0, 3.0))
+    np.testing.assert_allclose(work.weight[1, :13], expected, rtol=1e-9)
+
+
+@pytest.mark.requirement("E5")
+def test_a_second_start_sets_place_and_speed_free_by_their_own_variances(monkeypatch: pytest.MonkeyPatch) -> None:
+    update, given, weights = plain("tracking.update"), parameters(TrackingLimits()), list[np.ndarray]()
+    rows, work, covariance = _made_epoch((4, 3, 4, 2))
+    reweight = update.reweight
+    update.first_weights(rows, work.variance, given.degrees, 0.0, 0.0, work, 0, 0)
+    work.log_after[0] = reweight(rows, work.variance, given.degrees, given.passes, work, 0, 0, 0)
+
+    def reweighted(*arguments: Any) -> Any:
+        weights.append(work.weight[1, :13].copy())
+        return reweight(*arguments)
+
+    monkeypatch.setattr(update, "reweight", reweighted)
+    update.second_start(given, rows, work, 0, 1)
+    free = FREEDOM_PLACE_M2, FREEDOM_SPEED_M2PS2
+    np.testing.assert_allclose(weights[0], _expected_weights(rows, work, covariance, given.degrees, free), rtol=1e-9)
+    place, speed = np.zeros(len(covariance)), np.zeros(len(covariance))
+    place[:4], place[4 + layout.C_WAY], place[-2:] = work.design[0, :4, 0], 1.0, work.sensed[0, :2, 0]
+    speed[4 + layout.C_SPEED], speed[-2:] = 1.0, work.sensed[0, :2, 2]
+    freed = covariance + free[0] * np.outer(place, place) + free[1] * np.outer(speed, speed)
+    root, found = work.root[0, : len(freed)], work.own[1, : len(freed), : len(freed)]
+    upper = np.triu_indices(len(freed))
+    np.testing.assert_allclose((found * np.outer(root, root))[upper], freed[upper], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.requirement("E5")

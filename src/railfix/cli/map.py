@@ -11,13 +11,14 @@ import typer
 
 from railfix.cli.command import Command, command_group
 from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_table
-from railfix.cli.map_network import Columns, MapReading, match_command, network, route
+from railfix.cli.map_network import RUN_ALONE, Columns, match_command, network, route
 from railfix.cli.map_runs import service, survey
-from railfix.cli.options import OverwriteOption, check_outputs, from_models
+from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.core.tables import plain_table, plural
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import column_names, read_positions
+from railfix.run.inputs import TrackReading
 from railfix.track import (
     MapLimits,
     Thinned,
@@ -38,6 +39,11 @@ TracksArgument = Annotated[
     typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."),
 ]
 
+#: Reading of a map whose accuracy has no part in what is printed.
+PointsReading = Annotated[
+    TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma", "plan_sigma")
+]
+
 
 @app.command("check", cls=Command)
 @from_models
@@ -47,7 +53,7 @@ def check(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the picture map_check.png; made where absent.")
     ] = None,
-    reading: MapReading,
+    reading: PointsReading,
     max_gap: Annotated[
         float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
     ] = 1.0,
@@ -111,7 +117,7 @@ def features(
     out: Annotated[
         Path | None, typer.Option(metavar="CSV", help="File for the features; printed alone without it.")
     ] = None,
-    reading: MapReading,
+    reading: PointsReading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """List the features of a line: the places where its gradient or its curvature changes.

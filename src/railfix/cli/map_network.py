@@ -31,8 +31,10 @@ Columns = Annotated[
     list[str] | None, typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description))
 ]
 
-#: Reading of a map by itself: without what a run alone needs.
-MapReading = Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")]
+#: What a run alone needs of the reading of its track.
+RUN_ALONE = ("reference", "cache")
+#: Reading of a map by itself.
+MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma")]
 
 
 class RouteChoice(Settings):
@@ -155,7 +157,7 @@ def route(
     choice: RouteChoice,
     columns: ColumnNames,
     connecting: Connecting,
-    reading: Annotated[TrackReading, Without("reference")],
+    reading: Annotated[TrackReading, Without(*RUN_ALONE)],
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make the track map of one route from a network or any map file.
@@ -243,7 +245,7 @@ def match_command(
     options: MatchOptions,
     columns: ColumnNames,
     connecting: Connecting,
-    reading: Annotated[TrackReading, Without("reference", "height_sigma")],
+    reading: Annotated[TrackReading, Without(*RUN_ALONE, "height_sigma")],
     overwrite: OverwriteOption = False,
 ) -> None:
     """Put positions on the tracks of a network: track, chainage on it, probability, and the next best track.

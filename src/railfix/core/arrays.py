@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from reprlib import recursive_repr
-from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NoReturn, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,6 +148,9 @@ def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> No
 class FrozenArrays:
     """Base of dataclasses that freeze their arrays, also in copies and other processes: kernels compile once."""
 
+    def __post_init__(self) -> None:
+        freeze_arrays(cast("DataclassInstance", self))
+
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         vars(self).update({n: read_only(v) if isinstance(v, np.ndarray) else v for n, v in state.items()})
 
@@ -167,8 +170,18 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
 
     All have the arrays that the first has.
     """
+    if len(parts) == 1:
+        return parts[0]
     tables = [_row_arrays(part) for part in parts]
     return replace(parts[0], **{name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
+
+
+class RowArrays:
+    """Base of dataclasses whose arrays have one row for each of the same things."""
+
+    def take(self, rows: NDArray[Any] | slice) -> Self:
+        """Return some of the rows, by mask, index or slice, and the other fields."""
+        return take_rows(self, rows)  # type: ignore[type-var]
 
 
 def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:

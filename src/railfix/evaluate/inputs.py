@@ -233,6 +233,13 @@ def floats(table: pl.DataFrame, name: str) -> Floats:
     return table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
+def words(table: pl.DataFrame, name: str) -> Strings:
+    """Return a column as text, blank where it is null or the table has no such column."""
+    if name not in table.columns:
+        return np.full(len(table), "")
+    return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
+
+
 Method = Literal["chainage", "trajectory"]
 
 #: Longest gap of a reference that is interpolated over [s].
@@ -340,12 +347,12 @@ class Sections:
 
     def at(self, chainage_m: Floats) -> Strings:
         """Return the environment at chainages, shape (T,); blank outside every section and for NaN."""
-        words = np.array([*self.environment, ""])
+        names = np.array([*self.environment, ""])
         index = np.searchsorted(self.from_m, chainage_m, side="right") - 1
         safe = np.maximum(index, 0)
         last = (safe == len(self.to_m) - 1) & (chainage_m == self.to_m[-1])
         inside = (index >= 0) & ((chainage_m < self.to_m[safe]) | last)
-        return np.asarray(words[np.where(inside, safe, len(words) - 1)])
+        return np.asarray(names[np.where(inside, safe, len(names) - 1)])
 
 
 def read_sections(path: Path) -> Sections:

@@ -14,7 +14,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Masks, Strings, dataclass
 from railfix.evaluate.figures import ALL, KEYS, PASSED
-from railfix.evaluate.inputs import WINDOWS_S, EvaluationOptions, floats
+from railfix.evaluate.inputs import WINDOWS_S, EvaluationOptions, floats, words
 from railfix.integrity.stanford import Region, Stanford, stanford
 
 LevelsOf = Literal["usable", "all"]
@@ -116,12 +116,6 @@ def _usable(status: Strings, verdict: Strings) -> Masks:
     return np.asarray(np.isin(status, _BOUNDED) & (verdict != _ALARM))
 
 
-def _words(table: pl.DataFrame, name: str) -> Strings:
-    if name not in table.columns:
-        return np.full(len(table), "")
-    return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
-
-
 def epochs_diagram(
     epochs: pl.DataFrame, kind: str, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
@@ -138,8 +132,8 @@ def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Float
     level = effective_levels(
         floats(spanned, level_name(kind)),
         has,
-        _words(spanned, "status"),
-        _words(spanned, f"{kind}_protection_status"),
+        words(spanned, "status"),
+        words(spanned, f"{kind}_protection_status"),
         levels_of=levels_of,
     )
     return error, level
@@ -152,8 +146,8 @@ def positions_diagram(
     level = effective_levels(
         floats(positions, "protection_level_m"),
         np.isfinite(floats(positions, "chainage_m")),
-        _words(positions, "status"),
-        _words(positions, "protection_status"),
+        words(positions, "status"),
+        words(positions, "protection_status"),
         levels_of=levels_of,
     )
     return _sort(positions, np.full(len(positions), np.nan), level, alarm_limit_m, options)
@@ -268,7 +262,7 @@ def _beyond(epochs: pl.DataFrame, runs: Sequence[str], kind: str) -> pl.DataFram
         pl.col("run").is_in(runs) & level.is_finite() & (pl.col("error_m").abs() > level),
     )
     excess = pl.col("error_m").abs() - level
-    verdict = pl.Series("usable", _usable(_words(over, "status"), _words(over, columns["status"])))
+    verdict = pl.Series("usable", _usable(words(over, "status"), words(over, columns["status"])))
     named = {f"{kind}_{name}": pl.col(column) for name, column in columns.items()}
     listed = over.with_columns(verdict, level.alias(f"{kind}_level_m"), **named)
     return listed.sort(excess, descending=True, maintain_order=True).select(

@@ -210,8 +210,9 @@ def route_requested(
         if other.train == train:
             continue
         stays = other.station == target or other.direction != direction
-        if other.tracks.get(target) == track and stays and _in_station(other, target, layout):
-            return state, (), f"track {track} of {layout.stations[target].name} is taken by train {other.train}"
+        ahead = layout.stations[target]
+        if other.tracks.get(target) == track and stays and not other.has_passed(ahead.begin_m, ahead.end_m):
+            return state, (), f"track {track} of {ahead.name} is taken by train {other.train}"
         if other.direction != direction and _uses_section(other, section, layout):
             return state, (), f"train {other.train} comes the other way"
     needs: dict[PointName, int] = {(begin, direction): here.tracks[begin], (target, -direction): track}
@@ -226,11 +227,6 @@ def route_requested(
         points[name] = replace(point, locked={**point.locked, train: None})
     routed = replace(here, tracks={**here.tracks, target: track}, station=target, held=False)
     return replace(state, trains={**state.trains, train: routed}, points=points), tuple(moved), None
-
-
-def _in_station(train: TrainInterval, station: int, layout: Layout) -> bool:
-    """Return whether a train's interval or route still needs its track in a station."""
-    return not train.has_passed(layout.stations[station].begin_m, layout.stations[station].end_m)
 
 
 def _uses_section(train: TrainInterval, section: int, layout: Layout) -> bool:

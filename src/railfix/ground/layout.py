@@ -21,7 +21,8 @@ from railfix.track.network import Network
 
 #: Points: station and side, -1 at its lower end of chainage, 1 at its upper.
 PointName = tuple[int, int]
-#: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single line with the points.
+#: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single line with the points,
+#: 2 k + t is track t of station k.
 Piece = tuple[int, float, float]
 
 
@@ -118,7 +119,7 @@ class Layout(Settings):
                 continue
             if at < first:
                 pieces.append((0, at, first))
-            pieces.append((get_lane(k, tracks.get(k, 1)), max(at, first), min(high, last)))
+            pieces.append((2 * k + tracks.get(k, 1), max(at, first), min(high, last)))
             at = min(high, last)
         if at < high or not pieces:
             pieces.append((0, at, high))
@@ -136,11 +137,6 @@ class Layout(Settings):
             if station.inner_m[0] <= low_m and high_m <= station.inner_m[1]:
                 return k
         return None
-
-
-def get_lane(station: int, track: int) -> int:
-    """Return the number of the lane of a station's track; 0 is the single line."""
-    return 2 * station + track
 
 
 def along(between_m: tuple[float, float], direction: int) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks, dataclass
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
@@ -35,7 +35,7 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 
 
 @dataclass(frozen=True, kw_only=True)
-class StationFixes:
+class StationFixes(FrozenArrays):
     """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
 
     time: Datetimes  #: Epochs that at least one log has, rounded to 0.1 s; shape (T,).
@@ -43,9 +43,6 @@ class StationFixes:
     fixes_m: Floats  #: NaN where a log has no epoch, or the common satellites are too few; shape (T, N, 2).
     n_satellites: Integers  #: Shape (T,).
     cn0_fallen: Masks  #: Shape (T, N).
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: Navigation) -> StationFixes:

@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from pydantic import Field, model_validator
 
-from railfix.core.arrays import Codes, Floats, Integers, Masks, dataclass, freeze_arrays
+from railfix.core.arrays import Codes, Floats, FrozenArrays, Integers, Masks, dataclass
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option
 from railfix.ground.station_fixes import StationFixes
@@ -108,7 +108,7 @@ def limits_for_false_stops(
 
 
 @dataclass(frozen=True, kw_only=True)
-class TriangleResult:
+class TriangleResult(FrozenArrays):
     """Comparison of T sets of fixes with the reference triangle."""
 
     error_m: Floats  #: Horizontal distance of each fix from its point; NaN without a fix; shape (T, 3).
@@ -117,9 +117,6 @@ class TriangleResult:
     bearing_error_deg: Floats  #: Deviation of its bearing, clockwise, in [-180, 180); shape (T, 3).
     verdict: Codes  #: `TriangleVerdict`, shape (T,).
     receiver: Integers  #: Receiver that the verdict names, -1 where it names none; shape (T,).
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
 
 def compare_triangle(

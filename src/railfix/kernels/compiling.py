@@ -336,7 +336,7 @@ def missing() -> list[str]:
 
 
 class Reference(types.Type):
-    """Pointer to the numbers of a named tuple, one a slot of 8 bytes, those of a tuple within it among them."""
+    """Pointer to a named tuple in memory, with the tuples within it."""
 
     def __init__(self, values: types.NamedTuple) -> None:
         self.values = values
@@ -345,42 +345,6 @@ class Reference(types.Type):
 
 
 register_model(Reference)(models.OpaqueModel)
-
-
-def _leaves(llvm_type: Any) -> int:
-    """Return the number of numbers of a value."""
-    if isinstance(llvm_type, ir.ArrayType):
-        return int(llvm_type.count) * _leaves(llvm_type.element)
-    return sum(_leaves(part) for part in llvm_type) if isinstance(llvm_type, ir.LiteralStructType) else 1
-
-
-def _parts(llvm_type: Any) -> list[Any]:
-    """Return the types of the parts of a value, none of a number."""
-    if isinstance(llvm_type, ir.ArrayType):
-        return [llvm_type.element] * int(llvm_type.count)
-    return list(llvm_type) if isinstance(llvm_type, ir.LiteralStructType) else []
-
-
-def _store(builder: Any, value: Any, slots: Any, at: int) -> int:
-    """Store the numbers of a value from a slot on; return the slot after them."""
-    parts = _parts(value.type)
-    for k in range(len(parts)):
-        at = _store(builder, builder.extract_value(value, k), slots, at)
-    if parts:
-        return at
-    builder.store(value, builder.bitcast(builder.gep(slots, [_SLOT(at)]), value.type.as_pointer()))
-    return at + 1
-
-
-def _load(builder: Any, llvm_type: Any, slots: Any, at: int) -> Any:
-    """Load a value from a slot on."""
-    parts, value = _parts(llvm_type), llvm_type(ir.Undefined)
-    for k, part in enumerate(parts):
-        value = builder.insert_value(value, _load(builder, part, slots, at), k)
-        at += _leaves(part)
-    if parts:
-        return value
-    return builder.load(builder.bitcast(builder.gep(slots, [_SLOT(at)]), llvm_type.as_pointer()))
 
 
 @infer_getattr
@@ -397,15 +361,15 @@ class _Fields(AttributeTemplate):
 
 
 @lower_getattr_generic(Reference)  # type: ignore[no-untyped-call, untyped-decorator]
-def _field(context: Any, builder: Any, reference: Reference, slots: Any, field: str) -> Any:
+def _field(context: Any, builder: Any, reference: Reference, pointer: Any, field: str) -> Any:
     """Load a field, or compute the address of a tuple."""
     values = reference.values
     k = values.fields.index(field)
-    at = sum(_leaves(context.get_value_type(kind)) for kind in values.types[:k])
-    slots = builder.bitcast(slots, _SLOT.as_pointer())
+    whole = builder.bitcast(pointer, context.get_data_type(values).as_pointer())
+    place = cgutils.gep_inbounds(builder, whole, 0, k)  # type: ignore[no-untyped-call]
     if isinstance(values.types[k], types.NamedTuple):
-        return builder.bitcast(builder.gep(slots, [_SLOT(at)]), context.get_value_type(reference))
-    return _load(builder, context.get_value_type(values.types[k]), slots, at)
+        return builder.bitcast(place, context.get_value_type(reference))
+    return context.unpack_value(builder, values.types[k], place)
 
 
 @intrinsic
@@ -413,9 +377,9 @@ def _by_reference(_: Any, values: Any) -> Any:
     """Store a tuple where it is called; the pointer is valid until that function ends."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        (value,) = arguments
-        slots = cgutils.alloca_once(builder, _SLOT, size=_leaves(value.type))  # type: ignore[no-untyped-call]
-        _store(builder, value, slots, 0)
+        kind = context.get_data_type(values)
+        slots = cgutils.alloca_once(builder, _SLOT, size=context.get_abi_sizeof(kind) // 8 + 1)  # type: ignore[no-untyped-call]
+        context.pack_value(builder, values, arguments[0], builder.bitcast(slots, kind.as_pointer()))
         return builder.bitcast(slots, context.get_value_type(signature.return_type))
 
     return Reference(values)(values), generate

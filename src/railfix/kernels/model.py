@@ -127,17 +127,7 @@ def linearise_ranges(
 
 @kernel
 def residuals(model: Any) -> tuple[Floats, Floats, Floats]:
-    """Compute what the best fit leaves of the misfits of a linear model.
-
-    Parameters
-    ----------
-    model : ModelArrays
-
-    Returns
-    -------
-    step_m, residual, redundancy
-        Of `LinearModel`.
-    """
+    """Compute what the best fit leaves of the misfits of `ModelArrays`: step, residual, redundancy of `LinearModel`."""
     root_weight, clock, clock_covariance_m2, design, covariance_m2, _, misfit = model
     epochs, channels = root_weight.shape
     groups = clock_covariance_m2.shape[1]

@@ -260,13 +260,7 @@ def clear_of_sections(
 ) -> Floats:
     """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
 
-    Parameters
-    ----------
-    ecef_m, tangent, across, length_m : ndarray
-        Of the line: points (P, 3), the others of its sections.
-    stretches
-        `SearchIndex.stretches`.
-    section : ndarray of int, shape (S,)
+    `ecef_m` are the points of the line (P, 3), the others its sections; `stretches` are of `SearchIndex`.
     """
     clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
     nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)

@@ -33,7 +33,7 @@ from railfix.ranges.sbas import SbasMessages
 END_NS: Final = 1 << 62
 #: Epochs of one antenna that may wait; more than that means the other antenna's clock is elsewhere.
 _LONGEST_QUEUE = 100
-#: Way after which the order of the antennas is looked at again [m].
+#: Distance after which the order of the antennas is looked at again [m].
 _ORDER_STEP_M = 10.0
 
 
@@ -171,11 +171,6 @@ class LiveEngine:
             self._from_satellites[-1] = last.with_later(item)
         else:
             self._from_satellites.append(item)
-
-    @property
-    def uses_sbas(self) -> bool:
-        """Whether the settings ask for the SBAS messages of the streams."""
-        return self.processor.config.sbas == "stream"
 
     def start(self, *, now_ns: int) -> None:
         """Start the clock: from here on every period has a message, also before the first epoch."""

@@ -245,8 +245,9 @@ class _Session:
         skipped["messages with a bad checksum"] += received.bad_checksums
         if received.navigation is not None:
             self.engine.add_navigation(received.navigation)
-        if received.sbas is not None and self.engine.uses_sbas:
-            messages = from_receiver(received.sbas, source=name, band=self.engine.processor.config.sbas_band)
+        config = self.engine.processor.config
+        if received.sbas is not None and config.sbas == "stream":
+            messages = from_receiver(received.sbas, source=name, band=config.sbas_band)
             skipped.update({f"SBAS messages: {why}": n for why, n in messages.rejected.items() if n})
             if len(messages):
                 self.engine.add_sbas(messages)

@@ -139,12 +139,6 @@ class ByteTarget:
                 self.path.unlink()
 
 
-def standard_output() -> IO[bytes]:
-    """Return the standard output without a buffer, where there is one below it."""
-    out: IO[bytes] = getattr(sys.stdout.buffer, "raw", sys.stdout.buffer)
-    return out
-
-
 @dataclass
 class UdpTarget:
     """A datagram a message."""
@@ -310,7 +304,7 @@ async def open_sink(
     parts, shown = urlsplit(target), f"{name}@{hidden(target)}"
     opened: Any
     if target == "-":
-        opened = ByteTarget(form, standard_output())
+        opened = ByteTarget(form, getattr(sys.stdout.buffer, "raw", sys.stdout.buffer))  # no buffer
     elif parts.scheme in ("udp", "tcp-server", "mqtt"):
         try:
             host, port = parts.hostname, parts.port

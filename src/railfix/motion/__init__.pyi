@@ -16,10 +16,10 @@ from .tachometer import (
     SpeedCheck,
     TachometerLimits,
     check_speeds,
+    distance_m,
     pulse_acceleration,
     pulse_speeds,
     tooth_faults,
-    way_m,
 )
 
 __all__ = [
@@ -38,6 +38,7 @@ __all__ = [
     "TachometerLimits",
     "TachometerPulses",
     "check_speeds",
+    "distance_m",
     "find_slips",
     "line_series",
     "locate",
@@ -47,5 +48,4 @@ __all__ = [
     "radar_speed_mps",
     "tooth_faults",
     "two_way_range_m",
-    "way_m",
 ]

@@ -24,7 +24,7 @@ _CURVATURE_CHANGE_1PM: Final = 1e-3
 _LIKELIHOOD_RATIO: Final = 1e3  #: Of the place found to any other place of the window.
 _GAP_SIGMAS: Final = 3.0  #: Disagreement with the distance to the last accepted feature.
 _FIT_LIMIT: Final = 3.0  #: Mean square of the other quantity's residual over its variance.
-SCALE_SIGMA: Final = 2e-3  #: Of a way by wheel, as a share.
+SCALE_SIGMA: Final = 2e-3  #: Of a distance by wheel, as a share.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
 HALF_LENGTH_M: Final = 60.0  #: Line before and behind a feature that is compared.
 #: Length over which a change is taken: about that between the bogies of a vehicle, which rounds what is shorter.
@@ -120,7 +120,7 @@ def locate(
     Parameters
     ----------
     measured : LineSeries
-        Over travelled way in rising arc length, `arc_m` about the predicted place (0 in its middle).
+        Over travelled distance in rising arc length, `arc_m` about the predicted place (0 in its middle).
     line : LineSeries
     predicted_m, sigma_m : float [m]
         Place of the middle of the stretch as known before.
@@ -129,7 +129,7 @@ def locate(
     noise : tuple of float
         Standard deviations of the two quantities in one step.
     last : tuple of float, optional
-        Place of the last accepted feature, its sigma, and the way by wheel since [m].
+        Place of the last accepted feature, its sigma, and the distance by wheel since [m].
     """
     offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + STEP_M, 0.25 * STEP_M)
     at = predicted_m + offsets[:, None] + measured.arc_m

@@ -7,12 +7,23 @@ at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import field, fields
+from dataclasses import field
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, freeze_rows
+from railfix.core.arrays import (
+    Datetimes,
+    Floats,
+    Indices,
+    Integers,
+    Masks,
+    RowArrays,
+    Strings,
+    dataclass,
+    freeze_rows,
+    join_rows,
+)
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import nearest_rows
 
@@ -35,7 +46,7 @@ SENSORS: Final = ("tachometer", "inertial", "radar", "ranging", "balises")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Samples:
+class Samples(RowArrays):
     """N samples: read-only arrays with one row each."""
 
     #: Instant of each sample, shape (N,).
@@ -150,19 +161,17 @@ class SensorSamples:
         for name, rows in self.tables.items():
             first = 0 if np.isnat(begin) else int(np.searchsorted(rows.time, begin, side="right"))
             last = int(np.searchsorted(rows.time, end, side="right"))
-            parts[name] = type(rows)(**{f.name: getattr(rows, f.name)[first:last] for f in fields(rows)})
+            parts[name] = rows.take(slice(first, last))
         return SensorSamples(**parts, silent=self.silent)
 
     def merge(self, later: SensorSamples) -> SensorSamples:
         """Return these samples and others in order of time; some of the others may be older than some of these."""
         parts: dict[str, Any] = {}
         for name, after in later.tables.items():
-            before: Any = getattr(self, name)
-            values = {f.name: np.concatenate([getattr(before, f.name), getattr(after, f.name)]) for f in fields(after)}
+            before: Samples = getattr(self, name)
+            parts[name] = both = join_rows([before, after])
             if len(before) and len(after) and after.time[0] < before.time[-1]:
-                order = np.argsort(values["time"], kind="stable")
-                values = {column: rows[order] for column, rows in values.items()}
-            parts[name] = type(after)(**values)
+                parts[name] = both.take(np.argsort(both.time, kind="stable"))
         return SensorSamples(**parts, silent=later.silent)
 
     def __bool__(self) -> bool:

@@ -8,7 +8,7 @@ one that no line has. Two rules:
 * ``"map"``: against the gradient of the line at the present place, with a latch: a slip ends only when the wheel has
   come back to the speed carried by inertia and the pitch fits.
 
-While a slip lasts, speed and way come from the accelerometer less the pitch and its offset, learnt while the wheel
+While a slip lasts, speed and distance come from the accelerometer less the pitch and its offset, learnt while the wheel
 rolls, from `LOOK_BACK_S` before the detection. The pitch is that of the line where the place is known; with a gyro the
 integral of the pitch rate, which follows the line slowly, or without the line the pitch by wheel and accelerometer (P2
 2.1(3)).
@@ -92,7 +92,7 @@ class SlipResult:
     speed_mps: Floats  #: Of the wheel where it rolls, else carried; NaN in INIT and EXPIRED; shape (N,).
     #: Integral of the speed from the first sample, each slip corrected from its look-back on; at its end by what wheel
     #: and inertia differ by then, which has grown evenly since; shape (N,).
-    way_m: Floats
+    distance_m: Floats
     #: Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses; shape (N,).
     metric: Floats
     smooth: Floats  #: Mean of the metric over `SMOOTHING_S` less the accelerometer's offset; shape (N,).
@@ -150,7 +150,7 @@ class MotionSamples(NamedTuple):
 def find_slips(
     samples: MotionSamples, *, limits: SlipLimits | None = None, state: SlipState | None = None
 ) -> tuple[SlipResult, SlipState | None]:
-    """Return the state of the motion, its speed and way, each sample from itself and earlier ones.
+    """Return the state of the motion, its speed and distance, each sample from itself and earlier ones.
 
     `state` is what the samples before have left; the one returned goes on with the next samples, None before the first.
     """
@@ -165,11 +165,11 @@ def find_slips(
     for k, (dt, *values) in enumerate(zip(steps, *(column.tolist() for column in columns), strict=True)):
         automaton.step(dt, *values)
         rows[k] = automaton.row()
-    states, speed, way, metric, smooth, pitch, bias = rows.T
+    states, speed, distance, metric, smooth, pitch, bias = rows.T
     result = SlipResult(
         state=states.astype(np.int8),
         speed_mps=speed,
-        way_m=way,
+        distance_m=distance,
         metric=metric,
         smooth=smooth,
         pitch=pitch,
@@ -184,7 +184,7 @@ class _Automaton:
     def __init__(self, limits: SlipLimits) -> None:
         self.limits = limits
         self.state = MotionState.INIT
-        self.speed, self.way, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
+        self.speed, self.distance, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
         self.pitch, self.bias = float("nan"), 0.0
         self._smooth, self._limit, self._square = 0.0, _MAP_LIMIT, 0.0
         self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = 0.0
@@ -200,7 +200,7 @@ class _Automaton:
 
     def row(self) -> tuple[float, ...]:
         """Return the values of `SlipResult` at the last sample."""
-        return self.state, self.speed, self.way, self.metric, self._smooth, self.pitch, self.bias
+        return self.state, self.speed, self.distance, self.metric, self._smooth, self.pitch, self.bias
 
     def step(
         self, dt: float, wheel: float, acceleration: float, force: float, sine: float, body: list[float], since: float
@@ -232,7 +232,7 @@ class _Automaton:
         else:
             self._quiet(dt, force, inertial)
         if self.speed == self.speed:
-            self.way += self.speed * dt
+            self.distance += self.speed * dt
         self._past.append((self._age, self.speed, inertial))
 
     def _pitch_rate(self, wheel: float, right: float, pitching: float, yawing: float) -> float:
@@ -281,7 +281,7 @@ class _Automaton:
         self._fits = self._fits + dt if fits else 0.0
         if self._fits >= _LATCH_S:
             lasted = self._carried + LOOK_BACK_S + limits.confirm_s + SMOOTHING_S
-            self.way += 0.5 * lasted * (self._gap / self._fits if self._fits else 0.0)
+            self.distance += 0.5 * lasted * (self._gap / self._fits if self._fits else 0.0)
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
@@ -308,19 +308,19 @@ class _Automaton:
                 self._look_back(inertial, dt)
 
     def _look_back(self, inertial: float, dt: float) -> None:
-        """Put speed and way on the carry from a little before the detection."""
+        """Put speed and distance on the carry from a little before the detection."""
         begin = self._age - LOOK_BACK_S - self.limits.confirm_s - SMOOTHING_S
         past = [entry for entry in self._past if entry[0] >= begin and entry[1] == entry[1]]
         if not past:
             return
-        speed, old_way, new_way = past[0][1], 0.0, 0.0
+        speed, old_distance, new_distance = past[0][1], 0.0, 0.0
         for before, after in pairwise(past):
             step = after[0] - before[0]
             speed += after[2] * step
-            old_way += after[1] * step
-            new_way += speed * step
+            old_distance += after[1] * step
+            new_distance += speed * step
         self.speed = speed + inertial * dt
-        self.way += new_way - old_way
+        self.distance += new_distance - old_distance
 
     def _quiet(self, dt: float, force: float, inertial: float) -> None:
         """No pulse: standing, starting or stopping slowly, or rolling away."""

@@ -1,4 +1,4 @@
-"""Speed, acceleration and way from the instants of a tachometer's pulses (P2 2.2), and checks of its settings.
+"""Speed, acceleration and distance from the instants of a tachometer's pulses (P2 2.2), and checks of its settings.
 
 Over the pulses k0 to k the mean speed is ``(k - k0) p / (t_k - t_k0)``; where the acceleration is even it is the speed
 at the middle of the interval, and that instant is returned with it.
@@ -94,11 +94,11 @@ def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
         return np.asarray((late.speed_mps - early.speed_mps) / seconds(late.time - early.time))
 
 
-def way_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
-    """Return the signed way run up to instants, from pulses up to each, shape (N,) [m].
+def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
+    """Return the signed distance run up to instants, from pulses up to each, shape (N,) [m].
 
-    Between pulses the way goes on at the last speed, by less than one pulse. 0 before the first pulse. Where the sensor
-    has no direction every pulse counts forward.
+    Between pulses the distance goes on at the last speed, by less than one pulse. 0 before the first pulse. Where the
+    sensor has no direction every pulse counts forward.
     """
     limits = limits or TachometerLimits()
     if not len(pulses):

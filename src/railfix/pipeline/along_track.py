@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, copy_with
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, copy_with, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
@@ -131,7 +131,7 @@ def _against_wheel(
 ) -> tuple[WheelSigns, WheelState]:
     """Compare positions with the distance that the wheel has rolled."""
     parts = [(replay.epochs.time, replay.sensors.wheel_m) for replay in replays]
-    rolled = np.concatenate([np.full(len(time), np.nan) if way is None else way for time, way in parts])
+    rolled = np.concatenate([np.full(len(time), np.nan) if distance is None else distance for time, distance in parts])
     return wheel_signs(
         np.concatenate([time for time, _ in parts]), arc_m, sigma_m, rolled, state, config.interference,
         signed=all(replay.sensors.wheel_sign == "measured" for replay in replays if replay.sensors.wheel_m is not None),
@@ -211,7 +211,7 @@ def _run_filter(
     for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
         part = epochs if last - first == len(epochs) else epochs.take(slice(first, last))
         if len(part) and state.fixed is not None and _stretch(part.time[0]) != _stretch(state.fixed.time):
-            state = _begun_anew(state, state.fixed)
+            state = _restart_state(state, state.fixed)
         before = state.sensors
         sensors, sensed, kept = sensor_epochs(
             samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
@@ -233,7 +233,7 @@ def _run_filter(
         state = copy_with(state, track=after, level=level, sensors=kept, fixed=fixed)
         parts.append(tracked)
         motions.append(sensed)
-    return _join(parts), SensedMotion.concatenate(motions), tuple(replays), state
+    return join_rows(parts), join_rows(motions), tuple(replays), state
 
 
 def _gate(
@@ -246,12 +246,12 @@ def _gate(
     config: Config,
 ) -> tuple[GnssEpochs, ReturnState]:
     """Return epochs without the codes that an outage makes doubtful."""
-    way = np.full(len(epochs), np.nan)
+    distance = np.full(len(epochs), np.nan)
     for other in (sensors.radar_m, sensors.wheel_m):
         if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
-            way = np.where(np.isfinite(other), other, way)
+            distance = np.where(np.isfinite(other), other, distance)
     observed = np.asarray(np.isfinite(epochs.code_m).any(axis=1))
-    refused, gate = gated_codes(epochs.time, observed, way, place_m, sigma_m, state.gate, line, config.sensors)
+    refused, gate = gated_codes(epochs.time, observed, distance, place_m, sigma_m, state.gate, line, config.sensors)
     return (
         replace(epochs, code_m=np.where(refused[:, None], np.nan, epochs.code_m)) if refused.any() else epochs
     ), gate
@@ -282,13 +282,13 @@ def _stretch(time: np.datetime64) -> int:
     return int(time.astype(np.int64)) // _STRETCH_NS
 
 
-def _begun_anew(state: FilterState, fixed: FilterFix) -> FilterState:
+def _restart_state(state: FilterState, fixed: FilterFix) -> FilterState:
     """Return the state at the beginning of a stretch: what the sensors carry begins from the place of the filter."""
     sensors = state.sensors
     if sensors.motion.tick:
         motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
         sensors = replace(sensors, motion=motion)
-    gate = replace(state.gate, place_m=fixed.arc_m, sigma_m=fixed.sigma_m, way_m=0.0)
+    gate = replace(state.gate, place_m=fixed.arc_m, sigma_m=fixed.sigma_m, distance_m=0.0)
     return replace(state, sensors=sensors, anchor=fixed, gate=gate)
 
 
@@ -297,13 +297,6 @@ def _find_fix(tracked: Tracked) -> FilterFix:
     arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
     sigma = float(tracked.sigma_m[-1])
     return FilterFix(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
-
-
-def _join(parts: list[Tracked]) -> Tracked:
-    """Return the places of one stretch after the other."""
-    if len(parts) == 1:
-        return parts[0]
-    return Tracked(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Tracked)})
 
 
 def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:

@@ -8,13 +8,13 @@ other, also where it backs.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import field, replace
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, dataclass, join_rows
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises
@@ -83,7 +83,7 @@ def balise_epochs(
 #: Verdicts on a place or a reading.
 VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
-#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the way since the last balise read.
+#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the distance since the last balise read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
 #: Epochs further apart have nothing between them [s]; a reading may be so far outside of the interval of its passing.
 _APART_S: Final = 2.0
@@ -134,7 +134,7 @@ class PassingState:
     read: Datetimes  #: Last reading, shape (M,).
     #: Not yet compared, as the epoch after them is to come.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Readings that were right, the last before the chunk first, with the place of the filter [m].
+    #: Readings that were right, the last one `_APART_S` before the chunk's end first, with the filter's place [m].
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -166,19 +166,15 @@ def find_passings(
     rows = np.flatnonzero(np.isfinite(tracked.arc_m))
     values = np.stack([getattr(tracked, name)[rows] for name in _VALUES], axis=1)
     time, values = np.concatenate([state.time, tracked.time[rows]]), np.concatenate([state.values, values])
+    readings = join_rows([state.waiting, readings])
     if not len(time):
-        return (), replace(state, waiting=_join_readings(state.waiting, readings))
-    state, wrong = _judge(
-        _join_readings(state.waiting, readings), listed, arcs, trajectory.turn_m, time, values, state, limits
-    )
+        return (), replace(state, waiting=readings)
+    state, wrong = _judge(readings, listed, arcs, trajectory.turn_m, time, values, state, limits)
     passed, state = _pass(listed, arcs, trajectory.turn_m, time, values, state)
     found = sorted([*wrong, *passed], key=lambda passing: passing.time)
-    return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=state.right[-1:])
-
-
-def _join_readings(before: BaliseReadings, after: BaliseReadings) -> BaliseReadings:
-    names = [f.name for f in fields(BaliseReadings)]
-    return BaliseReadings(**{n: np.concatenate([getattr(before, n), getattr(after, n)]) for n in names})
+    earlier = [k for k, (at, _) in enumerate(state.right) if seconds(time[-1] - at) > _APART_S]
+    right = state.right[earlier[-1] if earlier else 0 :]
+    return tuple(found), replace(state, time=time[-1:], values=values[-1:], right=right)
 
 
 def _judge(
@@ -219,8 +215,7 @@ def _judge(
             here = "" if np.isnan(real).all() else str(listed.name[np.nanargmin(real)])
             chainage = float(listed.chainage_m[mark])
             wrong.append(replace(own, verdict=CONTRADICTS, chainage_m=chainage, read_error_m=error, here=here))
-    waiting = BaliseReadings(**{f.name: getattr(readings, f.name)[~heard] for f in fields(BaliseReadings)})
-    return replace(state, read=read, waiting=waiting, right=tuple(right)), wrong
+    return replace(state, read=read, waiting=readings.take(~heard), right=tuple(right)), wrong
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:

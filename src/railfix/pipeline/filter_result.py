@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Masks, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Masks, dataclass, join_rows
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 _OUTAGE_S: Final = 2.0
 #: Positions that must agree before codes count again.
 _AGREEING: Final = 3
-#: Standard deviation of a way by the sensors since the beginning of a stretch, as a share.
-_WAY_SHARE: Final = 0.01
+#: Standard deviation of a distance by the sensors since the beginning of a stretch, as a share.
+_DISTANCE_SHARE: Final = 0.01
 #: Least standard deviation of a single epoch at the end of a tunnel [m]: multipath of the portal.
 _LEAST_SIGMA_M: Final = 2.0
 _NEVER: Final = np.datetime64("NaT", "ns")
@@ -56,10 +56,10 @@ class ReturnState:
     """What one chunk leaves to the next."""
 
     time: np.datetime64 = _NEVER  #: Last epoch whose codes counted; NaT before the first.
-    #: Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a way.
+    #: Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a distance.
     place_m: float = float("nan")
     sigma_m: float = float("nan")
-    way_m: float = 0.0  #: Since the filter's own place.
+    distance_m: float = 0.0  #: Since the filter's own place.
     returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without.
     agreeing: int = 0  #: Positions in a row that agreed since.
 
@@ -67,7 +67,7 @@ class ReturnState:
 def gated_codes(
     time: Datetimes,
     observed: Masks,
-    way_m: Floats,
+    distance_m: Floats,
     place_m: Floats,
     sigma_m: Floats,
     state: ReturnState,
@@ -78,15 +78,15 @@ def gated_codes(
 
     After an outage the position of each epoch by itself is compared with the place coasted on the sensors: codes count
     again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
-    and after `SensorLimits.return_s` in any case. Where no sensor gives a way nothing is refused.
+    and after `SensorLimits.return_s` in any case. Where no sensor gives a distance nothing is refused.
 
-    Shape (T,): `observed`, epochs with codes; `way_m`, by the sensors since the epoch before; `place_m`, `sigma_m` of
-    each epoch by itself; NaN where there is none. `state` has the place of the filter at the epoch before the first.
+    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the epoch before; `place_m`, `sigma_m`
+    of each epoch by itself; NaN where there is none. `state` has the place of the filter at the epoch before the first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)
-    ways = state.way_m + np.cumsum(way_m)
-    coasted = state.place_m + np.cumsum(way_m)
-    spread = np.sqrt(state.sigma_m**2 + (_WAY_SHARE * ways) ** 2 + np.maximum(sigma_m, _LEAST_SIGMA_M) ** 2)
+    distances = state.distance_m + np.cumsum(distance_m)
+    coasted = state.place_m + np.cumsum(distance_m)
+    spread = np.sqrt(state.sigma_m**2 + (_DISTANCE_SHARE * distances) ** 2 + np.maximum(sigma_m, _LEAST_SIGMA_M) ** 2)
     fits = np.abs(line.nearest_m(place_m, coasted) - coasted) <= limits.return_sigmas * spread
     last, returned, agreeing = state.time, state.returned, state.agreeing
     steps = seconds(np.diff(time, prepend=last if not np.isnat(last) else time[:1]))
@@ -103,7 +103,12 @@ def gated_codes(
     if not len(time):
         return refused, state
     return refused, replace(
-        state, time=last, place_m=float(coasted[-1]), way_m=float(ways[-1]), returned=returned, agreeing=agreeing
+        state,
+        time=last,
+        place_m=float(coasted[-1]),
+        distance_m=float(distances[-1]),
+        returned=returned,
+        agreeing=agreeing,
     )
 
 
@@ -179,16 +184,9 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
             found, later = smooth_steps(trace, before or TrackState.empty(), later, limits)
             arc = found.arc_m + line.round_m(found.arc_m)
             parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
-    parts.reverse()
-    empty = {"time": np.empty(0, dtype="datetime64[ns]")}
-    return SmoothedTrack(
-        **{
-            f.name: np.concatenate([getattr(part, f.name) for part in parts])
-            if parts
-            else empty.get(f.name, np.empty(0))
-            for f in fields(SmoothedTrack)
-        }
-    )
+    nothing = np.empty(0)
+    empty = SmoothedTrack(time=nothing.astype("M8[ns]"), arc_m=nothing, sigma_m=nothing, speed_mps=nothing)
+    return join_rows([*reversed(parts), empty])
 
 
 def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:

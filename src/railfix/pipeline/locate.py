@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, dataclass, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
@@ -96,13 +96,7 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
 
 
 def locate(obs: Observations, received: Received, config: Config, book: ChannelBook) -> Located:
-    """Compute the conventional position of every epoch, ranges that disagree left out.
-
-    Parameters
-    ----------
-    obs, received, config, book
-        As for `uncorrected_ranges`.
-    """
+    """Compute the conventional position of every epoch, ranges that disagree left out; see `uncorrected_ranges`."""
     return locate_ranges(obs.time, uncorrected_ranges(obs, received, config, book), config)
 
 
@@ -138,18 +132,6 @@ _LONGEST_STEP: Final = 2.5
 _CURVED_MPS2: Final = 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurveyEpochs:
-    """Epochs of a log that a survey uses."""
-
-    time: Datetimes  #: Shape (T,).
-    #: 3-D positions, NaN where there is none, and standard deviations east, north, up; shape (T, 3).
-    ecef_m: Floats
-    sigma_m: Floats
-    n_used: Indices  #: Satellites of the position, shape (T,).
-    signals: RunSignals  #: Rows are those epochs.
-
-
 def survey_run(
     parts: Iterable[Observations], received: Received, config: Config, limits: SurveyLimits, *, name: str
 ) -> SurveyRun:
@@ -158,33 +140,28 @@ def survey_run(
     Between two parts there is no change. ValueError: fewer than three epochs have a position.
     """
     book, slips = ChannelBook(config), None
-    epochs: list[SurveyEpochs] = []
+    runs: list[SurveyRun] = []
+    signals: list[RunSignals] = []
     for part in parts:
         if len(part):
-            found, slips = survey_epochs(part, received, config, limits, book, slips)
-            epochs.append(found)
-    if sum(int(np.isfinite(e.ecef_m[:, 0]).sum()) for e in epochs) < 3:
+            run, own, slips = _survey_part(part, received, config, limits, book, slips)
+            before = sum(map(len, runs))
+            signals.append(replace(own, row=own.row + before, step=own.step + before))
+            runs.append(run)
+    if sum(int(np.isfinite(run.ecef_m[:, 0]).sum()) for run in runs) < 3:
         raise ValueError("fewer than three epochs have a position; are the navigation files of the day of the log?")
-    first = np.cumsum([0, *(len(e.time) for e in epochs)])
-    columns = {
-        item.name: np.concatenate([getattr(e.signals, item.name) for e in epochs]) for item in fields(RunSignals)
-    }
-    for index in ("row", "step"):
-        shifted = [getattr(e.signals, index) + start for e, start in zip(epochs, first, strict=False)]
-        columns[index] = np.concatenate(shifted)
-    time, ecef, sigma = (np.concatenate([getattr(e, n) for e in epochs]) for n in ("time", "ecef_m", "sigma_m"))
-    return SurveyRun(name=name, time=time, ecef_m=ecef, sigma_m=sigma, signals=RunSignals(**columns))
+    return replace(join_rows(runs), name=name, signals=join_rows(signals))
 
 
-def survey_epochs(
+def _survey_part(
     obs: Observations,
     received: Received,
     config: Config,
     limits: SurveyLimits,
     book: ChannelBook,
     slip_state: CycleSlipState | None,
-) -> tuple[SurveyEpochs, CycleSlipState | None]:
-    """Return the epochs of some observations, thinned to the interval of the survey, and the state of the slips.
+) -> tuple[SurveyRun, RunSignals, CycleSlipState | None]:
+    """Return the run of some observations, thinned to the interval of the survey, and the state of the slips.
 
     A range changes by the carrier phase where it goes on without a slip at every epoch between, else by the mean of
     the Dopplers at both ends.
@@ -233,11 +210,5 @@ def survey_epochs(
         change_sigma_m=np.where(joined, phase_m, doppler_m)[step, of_step],
         by_doppler=doppler[step, of_step],
     )
-    epochs = SurveyEpochs(
-        time=time,
-        ecef_m=located.ecef_m[rows],
-        sigma_m=np.nan_to_num(located.sigma_m[rows][:, [1, 0, 2]], nan=1.0),
-        n_used=located.n_used[rows],
-        signals=signals,
-    )
-    return epochs, after
+    sigma = np.nan_to_num(located.sigma_m[rows][:, [1, 0, 2]], nan=1.0)
+    return SurveyRun(name="", time=time, ecef_m=located.ecef_m[rows], sigma_m=sigma), signals, after

@@ -7,7 +7,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Strings, dataclass
+from railfix.core.arrays import Floats, Strings, dataclass, join_rows, take_rows
 from railfix.core.errors import SettingsError
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
@@ -158,7 +158,7 @@ def _drop_expired(table: Records, label: Strings, validity: Floats, time: np.dat
         return table
     order = np.argsort(table.toe, kind="stable")
     kept[order[len(order) - 1 - np.unique(label[order][::-1], return_index=True)[1]]] = True
-    return replace(table, **{item.name: getattr(table, item.name)[kept] for item in fields(table)})
+    return take_rows(table, kept)
 
 
 def merge_navigation(old: Navigation, new: Navigation) -> Navigation:
@@ -180,14 +180,7 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
     known = set(zip(*(getattr(old, name).tolist() for name in key), strict=True))
     rows = zip(*(getattr(new, name).tolist() for name in key), strict=True)
     fresh = np.array([row not in known for row in rows], dtype=bool)
-    if not fresh.any():
-        return old
-    return replace(
-        old,
-        **{
-            item.name: np.concatenate([getattr(old, item.name), getattr(new, item.name)[fresh]]) for item in fields(old)
-        },
-    )
+    return join_rows([old, take_rows(new, fresh)]) if fresh.any() else old
 
 
 def _with_ionosphere(received: Received, config: Config) -> Received:

@@ -62,11 +62,6 @@ class Column(Generic[Source]):
         """Decimals of a number in CSV files."""
         return decimals(self.name)
 
-    @property
-    def polars_type(self) -> pl.DataType:
-        """Type of the column in a table."""
-        return pl.Enum(self.words) if self.words else self.dtype
-
     def of(self, source: Source) -> Any:
         """Return the values from the source of a table; None where it has none."""
         if not isinstance(self.values, str):
@@ -78,7 +73,7 @@ class Column(Generic[Source]):
 
     def series(self, values: NDArray[Any] | str | None, rows: int) -> pl.Series:
         """Return values as a column of a table; NaN as null."""
-        kind = self.polars_type
+        kind = pl.Enum(self.words) if self.words else self.dtype
         if values is None or isinstance(values, str):
             return pl.Series(values=[values], dtype=kind).new_from_index(0, rows)
         if self.words:

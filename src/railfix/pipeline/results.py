@@ -91,23 +91,13 @@ class AntennaState(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True)
 class State(NotebookTable):
-    """State after a chunk: everything that the next one needs.
-
-    Attributes
-    ----------
-    antennas : mapping of str to AntennaState
-    base : BaseState or None
-        Of the base station.
-    received : Received or None
-        Navigation records and SBAS messages so far; None: those that the processor was made with.
-    fusion : mapping of str to FilterState
-        State of the filter along the track, by antenna.
-    """
+    """State after a chunk: everything that the next one needs."""
 
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
+    #: Navigation records and SBAS messages so far; None: those that the processor was made with.
     received: Received | None = None
-    base: BaseState | None = None
-    fusion: Mapping[str, FilterState] = field(default_factory=dict)
+    base: BaseState | None = None  #: Of the base station.
+    fusion: Mapping[str, FilterState] = field(default_factory=dict)  #: State of the filter along the track, by antenna.
 
     def __repr__(self) -> str:
         antennas = ", ".join(self.antennas) or "before the first epoch"
@@ -119,120 +109,73 @@ class AntennaResult(NotebookTable, OnDemand):
     """Results of one antenna, T epochs by M channels.
 
     The channels are those of the observations given, of all antennas where few epochs of several are given together.
-
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    satellite, signal : ndarray of str, shape (M,)
-    status : ndarray of int8, shape (T,)
-        `reasons.Status`.
-    chainage_m, kilometrage_m, arc_m : ndarray, shape (T,) [m]
-        Along the line (reference point named by the trajectory), its own marking, and along the
-        antenna's trajectory. NaN where the status has no position.
-    along_sigma_m : ndarray, shape (T,) [m]
-        Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
-        itself; satellites and atmosphere; the map error; and the distance to an open other place, by its probability.
-    own_sigma_m : ndarray, shape (T,) [m]
-        Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of
-        the receiver's noise and the noise of these residuals, widened by Student's t where few ranges are
-        redundant. Also given where the position is dropped.
-    noise_scale : ndarray, shape (T,)
-        Standard deviation of this receiver's ranges against the one the weights assume: root mean square of
-        what RAIM left in the epochs before, with forgetting.
-    ecef_m : ndarray, shape (T, 3) [m]
-        Antenna.
-    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-    n_used, n_rejected : ndarray of int, shape (T,)
-        Satellites used; satellites with a code that were not used.
-    conventional_status : ndarray of int8, shape (T,)
-        `railfix.pipeline.solve.PointStatus` of the conventional position, which is kept as it is.
-    conventional_ecef_m : ndarray, shape (T, 3) [m]
-        3-D single point from the same ranges.
-    conventional_arc_m, conventional_chainage_m, conventional_offset_m : ndarray, shape (T,) [m]
-        Nearest point of the trajectory to it, and how far that is.
-    reason : ndarray of int64, shape (T, M)
-        `reasons.Reason` bits, 0 = used.
-    elevation_deg, azimuth_deg, cn0_dbhz, sigma_m, corrected_code_m, residual_m : ndarray, shape (T, M)
-        NaN where unknown; residuals of the position on the line.
-    bound_sigma_m : ndarray, shape (T, M) [m]
-        Least sigma of each range in the level, by the error model; 0 without one.
-    satellites : SatelliteStates
-        Of the channels in `columns`.
-    columns : ndarray of int, shape (K,)
-        Channels that settings allow, in the order of the intermediate results below.
-    second : SecondCodes or None
-        Second codes of satellites, where two frequencies are used, shape (T, K).
-    combined : Combined or None
-        How they were combined with the first.
-    screens : mapping of str to Screened
-        Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which
-        judges positions, has shape (T,).
-    single_point : SinglePoint
-        The conventional position: every constellation with a clock of its own.
-    section : Section
-    constrained : Constrained
-    phase : PhasePositions or None
-        Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
-    raim : RaimResult
-        Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
-    protection : ProtectionResult or None
-        Protection levels along the line; None where they are off.
-    map_offset : MapOffset
-        Mean offset of the 3-D positions of the last minutes from the line.
-    interference : Interference or None
-        Jamming and spoofing suspected; None where that is off.
-    araim : AraimResult or None
-        ARAIM levels; None without an integrity support message.
-    clocks : tuple of str
-        Letter of each receiver clock of the results above, length G.
-    clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
-        Inter-system bias known before each epoch: that clock less the reference clock.
     """
 
-    time: Datetimes
+    time: Datetimes  #: Shape (T,).
+    #: Shape (M,).
     satellite: Strings
     signal: Strings
-    status: Codes
+    status: Codes  #: `reasons.Status`; shape (T,).
+    #: Along the line (reference point named by the trajectory), its own marking, and along the antenna's trajectory.
+    #: NaN where the status has no position; shape (T,).
     chainage_m: Floats
     kilometrage_m: Floats
     arc_m: Floats
+    #: Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
+    #: itself; satellites and atmosphere; the map error; and the distance to an open other place, by its probability;
+    #: shape (T,).
     along_sigma_m: Floats
+    #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
+    #: receiver's noise and the noise of these residuals, widened by Student's t where few ranges are redundant. Also
+    #: given where the position is dropped; shape (T,).
     own_sigma_m: Floats
+    #: Standard deviation of this receiver's ranges against the one the weights assume: root mean square of what RAIM
+    #: left in the epochs before, with forgetting; shape (T,).
     noise_scale: Floats
-    ecef_m: Floats
+    ecef_m: Floats  #: Antenna; shape (T, 3).
+    #: Shape (T,).
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
+    #: Satellites used; satellites with a code that were not used; shape (T,).
     n_used: Integers
     n_rejected: Integers
+    #: `railfix.pipeline.solve.PointStatus` of the conventional position, which is kept as it is; shape (T,).
     conventional_status: Codes
-    conventional_ecef_m: Floats
+    conventional_ecef_m: Floats  #: 3-D single point from the same ranges; shape (T, 3).
+    #: Nearest point of the trajectory to it, and how far that is; shape (T,).
     conventional_arc_m: Floats
     conventional_chainage_m: Floats
     conventional_offset_m: Floats
-    reason: Bits
+    reason: Bits  #: `reasons.Reason` bits, 0 = used; shape (T, M).
+    #: NaN where unknown; residuals of the position on the line; shape (T, M).
     elevation_deg: Floats
     azimuth_deg: Floats
     cn0_dbhz: Floats
     sigma_m: Floats
-    bound_sigma_m: Floats
+    bound_sigma_m: Floats  #: Least sigma of each range in the level, by the error model; 0 without one; shape (T, M).
+    #: NaN where unknown; residuals of the position on the line; shape (T, M).
     corrected_code_m: Floats
     residual_m: Floats
-    satellites: SatelliteStates
-    columns: Indices
-    second: SecondCodes | None
-    combined: Combined | None
+    satellites: SatelliteStates  #: Of the channels in `columns`.
+    columns: Indices  #: Channels that settings allow, in the order of the intermediate results below; shape (K,).
+    second: SecondCodes | None  #: Second codes of satellites, where two frequencies are used, shape (T, K).
+    combined: Combined | None  #: How they were combined with the first.
+    #: Metric and verdict of each screen that was on, by name,
+    #: shape (T, K); "antenna_spacing", which judges positions, has shape (T,).
     screens: Mapping[str, Screened]
-    single_point: SinglePoint
+    single_point: SinglePoint  #: The conventional position: every constellation with a clock of its own.
     section: Section
     constrained: Constrained
+    #: Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
     phase: PhasePositions | None
-    raim: RaimResult
-    protection: ProtectionResult | None
-    map_offset: MapOffset
-    interference: Interference | None
-    araim: AraimResult | None
-    clocks: tuple[str, ...]
+    raim: RaimResult  #: Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
+    protection: ProtectionResult | None  #: Protection levels along the line; None where they are off.
+    map_offset: MapOffset  #: Mean offset of the 3-D positions of the last minutes from the line.
+    interference: Interference | None  #: Jamming and spoofing suspected; None where that is off.
+    araim: AraimResult | None  #: ARAIM levels; None without an integrity support message.
+    clocks: tuple[str, ...]  #: Letter of each receiver clock of the results above, length G.
+    #: Inter-system bias known before each epoch: that clock less the reference clock; shape (T, G).
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats
 
@@ -254,19 +197,11 @@ class AntennaResult(NotebookTable, OnDemand):
 
 @dataclass(frozen=True, kw_only=True)
 class Result(NotebookTable):
-    """Results of one chunk.
-
-    Attributes
-    ----------
-    antennas : mapping of str to AntennaResult
-    notes : tuple of str
-        Differences between what was asked for and what was used, one sentence each.
-    fusion : mapping of str to AlongTrack
-        Positions of the filter along the track, by antenna; empty where it is off.
-    """
+    """Results of one chunk."""
 
     antennas: Mapping[str, AntennaResult]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  #: Differences between what was asked for and what was used, one sentence each.
+    #: Positions of the filter along the track, by antenna; empty where it is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
 
     def __getitem__(self, antenna: str) -> AntennaResult:

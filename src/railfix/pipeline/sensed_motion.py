@@ -1,9 +1,9 @@
-"""Motion between the epochs by wheel and inertial unit (slips, carried ways), and places by features of the line."""
+"""Motion between the epochs by wheel and inertial unit (slips, carried distances), places by features of the line."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import field, fields, replace
+from collections.abc import Callable
+from dataclasses import field, replace
 from typing import Final
 
 import numpy as np
@@ -33,7 +33,7 @@ from railfix.motion.slip import (
     pitch_rate_radps,
     roll_sine,
 )
-from railfix.motion.tachometer import TachometerLimits, faults_until, pulse_acceleration, pulse_speeds, way_m
+from railfix.motion.tachometer import TachometerLimits, distance_m, faults_until, pulse_acceleration, pulse_speeds
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
@@ -87,7 +87,7 @@ class RateSeries:
     #: At which they hold, and when they were known; shape (K,).
     time: Datetimes
     known: Datetimes
-    way_m: Floats  #: Wheel's way since the tick before the first, in rising arc length; shape (K,).
+    distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).
     arc_m: Floats  #: Place of the antenna by the wheel; NaN where it is not known; shape (K,).
     #: Change of heading (+ to the right) and of pitch (+ nose up) since the tick before, shape (K,).
     turned_rad: Floats
@@ -106,14 +106,14 @@ class RateSeries:
 class FeatureState:
     """What one chunk leaves to the next."""
 
-    way_m: float = 0.0  #: Way at the last tick.
+    distance_m: float = 0.0  #: Distance at the last tick.
     angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch there, from any beginning [rad].
-    #: Whole metres of way passed without a break, in the order of travel; shape (M,).
+    #: Whole metres of distance passed without a break, in the order of travel; shape (M,).
     metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: At each, shape (M,).
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))
     pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
-    #: Place of the last accepted feature, its standard deviation, and the way there [m].
+    #: Place of the last accepted feature, its standard deviation, and the distance there [m].
     last: tuple[float, float, float] | None = None
     done_m: float = float("nan")  #: Place up to which features have been compared; NaN before the first.
 
@@ -143,12 +143,12 @@ def feature_fixes(
 ) -> tuple[list[FeatureFix], FeatureState]:
     """Return verdicts on the features that were passed, and the state to pass on.
 
-    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only ways without a slip and faster than
-    1 m/s count: heading and pitch are integrals, and a break restarts them. `facing`: 1 where the front points to
+    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only distances without a slip and faster
+    than 1 m/s count: heading and pitch are integrals, and a break restarts them. `facing`: 1 where the front points to
     rising arc length, else -1; `sigma_m`: of the place by the wheel; `noise`: standard deviations of gradient and
     curvature in one metre.
     """
-    ways = np.concatenate([[0.0], rates.way_m]) + state.way_m
+    distances = np.concatenate([[0.0], rates.distance_m]) + state.distance_m
     heading, pitch = (
         np.concatenate([[0.0], np.cumsum(turns)]) + begin
         for turns, begin in zip((rates.turned_rad, rates.climbed_rad), state.angles, strict=True)
@@ -166,12 +166,12 @@ def feature_fixes(
         if end - begin < 2:
             continue
         rows = slice(begin + 1, end + 1)  # ticks begin + 1 .. end - 1, with the one before them at index begin + 1
-        way = ways[rows]
-        whole = _whole_metres(way)
-        if len(metre) and len(whole) and whole[0] != metre[-1] + np.sign(way[-1] - way[0]):
+        distance = distances[rows]
+        whole = _whole_metres(distance)
+        if len(metre) and len(whole) and whole[0] != metre[-1] + np.sign(distance[-1] - distance[0]):
             metre, headings, pitches = metre[:0], headings[:0], pitches[:0]
-        rising = way if way[-1] >= way[0] else way[::-1]
-        turned, climbed = (v[rows] if way[-1] >= way[0] else v[rows][::-1] for v in (heading, pitch))
+        rising = distance if distance[-1] >= distance[0] else distance[::-1]
+        turned, climbed = (v[rows] if distance[-1] >= distance[0] else v[rows][::-1] for v in (heading, pitch))
         metre = np.concatenate([metre, whole])
         headings = np.concatenate([headings, np.interp(whole, rising, turned)])
         pitches = np.concatenate([pitches, np.interp(whole, rising, climbed)])
@@ -182,13 +182,13 @@ def feature_fixes(
         behind = body - sense * HALF_LENGTH_M
         passed = float(behind[-1])
         known = done if done == done else float(behind[0])
-        for feature in line.features:
+        for feature in line.features[:: int(sense)]:
             if not 0.0 < sense * (feature.arc_m - known) <= sense * (passed - known):
                 continue
             tick = begin + 1 + int(np.argmax(sense * (behind - feature.arc_m) >= 0.0))
-            shift = float(body[tick - begin - 1] - ways[tick + 1])  # from ways to places of the body's middle
+            shift = float(body[tick - begin - 1] - distances[tick + 1])  # from distances to places of the body's middle
             # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
-            passed_by = np.flatnonzero(sense * (metre - ways[tick + 1]) <= 0.0)[:: int(sense)]
+            passed_by = np.flatnonzero(sense * (metre - distances[tick + 1]) <= 0.0)[:: int(sense)]
             profile = (
                 np.asarray(metre[passed_by] + shift, dtype=np.float64),
                 headings[passed_by],
@@ -211,14 +211,14 @@ def feature_fixes(
     metre, headings, pitches = metre[-kept:], headings[-kept:], pitches[-kept:]
     angles = (float(np.nan_to_num(heading[-1])), float(np.nan_to_num(pitch[-1])))
     return fixes, replace(
-        state, way_m=float(ways[-1]), angles=angles, metre=metre, heading_rad=headings, pitch_rad=pitches, last=last,
-        done_m=done,
+        state, distance_m=float(distances[-1]), angles=angles, metre=metre, heading_rad=headings, pitch_rad=pitches,
+        last=last, done_m=done,
     )  # fmt: skip
 
 
-def _whole_metres(way_m: Floats) -> Integers:
+def _whole_metres(distance_m: Floats) -> Integers:
     """Return the whole metres between the first value and the last, in the order of travel."""
-    first, last = float(way_m[0]), float(way_m[-1])
+    first, last = float(distance_m[0]), float(distance_m[-1])
     if last >= first:
         return np.arange(np.floor(first) + 1, np.floor(last) + 1).astype(np.int64)
     return np.arange(np.ceil(first) - 1, np.ceil(last) - 1, -1).astype(np.int64)
@@ -255,7 +255,7 @@ _MEAN_NS: Final = 200_000_000
 _FAULT_NS: Final = _MEAN_NS + 150_000_000
 #: Samples before the last epoch that the next chunk needs [ns].
 REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
-#: States whose way is that of the inertial unit.
+#: States whose distance is that of the inertial unit.
 CARRIED: Final = (
     MotionState.STANDING, MotionState.LOW_SPEED, MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE,
     MotionState.ROLLING,
@@ -278,11 +278,11 @@ class SensedMotion:
     """Motion of T intervals between epochs; forward is that of the vehicle."""
 
     state: Codes  #: `railfix.motion.slip.MotionState`; INIT without both sensors; shape (T,).
-    way_m: Floats  #: Forward by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
+    distance_m: Floats  #: Forward by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
     doubt_mps: Floats  #: Speed that a slip not detected yet may have had, shape (T,).
     #: Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro; shape (T,).
     swing_mps2: Floats
-    #: Of the line under the body, toward rising arc length (P2 2.3): climb over way by wheel and accelerometer (an
+    #: Of the line under the body, toward rising arc length (P2 2.3): climb over distance by wheel and accelerometer (an
     #: offset of 0.01 m/s2 is 0.001), curvature by the yaw rate, + to the right, lean of the body over the contact
     #: points of the wheels, + with the left rail higher; and chainage of the body's middle then. NaN where the wheel
     #: does not roll faster than `SLOWEST_MPS`; cant without a vehicle; shape (T,).
@@ -290,13 +290,6 @@ class SensedMotion:
     curvature_1pm: Floats
     cant_m: Floats
     under_m: Floats
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[SensedMotion]) -> SensedMotion:
-        """Return parts one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,11 +310,11 @@ class SensedState:
 
 def nothing_sensed(intervals: int) -> SensedMotion:
     """Return the motion without a sensor."""
-    way, gradient, curvature, cant, under = np.full((5, intervals), np.nan)
+    distance, gradient, curvature, cant, under = np.full((5, intervals), np.nan)
     doubt, swing = np.zeros((2, intervals))
     return SensedMotion(
-        state=np.zeros(intervals, dtype=np.int8), way_m=way, doubt_mps=doubt, swing_mps2=swing, gradient=gradient,
-        curvature_1pm=curvature, cant_m=cant, under_m=under,
+        state=np.zeros(intervals, dtype=np.int8), distance_m=distance, doubt_mps=doubt, swing_mps2=swing,
+        gradient=gradient, curvature_1pm=curvature, cant_m=cant, under_m=under,
     )  # fmt: skip
 
 
@@ -363,8 +356,8 @@ def sensed_motion(
     known_speed = np.nan_to_num(speed.speed_mps)
     turning = pitch_rate_radps(force, rates, known_speed)
     start = np.datetime64(begin * _TICK_NS, "ns")
-    ways = way_m(pulses, np.concatenate([[start], when]), limits=tachometer)
-    arc = state.arc_m + facing * (ways[1:] - ways[0])
+    distances = distance_m(pulses, np.concatenate([[start], when]), limits=tachometer)
+    arc = state.arc_m + facing * (distances[1:] - distances[0])
     line_sine = facing * sine_at(arc)
     # the speed by pulses is that of the middle of their time: 0.065 s ago, 0.2 m after a slip of 3 s begun at 1 m/s2
     ago = seconds(when - speed.time)
@@ -388,8 +381,10 @@ def sensed_motion(
     turned, rolls = heading_rate_radps(force, rates, known_speed), found.state == MotionState.NORMAL
     # mean rates are those of the middle of their time
     middle = (ticks * _TICK_NS - _MEAN_NS // 2).astype("datetime64[ns]")
-    passed = way_m(pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer)
-    passed_m = state.arc_m + facing * (passed[1:] - ways[0])
+    passed = distance_m(
+        pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer
+    )
+    passed_m = state.arc_m + facing * (passed[1:] - distances[0])
     sine = facing * (found.metric + found.pitch)
     under = np.stack([
         sine / np.sqrt(1.0 - np.clip(sine, -0.5, 0.5) ** 2),
@@ -403,7 +398,7 @@ def sensed_motion(
     sensed = replace(sensed, under_m=along(sensed.under_m))
     step = 1e-9 * _TICK_NS
     series = RateSeries(
-        time=middle, known=when, way_m=facing * (passed[1:] - passed[0]), arc_m=passed_m, turned_rad=step * turned,
+        time=middle, known=when, distance_m=facing * (passed[1:] - passed[0]), arc_m=passed_m, turned_rad=step * turned,
         climbed_rad=step * (turning - found.gyro_bias_radps), speed_mps=facing * speed.speed_mps, rolls=rolls,
     )  # fmt: skip
     return sensed, series, replace(state, tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
@@ -435,7 +430,7 @@ def _by_interval(
     named = state[np.maximum.reduceat(np.where(top, np.arange(end), -1), first)]
     mean = np.add.reduceat(speed_mps[:end], first) / count[some]
     result.state[some] = named
-    result.way_m[some] = np.where(np.isin(named, CARRIED), mean * span_s[some], np.nan)
+    result.distance_m[some] = np.where(np.isin(named, CARRIED), mean * span_s[some], np.nan)
     result.doubt_mps[some] = np.maximum.reduceat(doubt_mps[:end], first)
     result.swing_mps2[some] = np.add.reduceat(swing_mps2[:end], first) / count[some]
     outs = (result.gradient, result.curvature_1pm, result.cant_m, result.under_m)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container
-from dataclasses import field, fields, replace
+from dataclasses import field, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -24,7 +24,7 @@ from railfix.motion.samples import (
     TachometerPulses,
 )
 from railfix.motion.slip import MotionState, SlipLimits
-from railfix.motion.tachometer import LEAST_SPEED_MPS, TachometerLimits, faults_until, way_m, window_start
+from railfix.motion.tachometer import LEAST_SPEED_MPS, TachometerLimits, distance_m, faults_until, window_start
 from railfix.pipeline.balises import BaliseLimits, BaliseState, balise_epochs
 from railfix.pipeline.sensed_motion import (
     CARRIED,
@@ -43,13 +43,13 @@ from railfix.pipeline.sensed_motion import (
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import RangeEpochs, SensorEpochs
 
-#: Longest time between epochs over which a way or a mean force is taken [s].
+#: Longest time between epochs over which a distance or a mean force is taken [s].
 _LONGEST_S: Final = 5.0
 #: Share of the samples of an interval that must be there for its mean.
 _COMPLETE: Final = 0.9
 #: Standard deviation of the speed that the inertial unit carries through a slip, a stop or a start [m/s].
 _CARRY_SIGMA_MPS: Final = 0.1
-#: Standard deviations in one metre of way: swings of the body of 1 mrad, and of its heading [1/m].
+#: Standard deviations in one metre of distance: swings of the body of 1 mrad, and of its heading [1/m].
 _GRADIENT_NOISE: Final = 1e-3
 _CURVATURE_NOISE_1PM: Final = 1e-4
 #: Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`) [m]: a map of 0.3 m places no
@@ -92,7 +92,7 @@ class SensorLimits(Settings):
     #: After an outage codes count again when three positions in a row are within so many sigmas, or so late.
     return_sigmas: float = Field(default=4.0, gt=0)
     return_s: float = Field(default=60.0, ge=0)
-    #: Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
+    #: Of a distance between two epochs beside the pulse: creep of a braked or driven wheel.
     wheel_sigma_m: float = Field(default=0.01, gt=0)
     #: Of one speed, and the usual time between two.
     radar_step_s: float = Field(default=0.1, gt=0)
@@ -141,7 +141,7 @@ def sensor_epochs(
     sources: Container[str] = ("wheel", "radar", "force", "feature", "balise", "range"),
     surroundings: LineReferences | None = None,
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
-    """Return ways and forces between the epochs, the motion that wheel and inertia agree on, and the state to keep.
+    """Return distances and forces between the epochs, the motion that wheel and inertia agree on, and the new state.
 
     Samples are those since the chunk before, epochs those of the antenna, shape (T,); the trajectory shows which way
     the front points, `sine_at` the sine of the gradient at arc lengths (the line is unknown without). `sources` names
@@ -183,18 +183,18 @@ def sensor_epochs(
             fixes, passing = feature_fixes(rates, surroundings.features, facing, motion.sigma_m, passing, noise=noise)
             values |= _places(fixes, rates, time)
     if wheel:
-        way = np.diff(way_m(pulses, edges, limits=limits.tachometer))
+        distance = np.diff(distance_m(pulses, edges, limits=limits.tachometer))
         known = (
             usable
             & (edges[:-1] >= pulses.time[0])
-            & ~(np.abs(way) < LEAST_SPEED_MPS * np.maximum(span, 1e-9))
+            & ~(np.abs(distance) < LEAST_SPEED_MPS * np.maximum(span, 1e-9))
             & (np.diff(faults_until(pulses, edges)) == 0)
         )
         quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
         known &= ~_silent("tachometer", samples, len(time))
         carried = np.isin(sensed.state, CARRIED)
         known &= ~carried & (sensed.state != MotionState.EXPIRED)
-        rolled = np.where(known, way, np.where(carried & usable, sensed.way_m, np.nan))
+        rolled = np.where(known, distance, np.where(carried & usable, sensed.distance_m, np.nan))
         speed_sigma = np.where(carried, _CARRY_SIGMA_MPS * (sensed.state != MotionState.STANDING), sensed.doubt_mps)
         values |= {
             "wheel_m": facing * rolled,
@@ -308,5 +308,4 @@ def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
 
 def _latest(samples: Samples, first: int) -> Samples:
     """Return samples from an index on."""
-    start = max(int(first), 0)
-    return type(samples)(**{f.name: getattr(samples, f.name)[start:] for f in fields(samples)})
+    return samples.take(slice(max(int(first), 0), None))

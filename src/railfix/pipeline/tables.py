@@ -53,17 +53,7 @@ def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def positions_table(result: Result) -> pl.DataFrame:
-    """Return one row an epoch and antenna, in order of time, then of the antennas as given.
-
-    Parameters
-    ----------
-    result : Result
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `POSITION_COLUMNS`.
-    """
+    """Return one row an epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
@@ -89,17 +79,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 
 def observations_table(result: Result) -> pl.DataFrame:
-    """Return one row an epoch, antenna and channel that was observed, in order of time, antenna, satellite.
-
-    Parameters
-    ----------
-    result : Result
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `OBSERVATION_COLUMNS`.
-    """
+    """Return `OBSERVATION_COLUMNS`: a row an epoch, antenna and channel that was observed, in the order of these."""
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
@@ -230,7 +210,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("protection_separation_m", "largest distance of a sub-filter of the level", "tracked.separation_m"),
         Column(
             "over_reading_m",
-            "how far the train may be behind: the level, at least 2 % of the way since codes were used "
+            "how far the train may be behind: the level, at least 2 % of the distance since codes were used "
             "(`L_DOUBTOVER` less `Q_LOCACC`)",
             "tracked.amount_m",
         ),
@@ -258,8 +238,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "tracked.code_weight",
         ),
         Column("motion_weight", "mean weight of Dopplers and phases", "tracked.motion_weight"),
-        Column("wheel_scale", "share that its way is too short by, as estimated", "tracked.wheel_scale"),
-        Column("radar_scale", "share that its way is too short by, as estimated", "tracked.radar_scale"),
+        Column("wheel_scale", "share that its distance is too short by, as estimated", "tracked.wheel_scale"),
+        Column("radar_scale", "share that its distance is too short by, as estimated", "tracked.radar_scale"),
         Column("force_offset_mps2", "offset of the accelerometer, as estimated", "tracked.force_offset_mps2"),
         Column(
             "map_scale",
@@ -304,8 +284,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
                 partial(_innovation, kind=kind),
             )
             for kind, unit, what in (
-                (Kind.WHEEL, "m", "way since the epoch before"),
-                (Kind.RADAR, "m", "way since the epoch before"),
+                (Kind.WHEEL, "m", "distance since the epoch before"),
+                (Kind.RADAR, "m", "distance since the epoch before"),
                 (Kind.FORCE, "mps2", "mean specific force forward"),
                 (Kind.PLACE, "m", "place by a feature of the line"),
                 (Kind.BALISE, "m", "place of a balise"),
@@ -341,14 +321,7 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
 def train_table(result: Result) -> pl.DataFrame:
     """Return the positions of the filter along the track, one row per epoch and antenna in order of time.
 
-    Parameters
-    ----------
-    result : Result
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
+    Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
     """
     parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
     return in_time_order(parts) if parts else pl.DataFrame()
@@ -408,7 +381,7 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
         Column("doubt_over_m", "how far the train may be behind the place: `L_DOUBTOVER` less `Q_LOCACC`",
                _get_field("amount_m")),
         Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _get_field("amount_m")),
-        Column("odometer_m", "for comparison: 5 m and 5 % of the way since the last balise read (SUBSET-041)",
+        Column("odometer_m", "for comparison: 5 m and 5 % of the distance since the last balise read (SUBSET-041)",
                _get_field("odometer_m")),
     )
 )  # fmt: skip

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks, Strings, dataclass
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.settings import Settings
@@ -50,7 +50,7 @@ class DopplerSpeedLimits(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dopplers:
+class Dopplers(FrozenArrays):
     """Dopplers of one receiver with their satellites, T epochs by K satellites."""
 
     time: Datetimes  #: Shape (T,).
@@ -63,9 +63,6 @@ class Dopplers:
     earlier_ecef_m: Floats
     sat_velocity_mps: Floats  #: Shape (T, K, 3).
     clock_rate_mps: Floats  #: c times the drift of the satellite clock, relativity included; shape (T, K).
-
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.time)

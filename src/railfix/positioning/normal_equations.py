@@ -12,7 +12,6 @@ The single point is the reference method of P1 section 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 from functools import cached_property
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, dataclass, kernel_array
+from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, Strings, dataclass, kernel_array
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.settings import Settings
 from railfix.track.trajectory import Trajectory
@@ -30,16 +29,12 @@ UNTIED_M: Final = 1e6  #: Sigma of an offset between clocks of which nothing is 
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClockTies:
+class ClockTies(RowArrays):
     """Known offsets between the receiver clocks of the constellations."""
 
     #: Receiver clock of each group less a clock common to all; any finite value where unknown; shape (T, G).
     offset_m: Floats
     sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where nothing is known; shape (T, G).
-
-    def take(self, epochs: Masks | Indices) -> ClockTies:
-        """Return the ties of some epochs, by mask or index."""
-        return ClockTies(offset_m=self.offset_m[epochs], sigma_m=self.sigma_m[epochs])
 
 
 class RangeArrays(NamedTuple):
@@ -275,7 +270,7 @@ class SinglePointLimits(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SinglePoint:
+class SinglePoint(RowArrays):
     """3-D positions, T epochs."""
 
     ecef_m: Floats  #: NaN with too few satellites, singular geometry, or no convergence; shape (T, 3).
@@ -284,10 +279,6 @@ class SinglePoint:
     covariance_m2: Floats  #: Of the position, from the weights; shape (T, 3, 3).
     wsse: Floats  #: Shape (T,).
     residual_m: Floats  #: Shape (T, M).
-
-    def take(self, epochs: Indices) -> SinglePoint:
-        """Return the positions of some epochs, by index."""
-        return SinglePoint(**{item.name: getattr(self, item.name)[epochs] for item in fields(self)})
 
 
 def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLimits | None = None) -> SinglePoint:

@@ -220,6 +220,7 @@ class ErrorModel:
 
 FORMAT: Final = "railfix error model 2"
 _COLUMNS: Final = tuple(item.name for item in fields(BinStatistics))
+_SIDES: Final = ("before", "after")  #: Of the screens.
 _COUNTS: Final = ("count", "blocks", "pooled")
 _Count = Annotated[int, Field(ge=0)]
 
@@ -251,16 +252,8 @@ class _ErrorModelFile(Settings):
 
 def write_error_model(model: ErrorModel, path: FilePath) -> None:
     """Write a model; the file appears whole or not at all. OutputError: it cannot be written."""
-    file = _ErrorModelFile(
-        format=FORMAT,
-        covers=model.covers,
-        bins=model.bins,
-        conditions=model.conditions,
-        source=model.source,
-        faults=model.faults,
-        before=_columns(model.before),
-        after=_columns(model.after),
-    )
+    columns = {side: _columns(getattr(model, side)) for side in _SIDES}
+    file = _ErrorModelFile(format=FORMAT, **{**vars(model), **columns})
     comment = "Errors of corrected pseudoranges by elevation, azimuth from the car's front, and C/N0."
     write_toml(path, file.model_dump(exclude_none=True), what="error model", comment=comment)
 
@@ -279,15 +272,8 @@ def read_error_model(path: FilePath) -> ErrorModel:
     file = read_model_file(
         _ErrorModelFile, path, what="an error model", format_name=FORMAT, command="railfix error-model"
     )
-    return ErrorModel(
-        bins=file.bins,
-        before=_statistics(path, "before", file.before, file.bins),
-        after=_statistics(path, "after", file.after, file.bins),
-        covers=file.covers,
-        conditions=file.conditions,
-        source=file.source,
-        faults=file.faults,
-    )
+    values = {item.name: getattr(file, item.name) for item in fields(ErrorModel)}
+    return ErrorModel(**values | {side: _statistics(path, side, values[side], file.bins) for side in _SIDES})
 
 
 def _statistics(path: FilePath, name: str, columns: _Columns, bins: ErrorBins) -> BinStatistics:

@@ -180,20 +180,20 @@ def _with_wheel(
     if unknowns.difference < 0:
         return chain
     read = np.flatnonzero(np.isfinite(evidence.wheel_m))
-    way = np.diff(evidence.wheel_m)
-    known = np.isfinite(way)
-    way = np.where(known, way, 0.0)
+    distance = np.diff(evidence.wheel_m)
+    known = np.isfinite(distance)
+    distance = np.where(known, distance, 0.0)
     row = _one(unknowns, unknowns.place) + _one(unknowns, unknowns.difference)
     start = evidence.wheel_m[read[0]] - nominal[read[0]]
     weight = np.full(len(read), max(evidence.wheel_sigma_m, _LEAST_READING_M) ** -2)
     chain = chain.with_observations(read, row, evidence.wheel_m[read] - start - nominal[read], weight)
     chain = _with_prior(chain, unknowns.difference, _ANY_DISTANCE_M)
     chain = _with_prior(chain, unknowns.scale, settings.wheel_scale)
-    before, after = np.zeros((2, len(way), 1, unknowns.count))
+    before, after = np.zeros((2, len(distance), 1, unknowns.count))
     after[:, 0, unknowns.difference], before[:, 0, unknowns.difference] = 1.0, -1.0
-    before[:, 0, unknowns.scale] = -way
-    variance = np.where(known, settings.slip_m**2 * np.abs(way) + _LEAST_STEP_M**2, _ANY_DISTANCE_M**2)
-    chain = chain.with_steps(before, after, np.zeros((len(way), 1)), (1.0 / variance)[:, None, None])
+    before[:, 0, unknowns.scale] = -distance
+    variance = np.where(known, settings.slip_m**2 * np.abs(distance) + _LEAST_STEP_M**2, _ANY_DISTANCE_M**2)
+    chain = chain.with_steps(before, after, np.zeros((len(distance), 1)), (1.0 / variance)[:, None, None])
     return _with_walk(chain, unknowns.scale, np.ones(len(dt)), 1.0 / (_SCALE_DRIFT**2 * dt))
 
 
@@ -228,10 +228,10 @@ def _one(unknowns: _Unknowns, unknown: int) -> Floats:
 class Closings:
     """Closing errors of a measured distance between fixes, over W windows."""
 
-    error_m: Floats  #: Way measured less way between the fixes, shape (W,).
+    error_m: Floats  #: Distance measured less distance between the fixes, shape (W,).
     white_m2: Floats  #: Variance that single readings and the fixes explain, shape (W,) [m2].
     duration_s: Floats  #: Shape (W,).
-    way_m: Floats  #: Shape (W,).
+    distance_m: Floats  #: Shape (W,).
 
     def __len__(self) -> int:
         return len(self.error_m)
@@ -242,20 +242,23 @@ class Closings:
 
 
 def closings(
-    time: Datetimes, way_m: Floats, variance_m2: Floats, fix_m: Floats, fix_sigma_m: Floats, *, window_s: float
+    time: Datetimes, distance_m: Floats, variance_m2: Floats, fix_m: Floats, fix_sigma_m: Floats, *, window_s: float
 ) -> Closings:
-    """Compare a measured distance with that between fixes over windows; `way_m` and variance up to each fix."""
+    """Compare a measured distance with that between fixes over windows; `distance_m` and variance up to each fix."""
     t = seconds(time - time[0])
     end = np.searchsorted(t, t + window_s - 0.5)
     start = np.flatnonzero(end < len(t))
     start = start[t[end[start]] - t[start] <= 1.5 * window_s]
     end = end[start]
-    error = (way_m[end] - way_m[start]) - (fix_m[end] - fix_m[start])
+    error = (distance_m[end] - distance_m[start]) - (fix_m[end] - fix_m[start])
     white = variance_m2[end] - variance_m2[start] + fix_sigma_m[end] ** 2 + fix_sigma_m[start] ** 2
     usable = np.isfinite(error) & (white < 1e4)
     start, end = start[usable], end[usable]
     return Closings(
-        error_m=error[usable], white_m2=white[usable], duration_s=t[end] - t[start], way_m=fix_m[end] - fix_m[start]
+        error_m=error[usable],
+        white_m2=white[usable],
+        duration_s=t[end] - t[start],
+        distance_m=fix_m[end] - fix_m[start],
     )
 
 
@@ -271,13 +274,13 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
     """Return the random error of the wheel from the closing errors, its scale taken off [m per square root of m]."""
-    moving = np.abs(misclosures.way_m) > 1.0
+    moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
-    error, way = misclosures.error_m[moving], misclosures.way_m[moving]
-    error = error - float(np.median(error / way)) * way
-    excess = float(np.quantile(error**2 / np.abs(way), 0.8)) / _CHI2_80
-    excess -= float(np.median(misclosures.white_m2[moving] / np.abs(way)))
+    error, distance = misclosures.error_m[moving], misclosures.distance_m[moving]
+    error = error - float(np.median(error / distance)) * distance
+    excess = float(np.quantile(error**2 / np.abs(distance), 0.8)) / _CHI2_80
+    excess -= float(np.median(misclosures.white_m2[moving] / np.abs(distance)))
     return float(np.sqrt(max(excess, _LEAST_SLIP_M**2)))
 
 

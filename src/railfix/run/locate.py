@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Integers, dataclass
+from railfix.core.arrays import Floats, dataclass, join_rows, take_rows
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, ending, write_whole
 from railfix.core.geodesy import geodetic_from_ecef
@@ -23,7 +23,7 @@ from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import locate, survey_run
+from railfix.pipeline.locate import Located, locate, survey_run
 from railfix.pipeline.received import Received, known_from_start
 from railfix.run.inputs import InputFiles, LogReading, input_option
 from railfix.run.sources import Log
@@ -64,21 +64,19 @@ def locate_files(
         raise NoPositionError(
             f"{inputs.log[0]}: no epoch has a position; are the navigation files of the day of the log?"
         )
-    time, ecef, sigma, used = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "ecef_m", "sigma_m", "n_used")
-    )
-    write_whole(out, solution_text(time, ecef, sigma, used))
-    known = np.isfinite(ecef[:, 0])
-    north, east, up = np.median(sigma[known], axis=0).tolist()
+    located = join_rows(parts)
+    write_whole(out, solution_text(located))
+    known = np.isfinite(located.ecef_m[:, 0])
+    north, east, up = np.median(located.sigma_m[known], axis=0).tolist()
     return LocateSummary(
-        epochs=len(time),
+        epochs=len(known),
         positions=int(known.sum()),
         sigma_m=(north, east, up),
         notes=(*received.notes, *log.problems),
     )
 
 
-def solution_text(time: Datetimes, ecef_m: Floats, sigma_m: Floats, n_used: Integers) -> str:
+def solution_text(located: Located) -> str:
     """Return positions as RTKLIB's solution format (GPST, latitude, longitude, ellipsoidal height, sigmas)."""
     lines = [
         "% program   : railfix locate",
@@ -86,10 +84,9 @@ def solution_text(time: Datetimes, ecef_m: Floats, sigma_m: Floats, n_used: Inte
         "%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  "
         "sdeu(m)  sdun(m) age(s)  ratio",
     ]
-    known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
-    latitude, longitude, height = geodetic_from_ecef(ecef_m[known])
-    stamps = np.datetime_as_string(time[known], unit="ms")
-    rows: Any = zip(stamps, latitude, longitude, height, n_used[known], sigma_m[known], strict=True)
+    known = take_rows(located, np.isfinite(located.ecef_m[:, 0]))
+    stamps = np.datetime_as_string(known.time, unit="ms")
+    rows: Any = zip(stamps, *geodetic_from_ecef(known.ecef_m), known.n_used, known.sigma_m, strict=True)
     for stamp, lat, lon, up, count, (north, east, vertical) in rows:
         day, clock = str(stamp).replace("-", "/").split("T")
         lines.append(

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass, join_rows, take_rows
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import nearest_rows
@@ -276,20 +276,14 @@ class LogPositions:
             seconds = np.diff(part.time) / np.timedelta64(1, "s")
             step = max(1, round(_INTERVAL_S / float(np.median(seconds)))) if len(seconds) else 1
             located.append(locate(part[::step], received, self.config, book))
-        times, ecef, sigma = (
-            np.concatenate([getattr(part, name)[np.isfinite(part.ecef_m[:, 0])] for part in located] or [np.empty(0)])
-            for name in ("time", "ecef_m", "sigma_m")
-        )
-        if not len(times):
+        known = [take_rows(part, np.isfinite(part.ecef_m[:, 0])) for part in located]
+        if not (count := sum(len(part.time) for part in known)):
             raise MismatchError(f"{self.path}: the log has no position, so that its line cannot be found")
+        placed = join_rows(known)
         return PositionLog(
-            path=self.path,
-            time=times,
-            ecef_m=ecef,
-            quality=np.full(len(times), 5),
-            sigma_m=sigma,
-            line=np.arange(len(times)),
-        )
+            path=self.path, time=placed.time, ecef_m=placed.ecef_m, quality=np.full(count, 5), sigma_m=placed.sigma_m,
+            line=np.arange(count),
+        )  # fmt: skip
 
     def route(self, network: Network) -> RouteOfLog:
         """Find the route of the log through a network; MismatchError where there is none, or no position."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,7 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Strings
+from railfix.core.arrays import Datetimes, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.tables import reading_table
 from railfix.io.mate import mate_table
@@ -175,11 +174,7 @@ def load_balises(
         for path, is_virtual in ((places, False), (virtual, True))
         if path is not None
     ]
-    if not lists:
-        return None
-    return ListedBalises(
-        **{f.name: np.concatenate([getattr(each, f.name) for each in lists]) for f in fields(ListedBalises)}
-    )
+    return join_rows(lists) if lists else None
 
 
 def check_filter(config: Config, options: Iterable[str]) -> None:

@@ -17,7 +17,7 @@ from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antennas import AntennaOrder
 from railfix.pipeline.balises import balise_notes
-from railfix.pipeline.filter_result import AlongTrack, Replay, smooth
+from railfix.pipeline.filter_result import Replay, smooth
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.tables import (
@@ -151,10 +151,6 @@ class AntennaTally:
             self.level_status.update({s.name.lower(): int(levels[s]) for s in LevelStatus})
             self.without_budget += int(np.count_nonzero(result.protection.level.cause == Cause.BUDGET))
 
-    def add_filter(self, filtered: AlongTrack, satellite: Strings) -> None:
-        """Count the satellites, by channel of the filter, whose codes it left out in one more chunk."""
-        _count_left_out(self.left_out, filtered.tracked.faulty, satellite, filtered.time)
-
     def _add_map_offset(self, result: AntennaResult) -> None:
         """Keep the window that contradicts the map most."""
         offset = result.map_offset
@@ -261,7 +257,8 @@ class Tally:
             tally = self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites))
             tally.add(antenna)
             if name in result.fusion:
-                tally.add_filter(result.fusion[name], antenna.satellite[antenna.columns])
+                of_filter, satellite = result.fusion[name], antenna.satellite[antenna.columns]
+                _count_left_out(tally.left_out, of_filter.tracked.faulty, satellite, of_filter.time)
         if self.order is not None and len(result.antennas) > 1:
             both = (result.antennas["front"], result.antennas["rear"])
             self.order.add(*((each.time, each.chainage_m, each.along_sigma_m) for each in both))

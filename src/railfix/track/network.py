@@ -19,12 +19,11 @@ from railfix.core.arrays import (
     Floats,
     Indices,
     Integers,
-    Masks,
+    RowArrays,
     dataclass,
     join_rows,
     places_in_groups,
     read_only,
-    take_rows,
 )
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
@@ -58,16 +57,12 @@ class Link:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Candidates:
+class Candidates(RowArrays):
     """Tracks near positions (n, m), nearest first, -1 for none; `offset_m` in plan, right positive, else infinite."""
 
     track: Indices
     chainage_m: Floats
     offset_m: Floats
-
-    def take(self, rows: Indices | Masks) -> Candidates:
-        """Return those of some of the positions."""
-        return take_rows(self, rows)
 
 
 @dataclass(frozen=True, kw_only=True)

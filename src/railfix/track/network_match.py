@@ -9,7 +9,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, dataclass, take_rows
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, RowArrays, dataclass, take_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
@@ -46,7 +46,7 @@ _APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanLog:
+class PlanLog(RowArrays):
     """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None without any."""
 
     path: str
@@ -56,10 +56,6 @@ class PlanLog:
     sigma_m: Floats
     height_m: Floats | None = None
     sigma_up_m: Floats | None = None
-
-    def take(self, rows: Indices) -> PlanLog:
-        """Return some of the positions."""
-        return take_rows(self, rows)
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """Return the positions, in the frame of the satellites, in that of the network; else MismatchError."""

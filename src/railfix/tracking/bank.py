@@ -55,27 +55,16 @@ OTHERS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Risk of an independent error and probabilities of faults, with the factors that follow from them.
-
-    Attributes
-    ----------
-    risk : float
-    k : float
-        Sigmas that noise without a fault exceeds with the risk, on either side.
-    prior : tuple of float
-        Probability that a source of each `SourceKind` is faulty or still remembered; 0 needs no sub-filter.
-    k_fault : tuple of float
-        Sigmas that noise exceeds on one side with the risk over that probability: the least that a sub-filter requires.
-    k_speed : float
-    k_speed_fault : tuple of float
-        The same of the bound on the speed, which has `SPEED_SHARE` of the risk on top, in equal parts for all sources.
-    """
+    """Risk of an independent error and probabilities of faults, with the factors that follow from them."""
 
     risk: float
-    k: float
+    k: float  #: Sigmas that noise without a fault exceeds with the risk, on either side.
+    #: Probability that a source of each `SourceKind` is faulty or still remembered; 0 needs no sub-filter.
     prior: tuple[float, ...]
+    #: Sigmas that noise exceeds on one side with the risk over that probability: the least that a sub-filter requires.
     k_fault: tuple[float, ...]
     k_speed: float
+    #: The same of the bound on the speed, which has `SPEED_SHARE` of the risk on top, in equal parts for all sources.
     k_speed_fault: tuple[float, ...]
 
 

@@ -45,20 +45,13 @@ _BLOCK: Final = 128
 
 @dataclass(frozen=True, kw_only=True)
 class BatchTrack:
-    """Places of T epochs by all measurements together.
+    """Places of T epochs by all measurements together."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    arc_m, sigma_m : ndarray, shape (T,) [m]
-        NaN in a piece without codes.
-    speed_mps : ndarray, shape (T,)
-    """
-
-    time: Datetimes
+    time: Datetimes  #: Shape (T,).
+    #: NaN in a piece without codes; shape (T,).
     arc_m: Floats
     sigma_m: Floats
-    speed_mps: Floats
+    speed_mps: Floats  #: Shape (T,).
 
 
 def fit_batch(epochs: GnssEpochs, trajectory: Trajectory, near_m: Floats | None = None) -> BatchTrack:

@@ -27,59 +27,32 @@ FORGOTTEN: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """T epochs of K channels and S errors of satellites; `has` and `variance` of codes are settled epoch by epoch.
+    """T epochs of K channels and S errors of satellites; `has` and `variance` of codes are settled epoch by epoch."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    interval_s : ndarray, shape (T,) [s]
-        AccumulatedIncrement the epoch before; 1 for the first.
-    apart : ndarray of bool, shape (T,)
-        Epochs so long after the one before that they restart.
-    satellite : ndarray of str, shape (K,)
-    slot : ndarray of int, shape (K,)
-        Place of the channel's error among those of the state; -1 for one that is never measured.
-    offset : ndarray of int, shape (K,)
-        Place of its code clock in `CLOCKS`.
-    sat_ecef_m, sat_velocity_mps, before_ecef_m : ndarray, shape (T, K, 3)
-        Satellites at transmission, and those of the epoch before.
-    measured : ndarray, shape (3, T, K)
-        Code [m], change of the phase since the epoch before [m] and range rate [m/s]; NaN where there is none.
-    has : ndarray of bool, shape (3, T, K)
-        Where it is finite.
-    variance : ndarray, shape (3, T, K)
-        Of their white errors, before the scales learnt from residuals; of codes the mean over a second.
-    motion_measured : ndarray of bool, shape (T,)
-        Epochs with phases or Dopplers of at least four satellites: they carry the place on without codes.
-    code_sigma_m : ndarray, shape (T, K) [m]
-        Of the satellite's correlated error.
-    fresh : ndarray of bool, shape (T, S)
-        Satellites whose error begins at an epoch.
-    off_map : ndarray of bool, shape (T,)
-        The train is away from the line.
-    remembered : ndarray of bool, shape (T, S)
-        Satellites whose error lasts from before an epoch.
-    velocity_mps, velocity_covariance, velocity_age_s : ndarray, shape (T, 3), (T, 3, 3), (T,)
-        `velocity.Velocity`.
-    """
-
-    time: Datetimes
-    interval_s: Floats
-    apart: Masks
-    satellite: Strings
+    time: Datetimes  #: Shape (T,).
+    interval_s: Floats  #: Since the epoch before; 1 for the first; shape (T,).
+    apart: Masks  #: Epochs so long after the one before that they restart; shape (T,).
+    satellite: Strings  #: Shape (K,).
+    #: Place of the channel's error among those of the state; -1 for one that is never measured; shape (K,).
     slot: Indices
-    offset: Indices
+    offset: Indices  #: Place of its code clock in `CLOCKS`; shape (K,).
+    #: Satellites at transmission, and those of the epoch before; shape (T, K, 3).
     sat_ecef_m: Floats
     sat_velocity_mps: Floats
     before_ecef_m: Floats
+    #: Code [m], change of the phase since the epoch before [m] and range rate [m/s]; NaN where there is none;
+    #: shape (3, T, K).
     measured: Floats
-    has: Masks
+    has: Masks  #: Where it is finite; shape (3, T, K).
+    #: Of their white errors, before the scales learnt from residuals; of codes the mean over a second; shape (3, T, K).
     variance: Floats
+    #: Epochs with phases or Dopplers of at least four satellites: they carry the place on without codes; shape (T,).
     motion_measured: Masks
-    code_sigma_m: Floats
-    fresh: Masks
-    off_map: Masks
-    remembered: Masks
+    code_sigma_m: Floats  #: Of the satellite's correlated error; shape (T, K).
+    fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
+    off_map: Masks  #: The train is away from the line; shape (T,).
+    remembered: Masks  #: Satellites whose error lasts from before an epoch; shape (T, S).
+    #: `velocity.Velocity`; shape (T, 3), (T, 3, 3), (T,).
     velocity_mps: Floats
     velocity_covariance: Floats
     velocity_age_s: Floats

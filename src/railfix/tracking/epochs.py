@@ -28,43 +28,26 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class GnssEpochs:
-    """Corrected GNSS measurements of one antenna; NaN where there is none or it must not be used.
+    """Corrected GNSS measurements of one antenna; NaN where there is none or it must not be used."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    satellite : ndarray of str, shape (K,)
-    clock : ndarray of str, shape (K,)
-        Letter of the receiver clock of each channel's codes.
-    sat_ecef_m, sat_velocity_mps : ndarray, shape (T, K, 3)
-        Satellites at transmission.
-    code_m, code_sigma_m : ndarray, shape (T, K) [m]
-        Corrected pseudorange and its standard deviation, the receiver's noise scale included.
-    phase_m : ndarray, shape (T, K) [m]
-        Corrected carrier phase.
-    phase_joined : ndarray of bool, shape (T, K)
-        Whether the phase continues that of the epoch before without a cycle slip.
-    rate_mps : ndarray, shape (T, K) [m/s]
-        Range rate by the Doppler with the satellite clock and the troposphere's change taken off.
-    cn0_dbhz : ndarray, shape (T, K)
-    off_map : ndarray of bool, shape (T,)
-        Epochs at which the train is known to be away from the line: places are forgotten, nothing is used.
-    near_ecef_m : ndarray, shape (T, 3) [m], or None
-        Position without the line, right to some hundred metres, for the velocity across it; NaN or None: not looked at.
-    """
-
-    time: Datetimes
-    satellite: Strings
-    clock: Strings
+    time: Datetimes  #: Shape (T,).
+    satellite: Strings  #: Shape (K,).
+    clock: Strings  #: Letter of the receiver clock of each channel's codes; shape (K,).
+    #: Satellites at transmission; shape (T, K, 3).
     sat_ecef_m: Floats
     sat_velocity_mps: Floats
+    #: Corrected pseudorange and its standard deviation, the receiver's noise scale included; shape (T, K).
     code_m: Floats
     code_sigma_m: Floats
-    phase_m: Floats
-    phase_joined: Masks
+    phase_m: Floats  #: Corrected carrier phase; shape (T, K).
+    phase_joined: Masks  #: Whether the phase continues that of the epoch before without a cycle slip; shape (T, K).
+    #: Range rate by the Doppler with the satellite clock and the troposphere's change taken off; shape (T, K).
     rate_mps: Floats
-    cn0_dbhz: Floats
+    cn0_dbhz: Floats  #: Shape (T, K).
+    #: Epochs at which the train is known to be away from the line: places are forgotten, nothing is used; shape (T,).
     off_map: Masks
+    #: Position without the line, right to some hundred metres, for the velocity across it; NaN or None: not looked at;
+    #: shape (T, 3).
     near_ecef_m: Floats | None = None
 
     def __len__(self) -> int:
@@ -80,21 +63,14 @@ class GnssEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class RangeEpochs:
-    """Ranges to ground units since the epoch before, up to R an epoch; NaN where there is none.
+    """Ranges to ground units since the epoch before, up to R an epoch; NaN where there is none."""
 
-    Attributes
-    ----------
-    range_m, sigma_m, age_s : ndarray, shape (T, R)
-        Measured so long before the epoch.
-    unit_ecef_m : ndarray, shape (T, R, 3) [m]
-    lever_m : ndarray, shape (3,) [m]
-        From the trajectory's point to the vehicle's unit: along rising arc length, to the right, up.
-    """
-
+    #: Measured so long before the epoch; shape (T, R).
     range_m: Floats
     sigma_m: Floats
     age_s: Floats
-    unit_ecef_m: Floats
+    unit_ecef_m: Floats  #: Shape (T, R, 3).
+    #: From the trajectory's point to the vehicle's unit: along rising arc length, to the right, up; shape (3,).
     lever_m: Floats
 
     def take(self, rows: Indices) -> RangeEpochs:
@@ -105,17 +81,10 @@ class RangeEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseEpochs:
-    """Balises read since the epoch before, by turns: NaN, and any time, where there is none.
+    """Balises read since the epoch before, by turns: NaN, and any time, where there is none."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T, 2)
-        At which each was passed.
-    place_m, sigma_m : ndarray, shape (T, 2) [m]
-        Arc length of the trajectory's point then.
-    """
-
-    time: Datetimes
+    time: Datetimes  #: At which each was passed; shape (T, 2).
+    #: Arc length of the trajectory's point then; shape (T, 2).
     place_m: Floats
     sigma_m: Floats
 
@@ -140,49 +109,30 @@ class BaliseEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorEpochs:
-    """Sensor measurements at the same epochs, shape (T,) each, NaN where there is none; None without the sensor.
+    """Sensor measurements at the same epochs, shape (T,) each, NaN where there is none; None without the sensor."""
 
-    Attributes
-    ----------
-    wheel_m, wheel_sigma_m : ndarray or None [m]
-        Way since the epoch before by the wheel, + toward rising chainage.
-    wheel_sign : {"measured", "unknown"}
-        "unknown": the way has no sign and takes that of the speed.
-    radar_m, radar_sigma_m : ndarray or None [m]
-        The same by the radar: over a way the swings of the body cancel (P2 3.2).
-    force_mps2, force_sigma_mps2 : ndarray or None [m/s2]
-        Mean specific force along rising chainage since the epoch before, gravity on the gradient included.
-    place_m, place_sigma_m : ndarray or None [m]
-        Arc length, by a feature of the line.
-    balises : BaliseEpochs or None
-    ranges : RangeEpochs or None
-        Two-way ranges to ground units.
-    """
-
+    #: Way since the epoch before by the wheel, + toward rising chainage.
     wheel_m: Floats | None = None
     wheel_sigma_m: Floats | None = None
+    #: "unknown": the distance has no sign and takes that of the speed.
     wheel_sign: Literal["measured", "unknown"] = "measured"
+    #: The same by the radar: over a distance the swings of the body cancel (P2 3.2).
     radar_m: Floats | None = None
     radar_sigma_m: Floats | None = None
+    #: Mean specific force along rising chainage since the epoch before, gravity on the gradient included.
     force_mps2: Floats | None = None
     force_sigma_mps2: Floats | None = None
+    #: Arc length, by a feature of the line.
     place_m: Floats | None = None
     place_sigma_m: Floats | None = None
     balises: BaliseEpochs | None = None
-    ranges: RangeEpochs | None = None
+    ranges: RangeEpochs | None = None  #: Two-way ranges to ground units.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """The last epoch: what a change of the carrier phase is taken from.
+    """The last epoch: what a change of the carrier phase is taken from."""
 
-    Attributes
-    ----------
-    satellite : ndarray of str, shape (K,)
-    sat_ecef_m : ndarray, shape (K, 3) [m]
-    phase_m : ndarray, shape (K,) [m]
-    """
-
-    satellite: Strings
-    sat_ecef_m: Floats
-    phase_m: Floats
+    satellite: Strings  #: Shape (K,).
+    sat_ecef_m: Floats  #: Shape (K, 3).
+    phase_m: Floats  #: Shape (K,).

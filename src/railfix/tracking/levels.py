@@ -33,31 +33,18 @@ _MEAN: Final = np.array([False, False, True])
 
 @dataclass(frozen=True, kw_only=True)
 class AccumulatedIncrement:
-    """What was measured after the last epoch that was taken.
+    """What was measured after the last epoch that was taken."""
 
-    Attributes
-    ----------
-    start : datetime64[ns]
-        First epoch of the log: epochs are taken where a period from there is rounded to another number.
-    number : int
-        Of periods from `start` to the last epoch taken; -1 before the first.
-    epochs : int
-        AccumulatedIncrement then.
-    unbroken : frozenset of str or None
-        Satellites whose carrier phase went on at all of them; None where there was no epoch.
-    total, variance : ndarray, shape (3,)
-        Sums over them of the ways by wheel and radar [m] and of the force [m/s2], and of the variances.
-    balises : BaliseEpochs or None
-        Read since then, as one epoch.
-    """
-
+    #: First epoch of the log: epochs are taken where a period from there is rounded to another number.
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    number: int = -1
-    epochs: int = 0
+    number: int = -1  #: Of periods from `start` to the last epoch taken; -1 before the first.
+    epochs: int = 0  #: Since then.
+    #: Satellites whose carrier phase went on at all of them; None where there was no epoch.
     unbroken: frozenset[str] | None = None
+    #: Sums over them of the distances by wheel and radar [m] and of the force [m/s2], and of the variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
     variance: Floats = field(default_factory=lambda: np.zeros(3))
-    balises: BaliseEpochs | None = None
+    balises: BaliseEpochs | None = None  #: Read since then, as one epoch.
 
 
 def thin_epochs(
@@ -179,24 +166,13 @@ _KEPT: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class LevelState:
-    """State of the filter with sub-filters after a chunk.
-
-    Attributes
-    ----------
-    track : TrackState or None
-    since : AccumulatedIncrement
-    time : datetime64[ns]
-        Of its last epoch.
-    values : ndarray, shape (9,)
-        Its place, speed, levels with parts, amount and status there.
-    every : bool
-        It has taken every epoch so far: it is the filter itself.
-    """
+    """State of the filter with sub-filters after a chunk."""
 
     track: TrackState | None = None
-    every: bool = True
+    every: bool = True  #: It has taken every epoch so far: it is the filter itself.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of its last epoch.
+    #: Its place, speed, levels with parts, amount and status there; shape (9,).
     values: Floats = field(default_factory=lambda: np.full(len(_KEPT), np.nan))
 
 

@@ -13,26 +13,13 @@ from railfix.track.trajectory import Trajectory, joins_m
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """Vertices of a trajectory with their axes.
+    """Vertices of a trajectory with their axes."""
 
-    Attributes
-    ----------
-    arc_m : ndarray, shape (V,) [m]
-    ecef_m : ndarray, shape (V, 3) [m]
-    axes : ndarray, shape (V, 3, 3)
-        Rows: tangent (mean of the two segments), to the right, up.
-    segment : ndarray, shape (V - 1, 3)
-        Unit vector of each segment.
-    gradient : ndarray, shape (V - 1,)
-        Climb over horizontal length of each segment.
-    sigma_plan_m, sigma_height_m : float [m]
-    """
-
-    arc_m: Floats
-    ecef_m: Floats
-    axes: Floats
-    segment: Floats
-    gradient: Floats
+    arc_m: Floats  #: Shape (V,).
+    ecef_m: Floats  #: Shape (V, 3).
+    axes: Floats  #: Rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3).
+    segment: Floats  #: Unit vector of each segment; shape (V - 1, 3).
+    gradient: Floats  #: Climb over horizontal length of each segment; shape (V - 1,).
     sigma_plan_m: float
     sigma_height_m: float
 

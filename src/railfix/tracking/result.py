@@ -59,71 +59,47 @@ def is_bounded(status: Codes) -> Masks:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked:
-    """Places of T epochs; NaN where there is none.
+    """Places of T epochs; NaN where there is none."""
 
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    status : ndarray of int8, shape (T,)
-        `TrackStatus`.
-    arc_m, sigma_m : ndarray, shape (T,) [m]
-        Of the most probable hypothesis; the standard deviation has the straight distance to the others in it,
-        and in doubt the separation.
-    speed_mps, speed_sigma_mps, acceleration_mps2 : ndarray, shape (T,)
-    probability : ndarray, shape (T,)
-        Of the hypothesis given.
-    hypotheses : ndarray of int, shape (T,)
-    code_weight, motion_weight : ndarray, shape (T,)
-        Mean weights of codes, and of Dopplers and phases.
-    wheel_scale, force_offset_mps2, radar_scale : ndarray, shape (T,)
-    map_scale : ndarray, shape (T,)
-        Factor on the error of the map's lengths, 1 where codes do not contradict them.
-    level_m, ground_level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
-        Of the error along the line; of the straight distance, all branches and a map aside included; without faults and
-        branches; and the largest separation of a sub-filter. NaN where levels are off.
-    level_speed_mps : ndarray, shape (T,)
-        Bound of the error of the speed, which carries the level on to the next epochs.
-    amount_m : ndarray, shape (T,) [m]
-        Over- and under-reading amount: the level, and never less than the bound of the scale times the way since
-        codes were used (SUBSET-026 3.6.8).
-    used : ndarray of int, shape (T, len(Kind))
-        Measurements of each kind with a weight of more than a half.
-    innovation : ndarray, shape (T, 3, K)
-        Before the update, of codes, phases and Dopplers.
-    sensed : ndarray, shape (T, len(Kind) - 3)
-        The same of the sensors, in the order of `Kind`; of several ranges the last.
-    weight : ndarray, shape (T, 3, K)
-        0 for codes that are left out.
-    faulty : ndarray of bool, shape (T, K)
-        Codes that are left out (`railfix.kernels.tracking.learning`).
-    """
-
-    time: Datetimes
-    status: Codes
+    time: Datetimes  #: Shape (T,).
+    status: Codes  #: `TrackStatus`; shape (T,).
+    #: Of the most probable hypothesis; the standard deviation has the straight distance to the others in it, and in
+    #: doubt the separation; shape (T,).
     arc_m: Floats
     sigma_m: Floats
+    #: Shape (T,).
     speed_mps: Floats
     speed_sigma_mps: Floats
     acceleration_mps2: Floats
-    probability: Floats
-    hypotheses: Integers
+    probability: Floats  #: Of the hypothesis given; shape (T,).
+    hypotheses: Integers  #: Shape (T,).
+    #: Mean weights of codes, and of Dopplers and phases; shape (T,).
     code_weight: Floats
     motion_weight: Floats
+    #: Shape (T,).
     wheel_scale: Floats
     force_offset_mps2: Floats
     radar_scale: Floats
-    map_scale: Floats
+    map_scale: Floats  #: Factor on the error of the map's lengths, 1 where codes do not contradict them; shape (T,).
+    #: Of the error along the line; of the straight distance, all branches and a map aside included; without faults and
+    #: branches; and the largest separation of a sub-filter. NaN where levels are off; shape (T,).
     level_m: Floats
     ground_level_m: Floats
     level_noise_m: Floats
+    #: Bound of the error of the speed, which carries the level on to the next epochs; shape (T,).
     level_speed_mps: Floats
+    #: Of the error along the line; of the straight distance, all branches and a map aside included; without faults and
+    #: branches; and the largest separation of a sub-filter. NaN where levels are off; shape (T,).
     separation_m: Floats
+    #: Over- and under-reading amount: the level, and never less than the bound of the scale times the distance since
+    #: codes were used (SUBSET-026 3.6.8); shape (T,).
     amount_m: Floats
-    used: Integers
-    innovation: Floats
+    used: Integers  #: Measurements of each kind with a weight of more than a half; shape (T, len(Kind)).
+    innovation: Floats  #: Before the update, of codes, phases and Dopplers; shape (T, 3, K).
+    #: The same of the sensors, in the order of `Kind`; of several ranges the last; shape (T, len(Kind) - 3).
     sensed: Floats
-    weight: Floats
-    faulty: Masks
+    weight: Floats  #: 0 for codes that are left out; shape (T, 3, K).
+    faulty: Masks  #: Codes that are left out (`railfix.kernels.tracking.learning`); shape (T, K).
 
     def __len__(self) -> int:
         return len(self.time)

@@ -196,41 +196,23 @@ _ELSEWHERE: Final = 0.01
 
 @dataclass(frozen=True, kw_only=True)
 class SplitHypothesis:
-    """One of the narrower hypotheses that a wide one was split into.
+    """One of the narrower hypotheses that a wide one was split into."""
 
-    Attributes
-    ----------
-    parent : int
-        The wide one.
-    mean, covariance : ndarray, shapes (N,), (N, N)
-        Of the wide one.
-    place_m, sigma_m : float [m]
-        Of the narrower one.
-    """
-
-    parent: int
+    parent: int  #: The wide one.
+    #: Of the wide one; shapes (N,), (N, N).
     mean: Floats
     covariance: Floats
+    #: Of the narrower one.
     place_m: float
     sigma_m: float
 
 
 class Sought(NamedTuple):
-    """What was sought before an epoch.
+    """What was sought before an epoch."""
 
-    Attributes
-    ----------
-    lost : bool
-        Whether the track was lost.
-    parent : ndarray of int, shape (H,)
-        Hypothesis of the epoch before that each one goes on from; -1 where it began.
-    splits : list of SplitHypothesis or None
-        Hypotheses that began at this epoch within wider ones.
-    """
-
-    lost: bool
-    parent: Indices
-    splits: list[SplitHypothesis | None] | None
+    lost: bool  #: Whether the track was lost.
+    parent: Indices  #: Hypothesis of the epoch before that each one goes on from; -1 where it began; shape (H,).
+    splits: list[SplitHypothesis | None] | None  #: Hypotheses that began at this epoch within wider ones.
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Sought:

@@ -25,24 +25,14 @@ from railfix.tracking.velocity import transition
 
 @dataclass(frozen=True, kw_only=True)
 class Updated:
-    """Update of H hypotheses by D combinations of the unknowns, in their standard deviations.
+    """Update of H hypotheses by D combinations of the unknowns, in their standard deviations."""
 
-    Attributes
-    ----------
-    prior : ndarray, shape (H, N, N)
-        Covariance of the unknowns before the measurements.
-    combine : ndarray, shape (H, D, N)
-    information, covariance : ndarray, shape (H, D, D)
-        Inverse covariance of the combinations before, and covariance after the measurements.
-    change : ndarray, shape (H, D)
-        Of their means.
-    """
-
-    prior: Floats
-    combine: Floats
+    prior: Floats  #: Covariance of the unknowns before the measurements; shape (H, N, N).
+    combine: Floats  #: Shape (H, D, N).
+    #: Inverse covariance of the combinations before, and covariance after the measurements; shape (H, D, D).
     information: Floats
     covariance: Floats
-    change: Floats
+    change: Floats  #: Of their means; shape (H, D).
 
     def take(self, chosen: Indices) -> Updated:
         """Return the update of some hypotheses."""
@@ -51,30 +41,17 @@ class Updated:
 
 @dataclass(kw_only=True)
 class Step:
-    """One epoch of the filter with H hypotheses, as it was left.
+    """One epoch of the filter with H hypotheses, as it was left."""
 
-    Attributes
-    ----------
-    dt : float [s]
-    cut : ndarray of bool, shape (H, N)
-        Unknowns that have restarted at this epoch.
-    satellite : ndarray of str, shape (N - SATELLITES,)
-    mean, covariance : ndarray, shapes (H, N), (H, N, N)
-        After the epoch.
-    parent : ndarray of int, shape (H,)
-        Hypothesis of the epoch before; -1 where one began.
-    splits : list of SplitHypothesis or None
-    updated : Updated or None
-        None without a measurement.
-    """
-
-    dt: float
-    cut: Masks
-    satellite: Strings
+    dt: float  #: [s].
+    cut: Masks  #: Unknowns that have restarted at this epoch; shape (H, N).
+    satellite: Strings  #: Shape (N - SATELLITES,).
+    #: After the epoch; shapes (H, N), (H, N, N).
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
+    #: Hypothesis of the epoch before; -1 where one began; shape (H,).
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    updated: Updated | None = None
+    updated: Updated | None = None  #: None without a measurement.
     splits: list[SplitHypothesis | None] | None = None
 
     @classmethod
@@ -118,35 +95,23 @@ def _before_measurements(updated: Updated, h: int, vector: Floats, matrix: Float
 
 @dataclass(frozen=True, kw_only=True)
 class BackwardInformation:
-    """What all later epochs say of the unknowns after an epoch.
+    """What all later epochs say of the unknowns after an epoch."""
 
-    Attributes
-    ----------
-    place_m : float
-        Of the hypothesis that they go on from; NaN for none.
-    vector, matrix : ndarray, shapes (N,), (N, N)
-    satellite : ndarray of str, shape (N - SATELLITES,)
-    """
-
-    place_m: float
+    place_m: float  #: Of the hypothesis that they go on from; NaN for none.
+    #: Shapes (N,), (N, N).
     vector: Floats
     matrix: Floats
-    satellite: Strings
+    satellite: Strings  #: Shape (N - SATELLITES,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothed:
-    """Places of T epochs from both directions; NaN where the filter has none.
+    """Places of T epochs from both directions; NaN where the filter has none."""
 
-    Attributes
-    ----------
-    arc_m, sigma_m : ndarray, shape (T,) [m]
-    speed_mps : ndarray, shape (T,)
-    """
-
+    #: Shape (T,).
     arc_m: Floats
     sigma_m: Floats
-    speed_mps: Floats
+    speed_mps: Floats  #: Shape (T,).
 
 
 def smooth_steps(

@@ -63,22 +63,13 @@ FRESH: Final = slice(StateIndex.CODE_CLOCK, StateIndex.MAP_LENGTH_ERROR + 1)
 
 @dataclass(frozen=True, kw_only=True)
 class Bank:
-    """Sub-filters beside the most probable hypothesis, each without one source: B Gaussians over the same unknowns.
+    """Sub-filters beside the most probable hypothesis, each without one source: B Gaussians over the same unknowns."""
 
-    Attributes
-    ----------
-    without : tuple of str
-        A satellite ("G05"), a constellation by the letter of its clock ("G"), or a sensor ("wheel").
-    mean : ndarray, shape (B, N)
-    covariance : ndarray, shape (B, N, N)
-    weak_s : ndarray, shape (B,) [s]
-        How long the measurements of each have contradicted it.
-    """
-
+    #: A satellite ("G05"), a constellation by the letter of its clock ("G"), or a sensor ("wheel").
     without: tuple[str, ...]
-    mean: Floats
-    covariance: Floats
-    weak_s: Floats
+    mean: Floats  #: Shape (B, N).
+    covariance: Floats  #: Shape (B, N, N).
+    weak_s: Floats  #: How long the measurements of each have contradicted it; shape (B,).
 
     @classmethod
     def empty(cls, width: int) -> Bank:
@@ -88,94 +79,54 @@ class Bank:
 
 @dataclass(kw_only=True)
 class TrackState:
-    """What one epoch leaves to the next: H hypotheses of N unknowns. Its arrays are never written to.
+    """What one epoch leaves to the next: H hypotheses of N unknowns. Its arrays are never written to."""
 
-    Attributes
-    ----------
-    time : datetime64[ns]
-        Of the last epoch; NaT before the first.
-    mean : ndarray, shape (H, N)
-    covariance : ndarray, shape (H, N, N)
-    log_probability : ndarray, shape (H,)
-    log_code : ndarray, shape (H,)
-        Part of it that the codes gave (`railfix.kernels.tracking.branches`).
-    across : float
-        Sum of the contradictions of the velocity (`railfix.kernels.tracking.monitors`).
-    step_s, withheld_s, open_s : float [s]
-        How long all codes have asked for another place, how long the level is withheld still, and how long that along
-        the line, as other places of it were more probable than the risk.
-    motion_misfit : float
-        One less the mean weight of Dopplers and phases lately; 0 with a speed by a sensor.
-    code_bias : ndarray, shape (N - SATELLITES,)
-        Mean innovation of each satellite's codes (`railfix.kernels.tracking.learning`).
-    log_least : ndarray, shape (H,)
-        Least logarithm of the probability lately: it rises with time (`railfix.kernels.tracking.constants.LEAST_RISE`).
-    log_recent : ndarray, shape (H,)
-        Evidence of the codes lately against laps within the error of the map (`RECENT_S` there); no probability.
-    branch_s, branch_m : float [s], [m]
-        Time and distance since the hypotheses began.
-    origin_m : ndarray, shape (H,) [m]
-        Arc length at which each hypothesis began.
-    satellite : ndarray of str, shape (N - SATELLITES,)
-        Satellites whose errors are in the state.
-    seen : ndarray of datetime64[ns], shape (N - SATELLITES,)
-        When each was last measured.
-    offset_known : ndarray of bool, shape (len(CLOCKS),)
-        Clocks that have had an observation.
-    previous : Previous or None
-    measured : datetime64[ns]
-        Last epoch with measurements that the filter used.
-    coded : datetime64[ns]
-        Last epoch whose codes counted (`TrackingLimits.code_period_s`); NaT where the next ones do.
-    weak_motion_s, weak_code_s : float [s]
-        How long the mean weights have been low.
-    log_scale : tuple of float
-        Logarithm of the variance of Dopplers and of phases against that of the limits.
-    code_shift : tuple of float
-        Mean of the shifts that codes ask for over the last epochs, and its variance.
-    map_log_variance : float
-        Logarithm of the variance of lengths along the map against that of the limits, at least 0.
-    bank : Bank or None
-        Where levels are asked for.
-    distance_since_code_m : float [m]
-        Way since codes were used.
-    direction : float
-        Sign of the last speed with a direction.
-    speed_range_mps : tuple of float
-        Speeds that are possible after those measured so far (`railfix.kernels.tracking.prediction`); no bounds
-        while there are several hypotheses.
-    """
-
-    time: np.datetime64
-    mean: Floats
-    covariance: Floats
-    log_probability: Floats
-    origin_m: Floats
-    satellite: Strings
-    seen: np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]
-    offset_known: Masks
+    time: np.datetime64  #: Of the last epoch; NaT before the first.
+    mean: Floats  #: Shape (H, N).
+    covariance: Floats  #: Shape (H, N, N).
+    log_probability: Floats  #: Shape (H,).
+    origin_m: Floats  #: Arc length at which each hypothesis began; shape (H,).
+    satellite: Strings  #: Satellites whose errors are in the state; shape (N - SATELLITES,).
+    seen: np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]  #: When each was last measured; shape (N - SATELLITES,).
+    offset_known: Masks  #: Clocks that have had an observation; shape (len(CLOCKS),).
     previous: Previous | None
-    measured: np.datetime64
+    measured: np.datetime64  #: Last epoch with measurements that the filter used.
+    #: Last epoch whose codes counted (`TrackingLimits.code_period_s`); NaT where the next ones do.
     coded: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    #: How long the mean weights have been low.
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
+    #: Logarithm of the variance of Dopplers and of phases against that of the limits.
     log_scale: tuple[float, float] = (0.0, 0.0)
+    #: Mean of the shifts that codes ask for over the last epochs, and its variance.
     code_shift: tuple[float, float] = (0.0, 0.0)
+    #: Logarithm of the variance of lengths along the map against that of the limits, at least 0.
     map_log_variance: float = 0.0
+    #: Part of it that the codes gave (`railfix.kernels.tracking.branches`); shape (H,).
     log_code: Floats = field(default_factory=lambda: np.empty(0))
+    #: Mean innovation of each satellite's codes (`railfix.kernels.tracking.learning`); shape (N - SATELLITES,).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
+    #: Least logarithm of the probability lately: it rises with time (`railfix.kernels.tracking.constants.LEAST_RISE`);
+    #: shape (H,).
     log_least: Floats = field(default_factory=lambda: np.empty(0))
+    #: Evidence of the codes lately against laps within the error of the map (`RECENT_S` there); no probability;
+    #: shape (H,).
     log_recent: Floats = field(default_factory=lambda: np.empty(0))
-    across: float = 0.0
+    across: float = 0.0  #: Sum of the contradictions of the velocity (`railfix.kernels.tracking.monitors`).
+    #: How long all codes have asked for another place, how long the level is withheld still, and how long that along
+    #: the line, as other places of it were more probable than the risk.
     step_s: float = 0.0
     withheld_s: float = 0.0
     open_s: float = 0.0
-    motion_misfit: float = 0.0
+    motion_misfit: float = 0.0  #: One less the mean weight of Dopplers and phases lately; 0 with a speed by a sensor.
+    #: Time and distance since the hypotheses began.
     branch_s: float = 0.0
     branch_m: float = 0.0
-    bank: Bank | None = None
-    distance_since_code_m: float = 0.0
-    direction: float = 0.0
+    bank: Bank | None = None  #: Where levels are asked for.
+    distance_since_code_m: float = 0.0  #: Distance since codes were used.
+    direction: float = 0.0  #: Sign of the last speed with a direction.
+    #: Speeds that are possible after those measured so far (`railfix.kernels.tracking.prediction`); no bounds while
+    #: there are several hypotheses.
     speed_range_mps: tuple[float, float] = ANY_SPEED
 
     @property

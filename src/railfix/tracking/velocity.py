@@ -23,21 +23,11 @@ _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 
 @dataclass(frozen=True, kw_only=True)
 class Velocity:
-    """Velocities of T epochs, NaN where there is none.
+    """Velocities of T epochs, NaN where there is none."""
 
-    Attributes
-    ----------
-    velocity_mps : ndarray, shape (T, 3) [m/s]
-        ECEF.
-    covariance : ndarray, shape (T, 3, 3)
-        By the white errors of the measurements, larger where the residuals are.
-    age_s : ndarray, shape (T,) [s]
-        How long before the epoch it was so: half of the interval by phases, 0 by Dopplers.
-    """
-
-    velocity_mps: Floats
-    covariance: Floats
-    age_s: Floats
+    velocity_mps: Floats  #: ECEF; shape (T, 3).
+    covariance: Floats  #: By the white errors of the measurements, larger where the residuals are; shape (T, 3, 3).
+    age_s: Floats  #: How long before the epoch it was so: half of the interval by phases, 0 by Dopplers; shape (T,).
 
 
 def compute_velocity(

@@ -6,12 +6,11 @@ Precise positions are interpolated by a polynomial, clocks linearly.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, RowArrays, dataclass
 from railfix.core.constants import (
     EARTH_ROTATION_RATE,
     EARTH_ROTATION_RATE_BEIDOU,
@@ -42,7 +41,7 @@ ROTATION: Final[Mapping[str, float]] = {
 
 
 @dataclass(frozen=True)
-class Orbits:
+class Orbits(RowArrays):
     """Orbit elements and time-independent quantities, shape (n,); others as in `KeplerRecords`."""
 
     a: Floats  #: Semi-major axis [m].
@@ -95,10 +94,6 @@ class Orbits:
             relativity=-2.0 * np.sqrt(gm) / SPEED_OF_LIGHT**2 * records.eccentricity * records.sqrt_a,
             **{name: getattr(records, name) for name in _AS_BROADCAST},
         )
-
-    def take(self, rows: Integers) -> Orbits:
-        """Return the orbits of some records."""
-        return Orbits(**{item.name: getattr(self, item.name)[rows] for item in fields(self)})
 
 
 _AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "a_dot", "delta_n_dot", "cuc", "cus", "crc", "crs", "cic", "cis")

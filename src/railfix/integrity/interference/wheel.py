@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, dataclass, join_rows
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
@@ -24,27 +24,17 @@ _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
 @dataclass(frozen=True, kw_only=True)
-class WheelSamples:
+class WheelSamples(RowArrays):
     """Positions and distances once a second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
     #: By satellites.
     arc_m: Floats = field(default_factory=lambda: np.empty(0))
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    way_m: Floats = field(default_factory=lambda: np.empty(0))  #: Of the wheel since its beginning.
+    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Of the wheel since its beginning.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))  #: What it may have rolled at speeds too slow for it.
     #: The same where the wheel has turned without slip or a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-    def join(self, later: WheelSamples) -> WheelSamples:
-        """Return these and later ones."""
-        return WheelSamples(
-            **{name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in vars(self)}
-        )
-
-    def take(self, rows: Masks | Integers) -> WheelSamples:
-        """Return some of them."""
-        return WheelSamples(**{name: values[rows] for name, values in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +45,7 @@ class WheelState:
     samples: WheelSamples = field(default_factory=WheelSamples)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last epoch.
     #: Of the wheel there; the speed NaN where unknown.
-    way_m: float = 0.0
+    distance_m: float = 0.0
     doubt_m: float = 0.0
     speed_mps: float = float("nan")
 
@@ -105,7 +95,7 @@ def wheel_signs(
     usable = due & np.isfinite(arc_m) & (sigma_m <= limits.largest_sigma_m)
     every = replace(rolled, arc_m=arc_m, sigma_m=np.hypot(sigma_m, _LEAST_M))
     before = len(state.samples.time)
-    samples = state.samples.join(every.take(usable))
+    samples = join_rows([state.samples, every.take(usable)])
     difference, bound, beyond = _compare(samples, before, limits, signed=signed)
     latest = np.cumsum(usable)
     of_epoch = np.concatenate([[state.difference_m], difference])[latest]
@@ -136,14 +126,14 @@ def _wheel_distances(
     held_rail = np.abs(speed - last) <= limits.wheel_acceleration_mps2 * span + _SLOW_MPS
     new = np.where(known, ~held_rail & np.isfinite(last), ~slow) | (span > limits.longest_gap_s)
     part = state.part + np.cumsum(new)
-    way = state.way_m + np.cumsum(np.where(known, wheel_m, 0.0))
+    distance = state.distance_m + np.cumsum(np.where(known, wheel_m, 0.0))
     doubt = state.doubt_m + np.cumsum(np.where(slow, _SLOW_MPS * span, 0.0))
     none = np.full(len(time), np.nan)
     after = replace(
-        state, time=time[-1], way_m=float(way[-1]), doubt_m=float(doubt[-1]), part=int(part[-1]),
+        state, time=time[-1], distance_m=float(distance[-1]), doubt_m=float(doubt[-1]), part=int(part[-1]),
         speed_mps=float(np.concatenate([[state.speed_mps], speed])[row[-1]]),
     )  # fmt: skip
-    return WheelSamples(time=time, arc_m=none, sigma_m=none, way_m=way, doubt_m=doubt, part=part), after
+    return WheelSamples(time=time, arc_m=none, sigma_m=none, distance_m=distance, doubt_m=doubt, part=part), after
 
 
 def _compare(
@@ -159,21 +149,21 @@ def _compare(
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
         """Distance by satellites less that of the wheel, the wheel's, and the variance without the second position."""
-        arc, way = samples.arc_m[b] - samples.arc_m[a], samples.way_m[b] - samples.way_m[a]
+        arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
-            arc, way = np.abs(arc), np.abs(way)
+            arc, distance = np.abs(arc), np.abs(distance)
         doubt = samples.doubt_m[b] - samples.doubt_m[a]
-        return arc - way, way, samples.sigma_m[a] ** 2 + doubt**2
+        return arc - distance, distance, samples.sigma_m[a] ** 2 + doubt**2
 
-    difference, way, at_beginning = apart(begun, now)
+    difference, distance, at_beginning = apart(begun, now)
     earlier, rolled, noise = apart(start, begun)
     prior = limits.wheel_scale**-2.0
     weight = rolled**2 / (noise + samples.sigma_m[begun] ** 2)
     ratio = np.where(rolled != 0.0, earlier / np.where(rolled != 0.0, rolled, 1.0), 0.0)
     scale = weight * ratio / (prior + weight)
     variance = 1.0 / (prior + weight) + limits.wheel_change**2
-    left = difference - scale * way
-    by_wheel = at_beginning + way**2 * variance
+    left = difference - scale * distance
+    by_wheel = at_beginning + distance**2 * variance
     sigma = np.sqrt(by_wheel + samples.sigma_m[now] ** 2)
     beyond = long_enough & (np.abs(left) >= limits.wheel_m) & (np.abs(left) >= limits.wheel_sigmas * sigma)
     bound = np.abs(left) + limits.wheel_level_sigmas * np.sqrt(by_wheel)

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.special import ndtr
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass, join_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, read_toml, validate
@@ -114,9 +114,7 @@ def araim_levels(
     for first in range(0, max(epochs, 1), block):
         rows = slice(first, first + block)
         parts.append(_block(geometry, rows, sets, masks, size, np.array([phmi, false_alarm]), budget))
-    return AraimLevels(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in AraimLevels.__dataclass_fields__}
-    )
+    return join_rows(parts)
 
 
 def _block(

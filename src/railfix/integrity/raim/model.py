@@ -9,14 +9,14 @@ with `LinearModel.freedom` degrees of freedom.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass, kernel_array
+from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, dataclass, kernel_array
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
@@ -31,6 +31,10 @@ class ModelArrays(NamedTuple):
     covariance_m2: Floats
     prior: Floats
     misfit: Floats
+
+
+#: Arrays of `LinearModel` with an axis of epochs, the first.
+_BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_m2", "misfit", "freedom")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,19 +62,14 @@ class LinearModel:
 
     def take(self, epochs: Masks | Indices) -> LinearModel:
         """Return the model of some epochs, by mask or index."""
-        return LinearModel(
-            root_weight=self.root_weight[epochs], clock=self.clock,
-            clock_covariance_m2=self.clock_covariance_m2[epochs], design=self.design[epochs],
-            covariance_m2=self.covariance_m2[epochs], prior=self.prior, misfit=self.misfit[epochs],
-            freedom=self.freedom[epochs], interest=self.interest,
-        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[epochs] for name in _BY_EPOCH})
 
     def patch(self, epochs: Indices, part: LinearModel) -> LinearModel:
         """Return the model with some epochs, by index, replaced by those of another."""
         if len(epochs) == len(self):
             return part
         changed = {}
-        for name in ("root_weight", "clock_covariance_m2", "design", "covariance_m2", "misfit", "freedom"):
+        for name in _BY_EPOCH:
             changed[name] = getattr(self, name).copy()
             changed[name][epochs] = getattr(part, name)
         return replace(self, **changed)
@@ -140,7 +139,7 @@ class LinearModel:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compact:
+class Compact(RowArrays):
     """Residuals and their projector of the used channels alone, side by side: T epochs by n."""
 
     channel: Indices  #: Channel of the model in each place, shape (T, n).
@@ -149,10 +148,6 @@ class Compact:
     residual: Floats  #: Shape (T, n).
     sigma_m: Floats  #: 0 beyond, shape (T, n).
     gain_m: Floats  #: Shape (T, n, interest).
-
-    def take(self, epochs: Indices) -> Compact:
-        """Return the parts of some epochs, by index."""
-        return Compact(**{item.name: getattr(self, item.name)[epochs] for item in fields(self)})
 
 
 def compact(model: LinearModel) -> Compact:

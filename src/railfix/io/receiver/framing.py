@@ -7,7 +7,7 @@ reference guide, section 4.1 (SBF); NMEA 0183, section 5.3.
 from __future__ import annotations
 
 import binascii
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
 from typing import Final
@@ -21,10 +21,10 @@ from railfix.core.arrays import (
     Indices,
     Integers,
     Masks,
+    RowArrays,
     Strings,
     dataclass,
     join_rows,
-    take_rows,
 )
 from railfix.core.files import FilePath, open_stream
 
@@ -66,10 +66,22 @@ class Frames:
         own = self._by_protocol.get(protocol, np.empty(0, dtype=np.intp))
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
+    def structures(self, protocol: str, kinds: Iterable[int], layout: np.dtype) -> tuple[Indices, np.ndarray]:
+        """Return positions of the frames of some kinds that are long enough for a layout, and what they begin with."""
+        chosen = self.of(protocol, *kinds)
+        chosen = chosen[self.end[chosen] - self.start[chosen] >= layout.itemsize]
+        return chosen, gather_structures(self.data, self.start[chosen], layout)
+
     @cached_property
     def _by_protocol(self) -> dict[str, Indices]:
         """Positions of the frames of each protocol that there is: a live epoch is asked for many that there are not."""
         return {name: np.flatnonzero(self.protocol == name) for name in set(self.protocol.tolist())}
+
+
+def gather_structures(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
+    """Return the structures of one layout at many places of a buffer, shape (N,)."""
+    block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
+    return np.ascontiguousarray(block).view(layout)[:, 0]
 
 
 @dataclass(frozen=True)
@@ -308,7 +320,7 @@ def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Subframes:
+class Subframes(RowArrays):
     """Raw navigation words as UBX has them, N rows in the order of the stream."""
 
     satellite: Strings
@@ -321,10 +333,6 @@ class Subframes:
 
     def __len__(self) -> int:
         return len(self.satellite)
-
-    def take(self, rows: Integers | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Subframes:
-        """Return some of the rows."""
-        return take_rows(self, rows)
 
 
 def join_subframes(first: Subframes, second: Subframes) -> Subframes:

@@ -23,13 +23,13 @@ from railfix.io.receiver.framing import (
     SBAS_L5,
     Frames,
     Subframes,
+    gather_structures,
     join_subframes,
     read_unsigned,
     unpack_words,
 )
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.nav_messages import BCNAV1_PARTS, has_crc
-from railfix.io.receiver.ubx import gather_structures
 
 Words = np.ndarray[tuple[int, int], np.dtype[np.uint32]]
 
@@ -135,10 +135,7 @@ _SIGNAL_NAMES: Final = np.array([SIGNALS.get(number, "") for number in range(64)
 
 def meas_epoch_measurements(frames: Frames) -> Measurements:
     """Return the measurements of all MeasEpoch blocks; malformed ones are skipped and counted."""
-    chosen = frames.of("sbf", MEAS_EPOCH)
-    length = frames.end[chosen] - frames.start[chosen]
-    head = gather_structures(frames.data, frames.start[chosen][length >= _HEAD.itemsize], _HEAD)
-    chosen = chosen[length >= _HEAD.itemsize]
+    chosen, head = frames.structures("sbf", [MEAS_EPOCH], _HEAD)
     dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != _NO_WEEK) & (head["size1"] >= 20) & (head["size2"] >= 12)
     scrambled = dated & (head["flags"] & _SCRAMBLED != 0)
     dated &= ~scrambled
@@ -278,9 +275,7 @@ def navigation_subframes(frames: Frames) -> Subframes:
 
 def _bcnav1_pages(frames: Frames) -> Subframes:
     """Return the frames of B-CNAV1 with valid CRCs, each as three pages (`nav_messages.BCNAV1`)."""
-    chosen = frames.of("sbf", BDS_RAW_B1C)
-    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _FRAME.itemsize]
-    rows = gather_structures(frames.data, frames.start[chosen], _FRAME)
+    chosen, rows = frames.structures("sbf", [BDS_RAW_B1C], _FRAME)
     bits = np.unpackbits(rows["words"].astype(">u4").view(np.uint8).reshape(len(rows), 228), axis=1)
     subframe = {2: bits[:, 72:672], 3: bits[:, 1272:1536]}
     valid = (rows["crc"] == 1).all(axis=1) & has_crc(subframe[2], 576) & has_crc(subframe[3], 240)
@@ -303,9 +298,7 @@ def _bcnav1_pages(frames: Frames) -> Subframes:
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
     """Return the places in the stream of navigation pages with a time, and their times."""
-    chosen = frames.of("sbf", *_PAGES, BDS_RAW_B1C)
-    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _TIME.itemsize]
-    rows = gather_structures(frames.data, frames.start[chosen], _TIME)
+    chosen, rows = frames.structures("sbf", [*_PAGES, BDS_RAW_B1C], _TIME)
     dated = (rows["tow_ms"] != _NO_TIME) & (rows["week"] != _NO_WEEK)
     times = from_week(rows["week"][dated].astype(np.int64), rows["tow_ms"][dated] * 1e-3)
     return frames.frame_start[chosen[dated]], times
@@ -328,9 +321,7 @@ def _inav_words(words: Words) -> Words:
 def positions(frames: Frames) -> dict[str, np.ndarray]:
     """Return the receiver's own positions, of PVTGeodetic, else PVTCartesian blocks: columns of `PositionLog`."""
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
-    chosen = frames.of("sbf", PVT_GEODETIC if geodetic else PVT_CARTESIAN)
-    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
-    rows = gather_structures(frames.data, frames.start[chosen], _PVT)
+    _, rows = frames.structures("sbf", [PVT_GEODETIC if geodetic else PVT_CARTESIAN], _PVT)
     mode = rows["mode"] & 15
     rows = rows[(rows["error"] == 0) & np.isin(mode, list(_QUALITY)) & (rows["tow_ms"] != _NO_TIME)]
     place = rows["place"]

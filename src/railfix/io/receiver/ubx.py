@@ -10,10 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, Strings, places_in_groups
+from railfix.core.arrays import Datetimes, Integers, Masks, Strings, places_in_groups
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week, nearest_week
-from railfix.io.receiver.framing import Frames, Subframes
+from railfix.io.receiver.framing import Frames, Subframes, gather_structures
 from railfix.io.receiver.measurements import Measurements
 
 RXM_RAWX: Final = 0x0215
@@ -49,6 +49,7 @@ _MEASUREMENT: Final = np.dtype(
         ("doppler_std", "u1"), ("tracking", "u1"), ("reserved", "u1"),
     ]
 )  # fmt: skip
+_SFRBX_HEADER: Final = np.dtype([*((name, "u1") for name in ("gnss", "sv", "signal", "channel", "count")), ("_", "V3")])
 _WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Most words of RXM-SFRBX that are used.
 _RAWX_HEADER: Final = np.dtype(
     [("tow", "<f8"), ("week", "<u2"), ("leap", "i1"), ("count", "u1"), ("status", "u1"), ("version", "u1"), ("_", "V2")]
@@ -88,11 +89,8 @@ _NAMES: Final = _name_table()
 
 def rawx_measurements(frames: Frames) -> Measurements:
     """Return the raw measurements of all RXM-RAWX messages; malformed ones are counted."""
-    chosen = frames.of("ubx", RXM_RAWX)
-    length = frames.end[chosen] - frames.start[chosen]
-    header = gather_structures(frames.data, frames.start[chosen][length >= 16], _RAWX_HEADER)
-    chosen, length = chosen[length >= 16], length[length >= 16]
-    whole = length == 16 + 32 * header["count"].astype(np.int64)
+    chosen, header = frames.structures("ubx", [RXM_RAWX], _RAWX_HEADER)
+    whole = frames.end[chosen] - frames.start[chosen] == 16 + 32 * header["count"].astype(np.int64)
     plausible = whole & (header["week"] > 0) & (header["week"] <= _LAST_WEEK)
     plausible &= (header["tow"] >= 0) & (header["tow"] < 604_800)
     undated = whole & ~plausible
@@ -132,31 +130,21 @@ def rawx_measurements(frames: Frames) -> Measurements:
     )
 
 
-def gather_structures(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
-    """Return the structures of one layout at many places of a buffer, shape (N,)."""
-    block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
-    return np.ascontiguousarray(block).view(layout)[:, 0]
-
-
 def sfrbx_subframes(frames: Frames) -> Subframes:
     """Return the subframes of all RXM-SFRBX messages; L1 C/A ones of wrong parity are counted."""
-    chosen = frames.of("ubx", RXM_SFRBX)
-    length = frames.end[chosen] - frames.start[chosen]
-    chosen, length = chosen[length >= 8], length[length >= 8]
-    first = frames.start[chosen]
-    count = frames.data[first + 4].astype(np.int64)
-    whole = length == 8 + 4 * count
-    chosen, first, count = chosen[whole], first[whole], count[whole]
+    chosen, header = frames.structures("ubx", [RXM_SFRBX], _SFRBX_HEADER)
+    whole = frames.end[chosen] - frames.start[chosen] == 8 + 4 * header["count"].astype(np.int64)
+    chosen, header = chosen[whole], header[whole]
     data = np.concatenate([frames.data, np.zeros(_WORDS.itemsize, np.uint8)])
-    words = np.where(np.arange(10) < count[:, None], gather_structures(data, first + 8, _WORDS)["words"], 0)
-    words = words.astype(np.uint32)
-    system, signal = frames.data[first].astype(np.int64), frames.data[first + 2].astype(np.int64)
+    sent = gather_structures(data, frames.start[chosen] + 8, _WORDS)["words"]
+    words = np.where(np.arange(10) < header["count"][:, None], sent, 0).astype(np.uint32)
+    system, signal, channel = (header[name].astype(np.int64) for name in ("gnss", "signal", "channel"))
     wrong = np.isin(system, (0, 5)) & (signal == 0) & ~has_lnav_parity(words)
     counts = {f"{SYSTEMS[k]} subframes with wrong parity": int(np.sum(wrong & (system == k))) for k in (0, 5)}
     subframes = Subframes(
-        satellite=_NAMES[system, frames.data[first + 1]],
+        satellite=_NAMES[system, header["sv"]],
         signal=signal,
-        glonass_channel=frames.data[first + 3].astype(np.int64) - 7,
+        glonass_channel=channel - 7,
         words=words,
         order=frames.frame_start[chosen],
         skipped={what: number for what, number in counts.items() if number},
@@ -183,9 +171,7 @@ def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> 
 
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
     """Return the receiver's own positions, columns of `PositionLog`; `near` is within half a week."""
-    coarse = frames.of("ubx", NAV_PVT)
-    coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]
-    pvt = gather_structures(frames.data, frames.start[coarse], _PVT)
+    _, pvt = frames.structures("ubx", [NAV_PVT], _PVT)
     fixed = (pvt["flags"] & 1 == 1) & np.isin(pvt["fix"], [2, 3, 4])
     carrier = pvt["flags"] >> 6
     quality = np.where(carrier > 0, 3 - carrier.astype(np.int64), np.where(pvt["flags"] & 2 != 0, 4, 5))
@@ -235,9 +221,7 @@ def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
 
 def _date(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
     """Return days (UTC), rows and places of NAV-PVT with a valid date."""
-    chosen = frames.of("ubx", NAV_PVT)
-    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
-    rows = gather_structures(frames.data, frames.start[chosen], _PVT)
+    chosen, rows = frames.structures("ubx", [NAV_PVT], _PVT)
     valid = rows["valid"] & 3 == 3
     rows = rows[valid]
     year, month, day = (rows[name].astype(np.int64) for name in ("year", "month", "day"))

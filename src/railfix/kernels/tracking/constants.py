@@ -31,7 +31,7 @@ WHEEL_WALK: Final = 5e-4
 FORCE_WALK_MPS2: Final = 1e-3
 RADAR_WALK: Final = 2e-4
 #: Share of the map's error of height that changes over `map_correlation_m`; across it is the whole: heights of a survey
-#: or a terrain model are wrong over longer ways.
+#: or a terrain model are wrong over longer distances.
 HEIGHT_ROUGHNESS: Final = 0.5
 #: Least variance of a step of the place [m2], keeps matrices regular.
 LEAST_STEP_M2: Final = 1e-6
@@ -176,7 +176,7 @@ STEP_S: Final = 3.0
 STEP_HELD_S: Final = 300.0
 
 # Levels.
-#: Share of a way that a source without codes may be wrong by: a worn or wrongly entered wheel.
+#: Share of a distance that a source without codes may be wrong by: a worn or wrongly entered wheel.
 SCALE_BOUND: Final = 0.02
 #: A source that is not measured needs no sub-filter once it has left the filter: place and standard deviation differ
 #: by less than this share of the standard deviation.

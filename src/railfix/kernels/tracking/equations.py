@@ -82,10 +82,10 @@ def write_equations(
 ) -> None:
     """Write the equations of an epoch about the places `work.now[h]` and `work.before[h]`.
 
-    `design` has three coefficients on the axes for each code, four for each phase (way, clock, right, up) and Doppler
-    (right, up, speed, drift). `sensed` has for each sensor the coefficients of the place and the place before, the
-    speed and the speed before, of its own unknown (of a place the acceleration) and of the displacement along the map;
-    of a range the second and the fourth are of the error of the map to the right and up.
+    `design` has three coefficients on the axes for each code, four for each phase (distance, clock, right, up) and
+    Doppler (right, up, speed, drift). `sensed` has for each sensor the coefficients of the place and the place before,
+    the speed and the speed before, of its own unknown (of a place the acceleration) and of the displacement along the
+    map; of a range the second and the fourth are of the error of the map to the right and up.
     """
     mean, seen, design, value, sensed = work.mean, work.sight, work.design, work.value, work.sensed
     codes, phases, dopplers, sensors, point, axes = (

@@ -242,7 +242,7 @@ def advance_subfilters(
             own = epochs.slot[k] if satellite else slots + epochs.offset[k]
             out = own == b or (b == others + ALL_DOPPLERS and i >= nc + nph)
             out = out or (b == others + ALL_PHASES and nc <= i < nc + nph)
-            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)  # a way ahead shortens its range
+            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)  # a distance ahead shortens its range
             work.masked[i] = math.inf if out else work.variance[i]
         for j in range(rows.counts[3]):
             own = slots + clocks + min(rows.sensors[j], RANGE_ROW)

@@ -143,7 +143,7 @@ def predict(
     above = max(parameters.map_roughness_m, HEIGHT_ROUGHNESS * line.sigma_height_m)
     spread[to, n + STEP_RIGHT, n + STEP_RIGHT] = across**2 * changed + 1e-8
     spread[to, n + STEP_UP, n + STEP_UP] = above**2 * changed + 1e-8
-    # The way on the map is the way run less the error of the length: what codes see of it, phases do not.
+    # The distance on the map is the distance run less the error of the length: what codes see of it, phases do not.
     length = parameters.map_scale_m**2 * math.exp(map_log_variance) * travel + parameters.phase_walk_m**2 * dt
     spread[to, ARC, ARC] += length
     spread[to, n + MAP_LENGTH_ERROR, n + MAP_LENGTH_ERROR] = length + 1e-8

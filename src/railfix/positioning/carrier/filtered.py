@@ -1,8 +1,8 @@
 """Positions along the line from code and phase, each epoch from the past alone.
 
 The normal matrix of the running arcs' ambiguities is what one epoch leaves to the next; at multiples of a hop the
-ambiguities walk a little. Ambiguities of ended arcs are eliminated, so that the state is as small as there are
-channels.
+ambiguities walk a little. Where an arc begins, that of its channel before it is eliminated, so that the state is as
+small as there are channels.
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ from railfix.positioning.carrier.ambiguities import (
     number_hops,
     prepare_start,
 )
-from railfix.positioning.carrier.continuity import decode_channel
+from railfix.positioning.carrier.continuity import NO_ARC, decode_channel
 from railfix.positioning.carrier.observation_model import (
     IntegerChannels,
-    Linearised,
     Phases,
     linearise,
     own_clock,
@@ -94,7 +93,7 @@ def phase_positions(
     -------
     PhasePositions
     PhaseState
-        Any cutting into chunks gives the same within rounding: 1e-9 m, 0.2 % of sigma where most arcs are short.
+        Any cutting into chunks gives the same, to 1e-9 m.
     """
     limits = limits or PhaseLimits()
     memories = state.memories if state and state.memories else (Memory(),) * limits.passes
@@ -102,7 +101,7 @@ def phase_positions(
         raise ValueError(f"the state has {len(memories)} passes, the limits ask for {limits.passes}")
     started = np.isfinite(arc_m_start)
     ranges, phases, arc = prepare_start(ranges, phases, trajectory, arc_m_start)
-    cuts = _cuts(number_hops(time, limits), phases)
+    cuts = _cuts(number_hops(time, limits))
     integers, phases = phases.integers, replace(phases, integers=None)  # the last pass fixes
     after: list[Memory] = []
     pieces: list[PhasePositions] = []
@@ -122,22 +121,11 @@ def phase_positions(
     return _join(pieces), PhaseState(memories=tuple(after))
 
 
-def _cuts(hop: Integers, phases: Phases) -> list[Indices]:
-    """Cut epochs into segments inside a hop, with not many more arcs than channels."""
-    epochs, channels = phases.arc_id.shape
-    new = np.ones((epochs, channels), dtype=bool)
-    new[1:] = phases.arc_id[1:] != phases.arc_id[:-1]
-    begun = np.cumsum(np.count_nonzero(new & (phases.weight > 0), axis=1))
-    ends = np.append(np.flatnonzero(np.diff(hop)) + 1, epochs)
-    cuts, first = [], 0
-    while first < epochs:
-        known = begun[first - 1] if first else 0
-        within = int(np.searchsorted(begun, known + 2 * channels, side="right"))
-        hop_end = int(ends[np.searchsorted(ends, first, side="right")])
-        last = min(first + SEGMENT_EPOCHS, max(within, first + 1), hop_end)
-        cuts.append(np.arange(first, last))
-        first = last
-    return cuts or [np.arange(0)]
+def _cuts(hop: Integers) -> list[Indices]:
+    """Cut epochs into segments, each inside a hop."""
+    blocks = np.arange(0, len(hop), SEGMENT_EPOCHS)
+    starts = np.union1d(np.flatnonzero(np.diff(hop)) + 1, blocks)
+    return np.split(np.arange(len(hop)), starts[1:])
 
 
 def _segment(
@@ -154,86 +142,109 @@ def _segment(
     used = phases.weight > 0
     lin = linearise(ranges, phases, trajectory, arc_m, clocks=limits.clocks)
     memory = _walk(memory, time, limits)
-    ids, first, column = np.unique(phases.arc_id[used], return_index=True, return_inverse=True)
-    memory = _with_arcs(memory, ids, lin.phase_m[used][first])
-    place = np.searchsorted(memory.arc_id, ids)
-    count = len(memory.arc_id)
-    index = np.full(used.shape, count, dtype=np.intp)
-    index[used] = place[column]
-    base = np.append(memory.first_m, 0.0)
-    lin = shift_phases(lin, base[index])
-
-    matrix, right, kept = _accumulate(lin, index, memory)
-    row = np.arange(len(matrix))[:, None]
-    held = np.zeros((len(matrix), count + 1))
-    held[row, index] = own_clock(lin)
-    covariance = np.zeros((len(matrix), count + 1, count + 1))
-    covariance[:, :count, :count] = inverse_of_arcs(matrix, held[:, :count])
-    value = np.zeros((len(matrix), count + 1, 3))
-    value[:, :count] = covariance[:, :count, :count] @ right
-    floats = (np.zeros((count, count)), np.zeros(count))
-    if len(value):
-        floats = covariance[-1, :count, :count].copy(), value[-1, :count, 0].copy()
-    fixes = _fix_epochs((base, value, covariance), index, phases, trajectory, limits)
-    among = covariance[row[:, None], index[:, :, None], index[:, None, :]]
     before = np.asarray([memory.time], dtype="datetime64[ns]")
+    ids, first, column = np.unique(phases.arc_id[used], return_index=True, return_inverse=True)
+    rows = np.nonzero(used)[0]
+    known = np.isin(ids, memory.arc_id)
+    first_m, begin = lin.phase_m[used][first], np.where(known, -1, rows[first])
+    first_m[known] = memory.first_m[np.searchsorted(memory.arc_id, ids[known])]
+    base = np.zeros(used.shape)
+    base[used] = first_m[column]
+    lin = shift_phases(lin, base)
+    matrix, right = reduce(lin)
+
+    # A part ends where an arc begins, so that matrices have the same size however epochs are cut.
+    parts = []
+    for part in np.split(np.arange(len(time)), np.unique(begin[begin > 0])):
+        new = np.isin(begin, part[:1])
+        memory = _with_arcs(memory, ids[new], first_m[new])
+        arc_id = np.where(used[part], phases.arc_id[part], NO_ARC)
+        value, covariance, arcs, memory = _ambiguities(matrix[part], right[part], arc_id, memory, held=own_clock(lin))
+        parts.append((value, covariance))
+    value, covariance = (np.concatenate(each) for each in zip(*parts, strict=True))
+    fixes = _fix_epochs((base, value, covariance), phases, trajectory, limits)
     repeats = count_repeats(np.concatenate([before, time]), limits)[1:]
-    own = own_unknowns(lin, value[row, index], among, trajectory, repeats=repeats)
+    own = own_unknowns(lin, value, covariance, trajectory, repeats=repeats)
     arc = np.clip(arc_m + own.step_m, 0.0, trajectory.arc_m[-1])
-    seen = memory.seen.copy()
-    if len(ids):
-        last_row = np.zeros(len(ids), dtype=np.intp)
-        np.maximum.at(last_row, column, np.nonzero(used)[0])
-        seen[place] = time[last_row]
-    now = time[-1] if len(time) else memory.time
-    channel = decode_channel(memory.arc_id)
-    older = np.append(channel[1:] == channel[:-1], False)[:count]  # sorted: the newest of a channel comes last
-    left = _without(replace(kept, time=now, seen=seen), older)
-    last, end = floats
-    running = np.isin(memory.arc_id, left.arc_id)
-    arcs = ArcAmbiguities(
-        arc_id=left.arc_id, ambiguity_m=(memory.first_m + end)[running], covariance_m2=last[np.ix_(running, running)]
-    )
-    ambiguity = (base[index] + value[row, index, 0], covariance[row, index, index])
+    ambiguity = base + value[..., 0], np.diagonal(covariance, axis1=1, axis2=2)
     piece = assemble_positions(arc, started, own, lin, ambiguity, arcs, fixes, limits)
-    return piece, arc, left
+    if len(time):
+        last = np.zeros(len(ids), dtype=np.intp)
+        np.maximum.at(last, column, rows)
+        seen = memory.seen.copy()
+        here = np.isin(memory.arc_id, ids)
+        seen[here] = time[last[np.isin(ids, memory.arc_id)]]
+        memory = replace(memory, time=time[-1], seen=seen)
+    return piece, arc, memory
+
+
+def _ambiguities(
+    matrix: Floats, right: Floats, arc_id: Integers, memory: Memory, *, held: bool
+) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
+    """Return ambiguities of each epoch's channels less their first values, shape (T, M, 3), and covariances (T, M, M).
+
+    From each epoch's own normal equations and those before it; then those of all arcs, and the memory after the last
+    epoch. `held`: see `inverse_of_arcs`.
+    """
+    count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
+    # One more row and column takes what has no phase.
+    index = np.where(arc_id == NO_ARC, count, np.searchsorted(memory.arc_id, arc_id))
+    own = np.zeros((len(arc_id), count + 1, count + 4))
+    own[row[:, None], index[:, :, None], index[:, None, :]] = matrix
+    own[row, index, count + 1 :] = right
+    own = np.delete(own[:, :count], count, axis=2)
+    carried = np.concatenate([memory.matrix, memory.right], axis=1)
+    # cumsum from the carried sums: the same additions in the same order however epochs are cut.
+    sums = np.cumsum(np.concatenate([carried[None], own]), axis=0)
+    after = replace(memory, matrix=sums[-1, :, :count], right=sums[-1, :, count:])
+    level = np.zeros((len(arc_id), count + 1))
+    level[row, index] = held
+    covariance, value = np.zeros((len(arc_id), count + 1, count + 1)), np.zeros((len(arc_id), count + 1, 3))
+    covariance[:, :count, :count] = inverse_of_arcs(sums[1:, :, :count], level[:, :count])
+    value[:, :count] = covariance[:, :count, :count] @ sums[1:, :, count:]
+    arcs = ArcAmbiguities(
+        arc_id=memory.arc_id, ambiguity_m=memory.first_m + value[-1:, :count, 0].sum(axis=0),
+        covariance_m2=covariance[-1:, :count, :count].sum(axis=0),
+    )  # fmt: skip
+    return value[row, index], covariance[row[:, None], index[:, :, None], index[:, None, :]], arcs, after
 
 
 def _fix_epochs(
-    floats: tuple[Floats, Floats, Floats], index: Indices, phases: Phases, trajectory: Trajectory, limits: PhaseLimits
+    floats: tuple[Floats, Floats, Floats], phases: Phases, trajectory: Trajectory, limits: PhaseLimits
 ) -> tuple[Integers, Floats]:
     """Fix ambiguities in place, epoch by epoch; return how many differences, and the risk.
 
-    `floats`: first values of the ambiguities, corrections to them with their responses to the map, and covariances.
+    `floats`, by channel: first values of the ambiguities, corrections to them with their responses to the map, and
+    covariances.
     """
     first, value, covariance = floats
-    count, risk = np.zeros(len(index), dtype=np.int64), np.full(len(index), np.nan)
+    count, risk = np.zeros(len(value), dtype=np.int64), np.full(len(value), np.nan)
     integers = phases.integers
     if integers is None:
         return count, risk
-    for k, arcs in enumerate(index):
-        used = np.flatnonzero(phases.weight[k] > 0)
-        at = arcs[used]
-        whole = value[k, at]
-        whole[:, 0] += first[at]
+    for k, weight in enumerate(phases.weight):
+        used = np.flatnonzero(weight > 0)
+        both = np.ix_(used, used)
+        whole = value[k, used]
+        whole[:, 0] += first[k, used]
         fixed = fix_integers(
-            whole, covariance[k][np.ix_(at, at)], phases.weight[k, used],
+            whole, covariance[k][both], weight[used],
             IntegerChannels(wavelength_m=integers.wavelength_m[used], group=integers.group[used]),
             (trajectory.sigma_plan_m, trajectory.sigma_height_m),
             largest_risk=limits.integer_risk, no_integer_prior=limits.no_integer_prior,
         )  # fmt: skip
-        value[k, at], covariance[k][np.ix_(at, at)] = fixed.value_m, fixed.covariance_m2
-        value[k, at, 0] -= first[at]
+        value[k, used], covariance[k][both] = fixed.value_m, fixed.covariance_m2
+        value[k, used, 0] -= first[k, used]
         count[k], risk[k] = fixed.count, fixed.risk
     return count, risk
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
-    """Return the memory with room for more arcs, sorted by name; known ones keep their first values."""
-    new = ~np.isin(ids, memory.arc_id)
-    if not new.any():
+    """Return the memory with room for new arcs, sorted by name, those of the same channels eliminated."""
+    if not len(ids):
         return memory
-    arc_id = np.concatenate([memory.arc_id, ids[new]])
+    memory = _without(memory, np.isin(decode_channel(memory.arc_id), decode_channel(ids)))
+    arc_id = np.concatenate([memory.arc_id, ids])
     order = np.argsort(arc_id)
     count, old = len(arc_id), len(memory.arc_id)
     matrix, right = np.zeros((count, count)), np.zeros((count, 3))
@@ -243,27 +254,10 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
         memory,
         arc_id=arc_id[order],
         seen=np.concatenate([memory.seen, never])[order],
-        first_m=np.concatenate([memory.first_m, first_m[new]])[order],
+        first_m=np.concatenate([memory.first_m, first_m])[order],
         matrix=matrix[np.ix_(order, order)],
         right=right[order],
     )
-
-
-def _accumulate(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats, Floats, Memory]:
-    """Return the normal equations at each epoch, its own part included, and the memory after the last one."""
-    matrix, right = reduce(lin)
-    epochs, count = len(index), len(memory.arc_id)
-    row = np.arange(epochs)[:, None]
-    # One more row and column takes what has no phase.
-    own = np.zeros((epochs, count + 1, count + 4))
-    own[row[:, None], index[:, :, None], index[:, None, :]] = matrix
-    own[row, index, count + 1 :] = right
-    own = np.delete(own[:, :count], count, axis=2)
-    carried = np.concatenate([memory.matrix, memory.right], axis=1)
-    # cumsum from the carried sums: the same additions in the same order however epochs are cut.
-    sums = np.cumsum(np.concatenate([carried[None], own]), axis=0)
-    kept = replace(memory, matrix=sums[-1, :, :count], right=sums[-1, :, count:])
-    return sums[1:, :, :count], sums[1:, :, count:], kept
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:

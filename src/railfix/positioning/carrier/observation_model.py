@@ -91,7 +91,7 @@ class Linearised:
     phase_clock_m: Floats
     known: Floats  #: Prior information: errors of the map, ties between clocks; shape (T, P, P).
     inverse: Floats  #: Inverse of the normal matrix of the own unknowns, shape (T, P, P).
-    right: Floats  #: Right-hand side of the own unknowns, shape (T, P).
+    right: Floats  #: Right-hand side of the own unknowns, of the codes until `shift_phases`; shape (T, P).
     coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
     prior: Floats  #: Of the map's errors, shape (2,) [1/m^2].
 
@@ -125,7 +125,6 @@ def linearise(
     matrix = np.matmul((for_code * w[..., None]).swapaxes(1, 2), for_code)
     matrix += np.matmul((for_phase * v[..., None]).swapaxes(1, 2), for_phase)
     right = np.matmul((w * code)[:, None, :], for_code)[:, 0]
-    right += np.matmul((v * phase)[:, None, :], for_phase)[:, 0]
     if ranges.ties is not None:
         tie, tied = _ties(ranges.ties)
         known[:, PLACE : PLACE + groups, PLACE : PLACE + groups] += tie
@@ -170,13 +169,16 @@ def own_clock(lin: Linearised) -> bool:
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Take first values of the ambiguities (T, M), and what is left in common, off the phases."""
+    """Take first values of the ambiguities (T, M), and what is left in common, off the phases.
+
+    Only then they join the right-hand side: first values of 1e7 m would leave it with rounding errors of millimetres.
+    """
     phase = np.where(lin.phase_weight > 0, lin.phase_m - first_m, 0.0)
     clock = np.zeros(len(phase))
     if own_clock(lin):
         phase, clock = _level(phase, lin.phase_weight)
-    moved = np.matmul((lin.phase_weight * (phase - lin.phase_m))[:, None, :], lin.phase_design)[:, 0]
-    return replace(lin, phase_m=phase, right=lin.right + moved, phase_clock_m=lin.phase_clock_m + clock)
+    right = lin.right + np.matmul((lin.phase_weight * phase)[:, None, :], lin.phase_design)[:, 0]
+    return replace(lin, phase_m=phase, right=right, phase_clock_m=lin.phase_clock_m + clock)
 
 
 def reduce(lin: Linearised) -> tuple[Floats, Floats]:

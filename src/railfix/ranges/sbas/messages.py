@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import field, replace
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, dataclass, freeze_rows
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, dataclass, freeze_rows, join_rows
 from railfix.io.receiver.framing import crc24q
 
 Band = Literal["L1", "L5"]  #: Frequency that messages are sent on, and corrections made for.
@@ -66,7 +66,7 @@ def message_type(bits: Bytes, band: Band = "L1") -> Integers:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SbasMessages:
+class SbasMessages(RowArrays):
     """Messages that passed every check, N rows in the order of their reception."""
 
     #: GPS time at which the message had been received completely: from here on it may be used; shape (N,).
@@ -96,10 +96,6 @@ class SbasMessages:
         """PRNs that sent anything, rising."""
         return tuple(int(prn) for prn in np.unique(self.prn))
 
-    @property
-    def _arrays(self) -> dict[str, Any]:
-        return {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
-
     def describe_choice(self, prn: int) -> str:
         """Return a sentence on a PRN that was asked for; ValueError where none of the messages is of it."""
         known = ", ".join(map(str, self.prns))
@@ -122,19 +118,19 @@ class SbasMessages:
         """Return these messages and others, in the order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self
-        joined = {name: np.concatenate([rows, getattr(later, name)]) for name, rows in self._arrays.items()}
+        both = join_rows([self, later])
         sources = tuple(dict.fromkeys((*self.sources, *later.sources)))
         number = np.array([sources.index(name) for name in (*self.sources, *later.sources)] or [0], dtype=np.int64)
-        own = np.where(np.arange(len(joined["time"])) < len(self), 0, len(self.sources))
-        joined["source"] = number[np.minimum(joined["source"] + own, len(number) - 1)]
-        order = np.argsort(joined["time"], kind="stable")
-        return SbasMessages(
-            **{name: values[order] for name, values in joined.items()},
+        own = np.where(np.arange(len(both)) < len(self), 0, len(self.sources))
+        joined = replace(
+            both,
+            source=number[np.minimum(both.source + own, len(number) - 1)],
             sources=sources,
             rejected=dict(Counter(self.rejected) + Counter(later.rejected)),
             notes=tuple(dict.fromkeys((*self.notes, *later.notes))),
             band=later.band,
         )
+        return joined.take(np.argsort(both.time, kind="stable"))
 
     def repeated(self) -> Masks:
         """Return messages that another receiver has passed on before: the same bits of one PRN within 1 s, shape (N,).
@@ -148,7 +144,3 @@ class SbasMessages:
             same = (self.prn[later] == self.prn[earlier]) & (self.bits[later] == self.bits[earlier]).all(axis=1)
             again[later] |= same & (self.time[later] - self.time[earlier] <= _REPEATED_WITHIN)
         return again
-
-    def take(self, rows: Masks | Integers) -> SbasMessages:
-        """Return some of the messages."""
-        return replace(self, **{name: values[rows] for name, values in self._arrays.items()})

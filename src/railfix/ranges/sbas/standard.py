@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Integers, Masks, dataclass, freeze_arrays
+from railfix.core.arrays import Floats, FrozenArrays, Integers, Masks, dataclass
 from railfix.core.settings import Settings
 
 #: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).
@@ -158,13 +158,8 @@ def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: i
     return np.asarray(np.select(conditions, values, otherwise), dtype=np.int64)
 
 
-class _Frozen:
-    def __post_init__(self) -> None:
-        freeze_arrays(self)  # type: ignore[arg-type]
-
-
 @dataclass(frozen=True, kw_only=True)
-class SatelliteCorrections(_Frozen):
+class SatelliteCorrections(FrozenArrays):
     """Corrections of T epochs by K satellites; NaN and -1 where `state` is not OK, but for `udrei` and `iode`.
 
     The corrected code is ``code + fast_m``, with the satellite at ``broadcast + position_m`` and
@@ -205,7 +200,7 @@ class SatelliteCorrections(_Frozen):
 
 
 @dataclass(frozen=True, kw_only=True)
-class IonosphereDelays(_Frozen):
+class IonosphereDelays(FrozenArrays):
     """Delays of T epochs by K satellites from the grid."""
 
     state: Integers  #: `IonosphereState`, shape (T, K).

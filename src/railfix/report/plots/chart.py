@@ -15,7 +15,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Indices, Integers, Strings, dataclass
 from railfix.core.timescale import seconds
-from railfix.evaluate.inputs import floats
+from railfix.evaluate.inputs import floats, words
 
 #: Colours distinguishable with colour blindness (Okabe and Ito), with a contrast of 3 to 1 or more on white.
 BLUE: Final[str] = "#0072b2"
@@ -219,11 +219,6 @@ __all__ = ["find_start", "floats", "nice_step", "points", "since", "words"]
 def points(table: pl.DataFrame, *names: str) -> Floats:
     """Return columns side by side, shape (rows, columns)."""
     return np.stack([floats(table, name) for name in names], axis=1)
-
-
-def words(table: pl.DataFrame, name: str) -> Strings:
-    """Return a text column, blank where it is null."""
-    return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
 
 
 def find_start(table: pl.DataFrame) -> np.datetime64:

@@ -233,7 +233,8 @@ class Environment:
 
     def label_at(self, chainage_m: ArrayLike) -> Strings:
         """Return the kind of section at chainages; "open" outside all sections."""
-        return self.structures.kind_at(np.asarray(chainage_m, dtype=np.float64))
+        section = np.searchsorted(self.structures.borders_m, np.asarray(chainage_m, dtype=np.float64), side="right")
+        return self.structures.kinds[section]
 
     def __call__(self, geometry: SightGeometry) -> Disturbance:
         """Return the disturbance of every channel and epoch, shapes (T, M)."""

@@ -127,10 +127,6 @@ class Structures:
     borders_m: Floats  #: From and to of the sections, shape (2 S,).
     kinds: Strings  #: Kind before the first border, between, and after the last; shape (2 S + 1,).
 
-    def kind_at(self, chainage_m: Floats) -> Strings:
-        """Return the kind of section at chainages."""
-        return self.kinds[np.searchsorted(self.borders_m, chainage_m, side="right")]
-
 
 def build_structures(sections: Sequence[SectionSettings], line_length_m: float, seed: int) -> Structures:
     """Return the walls and roofs of given sections, which rise; the same seed gives the same structures."""

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, dataclass, take_rows
+from railfix.core.arrays import Floats, Indices, RowArrays, dataclass
 from railfix.simulate.environment.correlator import (
     circular_reflection,
     cross_polar_gain,
@@ -26,7 +26,7 @@ _LEAST_LATERAL: Final = 1e-3  #: Least component of a direction: rays along the 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rays:
+class Rays(RowArrays):
     """N directions to satellites from one antenna's places."""
 
     chainage_m: Floats  #: Shape (N,).
@@ -36,10 +36,6 @@ class Rays:
     y: Floats
     z: Floats
     wavelength_m: Floats  #: Shape (N,).
-
-    def take(self, rows: Indices) -> Rays:
-        """Return the rays of some rows."""
-        return take_rows(self, rows)
 
 
 def _slants(across: Floats, z: Floats) -> tuple[Floats, Floats]:

@@ -74,9 +74,6 @@ class RunSignals(FrozenArrays):
     change_sigma_m: Floats
     by_doppler: Masks  #: Whether Dopplers give the change, shape (C,).
 
-    def __post_init__(self) -> None:
-        freeze_arrays(self)
-
 
 @dataclass(frozen=True, kw_only=True)
 class SurveyRun(FrozenArrays):
