@@ -40,7 +40,7 @@ WARM_UP = 50
 #: Epoch before which the gap begins.
 GAP_AT = 400
 #: P1 6: from the receiver's output to the position; and what is aimed at here [ms].
-PAPER_MS, GOAL_MS = 40.0, 4.5
+PAPER_MS, GOAL_MS = 40.0, {"off": 4.5, "track": 9.0}
 #: Between two epochs [s].
 PERIOD_S = 0.1
 
@@ -105,7 +105,7 @@ def main() -> None:
     channels = {name: len(whole.satellite) for name, whole in observations.items()}
     print(f"live epochs of two antennas, {options.epochs} a round, channels {channels}, screens: {options.screens}")
     print(f"kernels: {kernels.numba_version()}, {loaded} loaded from the disk before the first epoch")
-    print(f"P1: {PAPER_MS:g} ms; goal for the 99th percentile: {GOAL_MS:g} ms")
+    print(f"P1: {PAPER_MS:g} ms; goal for the 99th percentile: {GOAL_MS[options.filter]:g} ms")
     rounds = []
     for number in range(options.rounds):
         times = milliseconds(processor, observations, gap)
