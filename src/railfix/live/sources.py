@@ -22,8 +22,8 @@ from railfix.live.settings import LiveSettings
 Item = TypeVar("Item")
 #: The present position as a GGA sentence, empty while there is none.
 Place = Callable[[], bytes]
-#: What is said to the other end of a connection, until cancelled.
-Said = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
+#: Sends to the other end of a connection until cancelled.
+Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
 
 _BLOCK = 4096
 _FORMS = (
@@ -160,9 +160,9 @@ async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
 
 
 async def _tcp(
-    source: str, request: bytes, silence_s: float, *, tls: ssl.SSLContext | None = None, said: Said | None = None
+    source: str, request: bytes, silence_s: float, *, tls: ssl.SSLContext | None = None, send: Send | None = None
 ) -> AsyncIterator[bytes]:
-    """Yield empty bytes once connected, then what arrives; `said` goes on saying things to the other end meanwhile."""
+    """Yield empty bytes once connected, then what arrives; `send` writes to the other end meanwhile."""
     parts = urlsplit(source)
     try:
         async with asyncio.timeout(_CONNECT_S):
@@ -177,7 +177,7 @@ async def _tcp(
     except (OSError, TimeoutError) as error:
         over = "" if tls is None else " over TLS"
         raise InputFileError(hidden(source), f"cannot be connected to{over} ({str(error) or 'no answer'})") from None
-    saying = None if said is None else asyncio.create_task(said(writer))
+    sending = None if send is None else asyncio.create_task(send(writer))
     try:
         if request:
             writer.write(request)
@@ -190,8 +190,8 @@ async def _tcp(
     except OSError as error:
         raise InputFileError(hidden(source), f"the connection broke ({error})") from None
     finally:
-        if saying is not None:
-            saying.cancel()
+        if sending is not None:
+            sending.cancel()
         writer.close()
 
 
@@ -228,8 +228,8 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
             await asyncio.sleep(settings.gga_s if sentence else min(settings.gga_s, _NO_PLACE_S))
 
     tls = _tls(source, settings.ntrip_certificates) if parts.scheme == "ntrips" else None
-    said = None if place is None else report
-    async for data in _tcp(source, request, settings.silence_s, tls=tls, said=said):
+    send = None if place is None else report
+    async for data in _tcp(source, request, settings.silence_s, tls=tls, send=send):
         if answered:
             if content := data if body is None else body.take(data):
                 yield content

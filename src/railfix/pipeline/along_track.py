@@ -59,7 +59,7 @@ _END_M: Final = 30.0
 _GATE_SIGMAS: Final = 3.0
 _LATE_M: Final = 0.6
 #: With sensors, epochs of so much GPS time go through the filter together [ns].
-_STRETCH_NS: Final = 5_000_000_000
+_BLOCK_NS: Final = 5_000_000_000
 #: A direction is given where the speed is beyond this many of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
 
@@ -72,18 +72,18 @@ def along_track(
     state: FilterState,
     *,
     samples: SensorSamples | None = None,
-    surroundings: LineReferences | None = None,
+    references: LineReferences | None = None,
 ) -> tuple[AlongTrack, FilterState]:
     """Return the filtered positions of one antenna after all screens and exclusions, and the state to pass on.
 
     Samples are those of the sensors on board since the chunk before; they meet features of the line, ground units and
-    balises of `surroundings`.
+    balises of `references`.
     """
     epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
     epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
     line = Line.of(trajectory) if state.line is None else state.line
     tracked, sensed, replays, after = _run_filter(
-        epochs, trajectory, line, config, copy_with(state, slips=slips), samples, surroundings,
+        epochs, trajectory, line, config, copy_with(state, slips=slips), samples, references,
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
@@ -189,12 +189,12 @@ def _run_filter(
     config: Config,
     state: FilterState,
     samples: SensorSamples | None,
-    surroundings: LineReferences | None,
+    references: LineReferences | None,
     alone: tuple[Floats, Floats],
 ) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
     """Return the places of the filter, motion by the sensors, and the state to pass on.
 
-    With sensors the epochs are taken in stretches of `_STRETCH_NS` of GPS time, however the log is cut: the place by
+    With sensors the epochs are taken in stretches of `_BLOCK_NS` of GPS time, however the log is cut: the place by
     the wheel, for the gradient there, begins each from the place of the filter.
     """
 
@@ -203,19 +203,19 @@ def _run_filter(
         return np.asarray(slope / np.sqrt(1.0 + slope**2))
 
     sensing = bool(samples) or bool(state.sensors.samples)
-    number = epochs.time.astype(np.int64) // _STRETCH_NS
+    number = epochs.time.astype(np.int64) // _BLOCK_NS
     edges = np.diff(number, prepend=number[:1], append=number[-1:]).nonzero()[0] if sensing else np.empty(0, np.intp)
     parts: list[Tracked] = []
     motions: list[SensedMotion] = []
     replays: list[Replay] = []
     for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
         part = epochs if last - first == len(epochs) else epochs.take(slice(first, last))
-        if len(part) and state.fixed is not None and _stretch(part.time[0]) != _stretch(state.fixed.time):
+        if len(part) and state.fixed is not None and _block(part.time[0]) != _block(state.fixed.time):
             state = _restart_state(state, state.fixed)
         before = state.sensors
         sensors, sensed, kept = sensor_epochs(
             samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
-            sources=config.filter_sources, surroundings=surroundings,
+            sources=config.filter_sources, references=references,
         )  # fmt: skip
         samples = None
         if sensors.ranges is not None:
@@ -278,8 +278,8 @@ def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: Filte
     return replace(ranges, range_m=np.where(kept, ranges.range_m, np.nan))
 
 
-def _stretch(time: np.datetime64) -> int:
-    return int(time.astype(np.int64)) // _STRETCH_NS
+def _block(time: np.datetime64) -> int:
+    return int(time.astype(np.int64)) // _BLOCK_NS
 
 
 def _restart_state(state: FilterState, fixed: FilterFix) -> FilterState:

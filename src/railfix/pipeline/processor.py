@@ -400,7 +400,7 @@ class EpochProcessor:
                 take_rows(solved.ranges, rows),
                 single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
                 self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
-                samples=sensors, surroundings=self._line_references(name, sensors),
+                samples=sensors, references=self._line_references(name, sensors),
             )  # fmt: skip
 
         over_antennas = self._threads.map if len(solved.results) > 1 else map

@@ -139,13 +139,13 @@ def sensor_epochs(
     limits: SensorLimits,
     sine_at: Callable[[Floats], Floats] | None = None,
     sources: Container[str] = ("wheel", "radar", "force", "feature", "balise", "range"),
-    surroundings: LineReferences | None = None,
+    references: LineReferences | None = None,
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
     """Return distances and forces between the epochs, the motion that wheel and inertia agree on, and the new state.
 
     Samples are those since the chunk before, epochs those of the antenna, shape (T,); the trajectory shows which way
     the front points, `sine_at` the sine of the gradient at arc lengths (the line is unknown without). `sources` names
-    which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted, `surroundings` has features of the
+    which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted, `references` has features of the
     line, ground units and listed balises.
     """
     if not (samples or state.samples):
@@ -178,9 +178,9 @@ def sensor_epochs(
             tachometer=limits.tachometer,
             limits=limits.slip,
         )
-        if rates is not None and surroundings is not None and surroundings.features is not None:
+        if rates is not None and references is not None and references.features is not None:
             noise = _with_map(trajectory)
-            fixes, passing = feature_fixes(rates, surroundings.features, facing, motion.sigma_m, passing, noise=noise)
+            fixes, passing = feature_fixes(rates, references.features, facing, motion.sigma_m, passing, noise=noise)
             values |= _places(fixes, rates, time)
     if wheel:
         distance = np.diff(distance_m(pulses, edges, limits=limits.tachometer))
@@ -213,11 +213,11 @@ def sensor_epochs(
             "force_mps2": np.where(known, facing * (mean - sensed.swing_mps2), np.nan),
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
         }
-    if len(ranging) and "range" in sources and surroundings is not None and surroundings.units is not None:
-        values["ranges"] = _ranges(ranging, edges, surroundings.units, ranging_lever_m(trajectory, limits))
-    if len(state.samples.balises) and "balise" in sources and surroundings is not None and surroundings.balises:
+    if len(ranging) and "range" in sources and references is not None and references.units is not None:
+        values["ranges"] = _ranges(ranging, edges, references.units, ranging_lever_m(trajectory, limits))
+    if len(state.samples.balises) and "balise" in sources and references is not None and references.balises:
         values["balises"], balises = balise_epochs(
-            state.samples.balises, edges, surroundings.balises, trajectory, balises, limits.balise
+            state.samples.balises, edges, references.balises, trajectory, balises, limits.balise
         )
     kept = SensorSamples(
         tachometer=_latest(pulses, _find_first_needed(pulses, edges[-1] - REACH, limits)),

@@ -143,28 +143,28 @@ def solve(
     def robust_scale(sums: list[Floats]) -> tuple[Floats, Floats]:
         wsse, one = on_line.variance * on_line.freedom, np.ones(len(time))
         return noise_scale(
-            windows, wsse, on_line.freedom, teaching, one, np.array(sums), limits=learning, least=least
+            windows, wsse, on_line.freedom, usable_for_noise, one, np.array(sums), limits=learning, least=least
         )  # fmt: skip
 
-    on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
+    on_line, usable_for_noise = _fit_on_line(corrected, ranges, antennas, place, config)
     raised, raised_sums = robust_scale([state.lasting.noise for state in states])
     ranges, place, model, lasting, lasting_states = lasting_errors(
         corrected, ranges, antennas, place, raised, config, [state.lasting for state in states]
     )
     if lasting.any():
         corrected = corrected.reject(lasting, Reason.LASTING_ERROR)
-        on_line, teaching = _fit_on_line(corrected, ranges, antennas, place, config)
+        on_line, usable_for_noise = _fit_on_line(corrected, ranges, antennas, place, config)
     robust, robust_sums = robust_scale([noise.robust for noise in noises])
     ranges, place, raim = fault_free(ranges, antennas, place, model, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, count_redundancy(ranges)
     model = model_again(model, ranges, antennas, constrained, np.flatnonzero(raim.excluded.any(axis=1)))
     off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)
-    teaching = ~off_map & ~raim.faulty
+    usable_for_noise = ~off_map & ~raim.faulty
     if "raim" not in config.screens:
-        teaching[:] = False
+        usable_for_noise[:] = False
     scale, stated_sums = noise_scale(
-        windows, constrained.wsse, redundancy, teaching, robust, np.array([noise.remaining for noise in noises]),
-        limits=learning, least=least,
+        windows, constrained.wsse, redundancy, usable_for_noise, robust,
+        np.array([noise.remaining for noise in noises]), limits=learning, least=least,
     )  # fmt: skip
     on_map = np.isfinite(constrained.arc_m) & ~off_map
 

@@ -63,8 +63,8 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
         name = " ".join(str(row[field]) for field in fields)
         found: dict[str, Any] = {}
         if row["status"] == "done":
-            table, said = _epochs(out / row["folder"], row["reference"])
-            notes += [f"{name}: {note}" for note in said]
+            table, own_notes = _epochs(out / row["folder"], row["reference"])
+            notes += [f"{name}: {note}" for note in own_notes]
             found = _figures(table)
             epochs.append(_worst_of_pieces(table).with_columns(run=pl.lit(name), folder=pl.lit(row["folder"])))
         rows.append({**row, **{name: None for _, name, _ in _FIGURES if name not in row}, **found, "run": name})

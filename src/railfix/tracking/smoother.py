@@ -87,10 +87,10 @@ class Step:
 
 def _before_measurements(updated: Updated, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
     """Carry what later epochs say of hypothesis h backward through an update."""
-    said = updated.combine[h].T @ updated.information[h]
-    gained = said @ updated.combine[h] - said @ updated.covariance[h] @ said.T
+    gain = updated.combine[h].T @ updated.information[h]
+    gained = gain @ updated.combine[h] - gain @ updated.covariance[h] @ gain.T
     back = np.eye(len(vector)) - gained @ updated.prior[h]
-    return said @ updated.change[h] + back @ vector, gained + back @ matrix @ back.T
+    return gain @ updated.change[h] + back @ vector, gained + back @ matrix @ back.T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +180,7 @@ def smooth_steps(
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return the vector and matrix for other satellites; those that are not in the state any more said nothing."""
+    """Return the vector and matrix for other satellites; those no longer in the state have no information."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(SATELLITES), SATELLITES + here])
     of = np.concatenate([np.arange(SATELLITES), SATELLITES + there])
