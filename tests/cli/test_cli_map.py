@@ -110,7 +110,7 @@ def test_misuse_ends_with_one_sentence_and_its_code(
 
 @pytest.mark.parametrize(
     ("command", "option"),
-    [("check", "--plan-sigma"), ("features", "--plan-sigma"), ("check", "--no-cache"), ("network", "--no-cache")],
+    [("features", "--plan-sigma"), ("check", "--no-cache"), ("features", "--no-cache"), ("network", "--no-cache")],
 )
 def test_options_without_an_effect_are_not_offered(command: str, option: str, tmp_path: Path) -> None:
     code, printed = call(command, line(tmp_path), *((option,) if option == "--no-cache" else (option, "2")))
@@ -189,3 +189,15 @@ def test_the_map_states_the_accuracy_of_its_positions(tmp_path: Path, quality: i
     assert code == 0, printed
     assert read_track(tmp_path / "made.csv").sigma_plan_m == plan_m
     assert "accuracy of the map" in printed
+
+
+def test_the_check_takes_the_accuracy_that_its_note_asks_for(tmp_path: Path) -> None:
+    track, bare = read_track([line(tmp_path)]), tmp_path / "bare.csv"
+    columns = zip(track.latitude_deg, track.longitude_deg, track.height_m, strict=True)
+    bare.write_text(
+        "latitude_deg,longitude_deg,height_m\n" + "".join(f"{a:.9f},{b:.9f},{c:.3f}\n" for a, b, c in columns)
+    )
+    code, printed = call("check", bare, "--height-datum", "ellipsoidal")
+    assert (code, "(--plan-sigma)" in printed) == (0, True)
+    code, printed = call("check", bare, "--height-datum", "ellipsoidal", "--plan-sigma", "2")
+    assert (code, "(--plan-sigma)" in printed) == (0, False)

@@ -8,6 +8,7 @@ import pickle
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from railfix.core import arrays
@@ -136,3 +137,18 @@ def test_others_are_those_of_the_standard_library() -> None:
     counted = Counted()
     counted.value = 3
     assert counted == Counted(value=3)
+
+
+def test_rows_with_other_arrays_are_not_joined() -> None:
+    """A column that one part lacks would be lost without a word."""
+
+    @arrays.dataclass(frozen=True, kw_only=True)
+    class Points(arrays.RowArrays):
+        x_m: np.ndarray
+        y_m: np.ndarray | None = None
+
+    both, bare = Points(x_m=np.arange(2.0), y_m=np.ones(2)), Points(x_m=np.arange(3.0))
+    assert arrays.join_rows([both, both.take(np.array([True, False]))]).x_m.tolist() == [0.0, 1.0, 0.0]
+    for parts in ([both, bare], [bare, both]):
+        with pytest.raises(ValueError, match="rows with other arrays than x_m"):
+            arrays.join_rows(parts)

@@ -107,7 +107,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
         "damaged": (kept[:-1], [], None, "is damaged or cut off"),
         "changed": (kept[:-1] + bytes([kept[-1] ^ 1]), [], None, "is damaged or cut off"),
         "empty": (b"", [], None, "is no state file of this version"),
-        "older": (kept.replace(b"live state 2", b"live state 1", 1), [], None, "is no state file of this version"),
+        "older": (kept.replace(b"live state 3", b"live state 2", 1), [], None, "is no state file of this version"),
     }
     for name, (content, words, track, says) in cases.items():
         path.write_bytes(content)
@@ -159,6 +159,18 @@ def test_a_file_that_is_no_state_is_not_overwritten(tmp_path: Path) -> None:
         assert path.read_bytes() == content
 
 
+def test_a_state_of_another_commit_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fields of its classes may have other names there."""
+    path = tmp_path / "state"
+    saved = SavedSession(engine=EngineState(state=State(), done_ns=1, last_tag={}, sequence=1), streams={})
+    write_state(path, saved, belongs_to({}, {}, ("front",)))
+    assert load_state(path, belongs_to({}, {}, ("front",))).session == saved
+    monkeypatch.setattr("railfix.live.state.source_commit", lambda: "another")
+    loaded = load_state(path, belongs_to({}, {}, ("front",)))
+    assert loaded.session is None
+    assert "was made with another version" in loaded.outcome
+
+
 class Evil:
     def __reduce__(self) -> tuple[object, tuple[str]]:
         import os
@@ -175,7 +187,7 @@ def test_only_values_of_the_package_are_read(tmp_path: Path) -> None:
     write_state(path, saved, under)
     assert load_state(path, under).session == saved
     content = pickle.dumps(Evil())
-    head = {"form": "railfix live state 2", **under, "bytes": len(content)}
+    head = {"form": "railfix live state 3", **under, "bytes": len(content)}
     head["sha256"] = hashlib.sha256(content).hexdigest()
     path.write_bytes(json.dumps(head).encode() + b"\n" + content)
     loaded = load_state(path, under)

@@ -274,6 +274,15 @@ def test_chunks_give_the_same_with_arcs_of_seconds():
         assert np.abs(pieces.sigma_m - whole.sigma_m).max() < 1e-9
 
 
+def test_an_arc_that_goes_on_after_a_newer_one_of_its_channel_is_an_error():
+    time, ranges, phases, start = in_town(0.0)
+    again = phases.arc_id.copy()
+    again[150:] = again[:10]
+    again = np.where(phases.arc_id >= 0, np.maximum(again, 0), -1)
+    with pytest.raises(ValueError, match="go on after a newer arc of their channel; number arcs with number_arcs"):
+        phase_positions(time, ranges, replace(phases, arc_id=again), LINE, start)
+
+
 @pytest.mark.requirement("A5")
 def test_many_whole_cycles_give_the_same_with_arcs_of_seconds():
     """Right-hand sides with 1e7 m times the weight of a phase in them would be off by centimetres of position."""

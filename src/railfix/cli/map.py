@@ -11,7 +11,7 @@ import typer
 
 from railfix.cli.command import Command, command_group
 from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_table
-from railfix.cli.map_network import RUN_ALONE, Columns, match_command, network, route
+from railfix.cli.map_network import RUN_ALONE, Columns, MapReading, match_command, network, route
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
@@ -53,7 +53,7 @@ def check(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the picture map_check.png; made where absent.")
     ] = None,
-    reading: PointsReading,
+    reading: MapReading,
     max_gap: Annotated[
         float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
     ] = 1.0,
@@ -82,6 +82,7 @@ def check(
         crs=reading.crs,
         height_datum=reading.height_datum,
         geoid=reading.geoid,
+        sigma_plan_m=reading.plan_sigma,
         max_gap_m=max_gap,
         duplicates="keep",
     )

@@ -168,11 +168,13 @@ def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
 def join_rows(parts: Sequence[Rows]) -> Rows:
     """Return a dataclass with the rows of several one after the other, and the other fields of the first.
 
-    All have the arrays that the first has.
+    ValueError: they do not have the same arrays.
     """
     if len(parts) == 1:
         return parts[0]
     tables = [_row_arrays(part) for part in parts]
+    if any(table.keys() != tables[0].keys() for table in tables):
+        raise ValueError(f"rows with other arrays than {', '.join(tables[0])}")
     return replace(parts[0], **{name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
 
 

@@ -22,12 +22,12 @@ import numpy as np
 import railfix
 from railfix.core.arrays import dataclass
 from railfix.core.errors import OutputError
-from railfix.core.files import file_sha256
+from railfix.core.files import file_sha256, source_commit
 from railfix.core.settings import Settings
 from railfix.live.engine import EngineState
 from railfix.live.stream import ReceiverState
 
-_FORM: Final = "railfix live state 2"
+_FORM: Final = "railfix live state 3"
 #: Classes beside those of this package that a state consists of.
 _PLAIN: Final = {
     ("numpy", "dtype"),
@@ -66,8 +66,9 @@ def belongs_to(
     files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...]
 ) -> dict[str, Any]:
     """What a state is made under (files by their role, settings, antennas); a state of anything else is not used."""
+    own = f"{railfix.__version__} ({source_commit()})"
     return {
-        "version": f"railfix {railfix.__version__}, numpy {np.__version__}, Python {platform.python_version()}",
+        "version": f"railfix {own}, numpy {np.__version__}, Python {platform.python_version()}",
         "antennas": list(antennas),
         **{name: file_sha256(path) for name, path in files.items()},
         **{

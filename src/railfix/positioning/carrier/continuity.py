@@ -127,7 +127,9 @@ class TrackJumps:
     jump: Masks  #: True where the phase does not fit: a new arc begins; shape (T, M).
     metric_m: Floats  #: Change of phase less that of the channels kept; NaN where not judged; shape (T, M).
     judged: Masks  #: Shape (T, M).
-    moved_m: Floats  #: Way along the line since the epoch before, from the phases; NaN where not known; shape (T,).
+    moved_m: (
+        Floats  #: Distance along the line since the epoch before, from the phases; NaN where not known; shape (T,).
+    )
     moved_sigma_m: Floats  #: Shape (T,).
 
 

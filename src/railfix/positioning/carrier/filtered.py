@@ -82,7 +82,7 @@ def phase_positions(
     ranges : Ranges
         Corrected codes with their weights, satellites, clocks, ties between clocks.
     phases : Phases
-        Arcs named by `arcs.number_arcs`: of one channel only the newest runs.
+        Arcs named by `number_arcs`: of one channel only the newest runs.
     trajectory : Trajectory
     arc_m_start : ndarray, shape (T,) [m]
         Where each epoch starts from (the constrained position of codes alone); NaN leaves it out.
@@ -189,6 +189,8 @@ def _ambiguities(
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
     # One more row and column takes what has no phase.
     index = np.where(arc_id == NO_ARC, count, np.searchsorted(memory.arc_id, arc_id))
+    if (np.append(memory.arc_id, NO_ARC)[index] != arc_id).any():
+        raise ValueError("the phases of an arc go on after a newer arc of their channel; number arcs with number_arcs")
     own = np.zeros((len(arc_id), count + 1, count + 4))
     own[row[:, None], index[:, :, None], index[:, None, :]] = matrix
     own[row, index, count + 1 :] = right
