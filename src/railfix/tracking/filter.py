@@ -185,7 +185,7 @@ def _columns(sensors: SensorEpochs, time: Datetimes) -> dict[str, Floats]:
 
 @lru_cache(maxsize=8)
 def _parameters(limits: TrackingLimits, branch_m: float) -> layout.Parameters:
-    """Return settings as the kernel takes them."""
+    """Return the settings as the kernel takes them."""
     budget = bank.budget(limits)
     given: dict[str, Any] = {
         "degrees": tuple(limits.tails),

@@ -207,7 +207,7 @@ class Handover:
 
 
 def _in_use(state: TrackState, chunk: Chunk, sensed: Masks, first: int, last: int) -> Masks:
-    """Return unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
+    """Return the unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
     used = (state.covariance != 0.0).sum(axis=1).max(axis=0) > 1
     if state.bank is not None and len(state.bank.without):
         used |= (state.bank.covariance != 0.0).sum(axis=1).max(axis=0) > 1
