@@ -124,7 +124,7 @@ def _name_sources(track: AlongTrack) -> Source:
 
 
 def choose_antenna(result: Result) -> str:
-    """The antenna whose place goes out: one that has a place, of two the one with the smaller protection level."""
+    """Return the antenna to report: one that has a place, of two the one with the smaller protection level."""
 
     def worth(name: str) -> tuple[bool, float]:
         antenna, track = result.antennas[name], result.fusion.get(name)

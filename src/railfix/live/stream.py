@@ -288,7 +288,7 @@ class Lag:
 
     behind_s: float  #: With more delay epochs are skipped until it is a quarter of that; infinite: never.
     skipped: int = 0  #: Epochs skipped since the session fell behind.
-    reported: list[str] = field(default_factory=list)  #: To be reported of it.
+    reports: list[str] = field(default_factory=list)  #: Sentences that the session has not logged yet.
     _shortest_ns: float | None = None
     _at_ns: int = 0
     _since_ns: int = 0
@@ -309,16 +309,16 @@ class Lag:
         if self.skipped == 0:
             if lag_s <= self.behind_s:
                 return False
-            self.reported.append(f"{lag_s:.1f} s behind the receivers: epochs are skipped up to the present")
+            self.reports.append(f"{lag_s:.1f} s behind the receivers: epochs are skipped up to the present")
             self._steady = 0
         elif lag_s <= 0.25 * self.behind_s:
-            self.reported.append(f"at the present again, {self.skipped} epochs were skipped")
+            self.reports.append(f"at the present again, {self.skipped} epochs were skipped")
             self.skipped = 0
             return False
         if self._steady == 0 or abs(lag_s - self._steady_s) > STEADY_S:
             self._since_ns, self._steady_s, self._steady = now_ns, lag_s, 0
         elif self._steady >= STEADY_EPOCHS and (now_ns - self._since_ns) * 1e-9 > ADMITTED_S:
-            self.reported.append(
+            self.reports.append(
                 f"the receivers' time is {lag_s:.1f} s later than before; {self.skipped} epochs were skipped"
             )
             self.reset()

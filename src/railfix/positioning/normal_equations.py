@@ -238,7 +238,7 @@ def _on_line(
 def _from(
     vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """`iterate_along` of a trajectory, from points of it."""
+    """Run `iterate_along` on a trajectory, from points of it."""
     line = SectionArrays(
         trajectory.ecef_m[:-1], trajectory.tangent, trajectory.across, trajectory.up, trajectory.length_m,
         trajectory.sigma_plan_m, trajectory.sigma_height_m,

@@ -337,7 +337,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
         fits = f"sensors.tachometer.wheel_diameter_m = {real:.3f}"
         if found is not None and abs(found.ratio - 1.0) > _OTHER_TEETH:
             fits = f"sensors.tachometer.pulses_per_turn = {found.ratio * tachometer.pulses_per_turn:.0f} or {fits}"
-        scale = f"the distance of its wheel is {{:+.1f}} % off that by satellites; {fits} would fit"
+        scale = f"the distance by its wheel is {{:+.1f}} % off that by satellites; {fits} would fit"
         notes += _sentences("tachometer", found, scale)
     return tuple(notes)
 

@@ -229,7 +229,7 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
 
 
 def _list_columns(table: pl.DataFrame, kind: str) -> pl.Expr:
-    """Return those that the table has beside the time."""
+    """Return the columns of a sensor that the table has, without the time."""
     return pl.col([name for name in _names_of_columns(kind) if name in table.columns])
 
 

@@ -68,7 +68,7 @@ def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.ge
 
 
 def _layout() -> tuple[Integers, Integers]:
-    """Return point of each bit of each band (-1 without), and the up to two (band, bit) cells of each point (-1)."""
+    """Return the point of each bit of each band (-1 without), and up to two (band, bit) cells of each point (-1)."""
     point = np.full((BANDS, BITS), -1, dtype=np.int64)
     cells = np.full((ROWS * COLUMNS, 2), -1, dtype=np.int64)
     for band in range(BANDS):

@@ -148,11 +148,11 @@ class LocalFrame:
         )
 
     def plane(self, ecef_m: Floats) -> Floats:
-        """East and north of points, shape (P, 2) [m]."""
+        """Return the east and north of points, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
     def to_plane(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
-        """East and north of points of the height of the origin, shape (P, 2) [m]."""
+        """Return the east and north of points of the height of the origin, shape (P, 2) [m]."""
         return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
 
@@ -284,7 +284,7 @@ def interval_over_chainage(table: pl.DataFrame) -> Chart:
 
 
 def interval_distribution(table: pl.DataFrame) -> Chart:
-    """Return distribution of the distances from the previous position (P1 figure 12), of the table of `interval`."""
+    """Return the distribution of distances from the previous position (P1 figure 12), of the table of `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)
