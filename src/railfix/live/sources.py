@@ -314,7 +314,7 @@ def _baud(source: str) -> int:
 
 
 async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
-    """Empty bytes once the line is open, then what arrives; a thread of its own reads, so that no byte overflows."""
+    """Yield empty bytes once the line is open, then what arrives; a thread reads, so that no byte overflows."""
     try:
         import serial
     except ModuleNotFoundError:

@@ -58,7 +58,7 @@ class ReceivedData:
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
-    """What some bytes of a receiver complete, in the order of the stream; any cutting of the stream gives the same.
+    """Yield what some bytes of a receiver complete, in the order of the stream; any cutting of it gives the same.
 
     Each item ends with the message that completes an epoch, so that its navigation records came before its epoch.
     The state to go on with is that of the last item, `ReceivedData.after`; there is always one. Epochs with repeated or
@@ -131,7 +131,7 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 async def arrivals(
     source: str, state: ReceiverState, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
-    """What a source's data complete, item by item, and the breaks of its connection; `place` as for `read_source`."""
+    """Yield what a source's data complete, item by item, and the breaks of its connection; `place`: see `read_source`."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and not is_receiver_log(read_head(path)):
         for piece in scan_observations(path, epochs=200):

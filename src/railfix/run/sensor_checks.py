@@ -175,7 +175,7 @@ def _centre(values: Floats) -> Floats:
 
 
 def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
-    """The mean force is gravity, upward: -9.8 m/s2 on the axis that points down."""
+    """Check that the mean force is gravity, upward: -9.8 m/s2 on the axis that points down."""
     if not np.isfinite(inertial.force_mps2).any(axis=0).all():
         return
     forward, right, down = np.nanmedian(inertial.force_mps2, axis=0).tolist()

@@ -222,7 +222,7 @@ def _square_weights(x: Floats, y: Floats) -> Floats:
 
 
 def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], tuple[Floats, ...]]]:
-    """South-west corners and sizes of the cells to try, in order (A.4.4.10.2): the small one, then 10 by 10."""
+    """Yield the south-west corners and sizes of the cells to try, in order (A.4.4.10.2): small, then 10 by 10."""
 
     def small(at: Indices) -> tuple[Floats, ...]:
         lat, lon = latitude[at], longitude[at]
