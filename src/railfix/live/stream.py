@@ -131,7 +131,7 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 async def arrivals(
     source: str, state: ReceiverState, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
-    """Yield what a source's data complete, item by item, and the breaks of its connection; `place`: see `read_source`."""
+    """Yield what a source's data complete, by items, and the breaks of its connection; `place`: see `read_source`."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and not is_receiver_log(read_head(path)):
         for piece in scan_observations(path, epochs=200):
