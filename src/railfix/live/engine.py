@@ -396,7 +396,7 @@ class LiveEngine:
         return replace(samples, silent=silent)
 
     def _tell_changes(self, notes: tuple[str, ...]) -> None:
-        """Tell what is used in place of what was asked for since the received data changed, and what no longer is."""
+        """Report what is used in place of what was asked for since the received data changed, and what no longer is."""
         if notes is not self._notes:
             self.reports.extend(note for note in notes if note not in self._notes)
             self.reports.extend(f"no longer so: {note}" for note in self._notes if note not in notes)

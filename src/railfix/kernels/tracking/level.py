@@ -294,7 +294,7 @@ def _add_pairs(
     is known with all in view. The standard deviation is mostly within a tenth of that of a filter without both; with
     few satellites it can be half of it.
 
-    Returns the number of rows, and the risk that is spent on pairs that have none: those that ask for less than the
+    Returns the number of rows, and the risk that is spent on pairs that have none: those that require less than the
     level `start`, and those without whose satellites nothing is known, which nothing bounds.
     """
     place, in_view, spent = state.mean[0, ARC], len(bank.running) - OTHERS + ALL_IN_VIEW, 0.0
