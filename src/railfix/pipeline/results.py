@@ -200,7 +200,7 @@ class Result(NotebookTable):
     """Results of one chunk."""
 
     antennas: Mapping[str, AntennaResult]
-    notes: tuple[str, ...]  #: Differences between requested and used settings, one sentence each.
+    notes: tuple[str, ...]  #: Differences between what was requested and what was used, one sentence each.
     #: Positions of the filter along the track, by antenna; empty where it is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
 
