@@ -135,7 +135,7 @@ class Recursion:
     ) -> None:
         """Take an epoch back, and add what the smoother needs of it."""
         hypotheses = state.hypotheses
-        updated, cut = handed.update_epoch(state, epoch)
+        updated, cut = handed.collect_update(state, epoch)
         cut[:, SATELLITES + self.chunk.fresh[epoch].nonzero()[0]] = True
         handed.take_back(state, epoch, epoch + 1)
         step = Step(

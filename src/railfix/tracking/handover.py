@@ -183,7 +183,7 @@ class Handover:
         variance[OFFSETS:SATELLITES] += self.recursion.limits.offset_walk_m**2 * elapsed_s
         return mean, variance
 
-    def update_epoch(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
+    def collect_update(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
         """Return the update of an epoch, None where nothing was used, and the unknowns that have restarted."""
         work, count, both = self.work, state.hypotheses, self.both
         cut = np.zeros(state.mean.shape, dtype=np.bool_)

@@ -96,7 +96,7 @@ def plan(
                 Points(label=f"{label} ({len(rows):,})", colour=colour, x=x, y=y, size=4.0, epoch_s=epoch[kept])
             )
     if filtered is not None:
-        layers += _filter(positions.filter(pl.Series(has)), filtered, frame, cell, find_start(positions))
+        layers += _filter_points(positions.filter(pl.Series(has)), filtered, frame, cell, find_start(positions))
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
     thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
@@ -108,7 +108,7 @@ def plan(
     )
 
 
-def _filter(
+def _filter_points(
     placed: pl.DataFrame, filtered: pl.DataFrame, frame: LocalFrame, cell: float, start: np.datetime64
 ) -> Iterator[Points]:
     """Yield the filtered positions of the epochs that have none of their own."""
