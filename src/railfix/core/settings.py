@@ -160,7 +160,7 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
 
 
 def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:
-    """Read settings from a TOML file; InputFileError as `read_toml`, SettingsError as `validated`."""
+    """Read settings from a TOML file; InputFileError as `read_toml`, SettingsError as `validate`."""
     return validate(model, read_toml(path, what=what), source=str(path))
 
 

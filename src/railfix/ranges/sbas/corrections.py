@@ -245,7 +245,7 @@ class SbasState:
     """Messages of one GEO received so far: a value that new messages are added to as they arrive.
 
     Corrections at an epoch are the same as from the whole log, however it was cut: a message counts from its
-    reception on, and `kept_from` drops only messages that no later epoch can use.
+    reception on, and `drop_before` drops only messages that no later epoch can use.
 
     ::
 
