@@ -261,7 +261,7 @@ class SectionArrays(NamedTuple):
 class SinglePointLimits(Settings):
     """Limits of the iteration, and of the validation of its position (`conventional_status`)."""
 
-    tolerance_m: float = Field(default=1.0, gt=0)  #: The last step: one of 1 m leaves 0.01 mm (`railfix.kernels.ranges`).
+    tolerance_m: float = Field(default=1.0, gt=0)  #: The last step: one of 1 m leaves 0.01 mm.
     max_iterations: int = Field(default=12, ge=1)  #: Steps at most.
     #: Probability that noise alone fails the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
