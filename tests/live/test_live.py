@@ -194,7 +194,7 @@ def test_a_session_that_falls_behind_says_so_and_skips_to_the_present(
     skipped = engine.counts["skipped, behind the receivers"]
     assert skipped == len(late) == 22
     assert sum(output.result is not None for output in outputs) == 60 - skipped
-    told = [text for text in engine.reported if "behind" in text or "skipped" in text]
+    told = [text for text in engine.reports if "behind" in text or "skipped" in text]
     assert told == [
         "2.4 s behind the receivers: epochs are skipped up to the present",
         "at the present again, 22 epochs were skipped",
@@ -203,7 +203,7 @@ def test_a_session_that_falls_behind_says_so_and_skips_to_the_present(
     times = [tag_ns(epoch) + (3000 * MS if k >= 10 else 0) for k, epoch in enumerate(epochs)]
     played(stepped, [(at, "front", epoch) for at, epoch in zip(times, epochs, strict=True)])
     assert stepped.counts["skipped, behind the receivers"] == 21
-    assert any("the receivers' time is 3.0 s later than before" in text for text in stepped.reported)
+    assert any("the receivers' time is 3.0 s later than before" in text for text in stepped.reports)
 
 
 def test_a_session_that_is_behind_says_so_while_data_wait(
@@ -244,9 +244,9 @@ def test_a_computer_too_busy_to_skip_is_no_step_of_the_tags() -> None:
         free = max(now_ns + 5 * MS, k * 100 * MS)
         now_ns = k * 100 * MS if k < 10 else now_ns + 300 * MS if k < 40 else free
         skipped.append(lag.skips(k * 100 * MS, now_ns))
-    assert lag.reported[0] == "1.2 s behind the receivers: epochs are skipped up to the present"
-    assert lag.reported[1].startswith("at the present again")
-    assert len(lag.reported) == 2
+    assert lag.reports[0] == "1.2 s behind the receivers: epochs are skipped up to the present"
+    assert lag.reports[1].startswith("at the present again")
+    assert len(lag.reports) == 2
     assert skipped[15:100] == [True] * 85
     assert not any(skipped[105:])
 
@@ -273,14 +273,14 @@ def test_what_is_used_in_place_of_what_was_asked_for_is_told(logs: dict[str, tup
     navigation = known.received.navigation
     bare = railfix.EpochProcessor(known.config, known.trajectories, navigation=replace(navigation, klobuchar={}))
     engine = LiveEngine(bare, LiveSettings())
-    assert "no coefficients of GPS or QZSS received" in engine.reported[0]
-    engine.reported.clear()
+    assert "no coefficients of GPS or QZSS received" in engine.reports[0]
+    engine.reports.clear()
     at = tag_ns(logs["front"][0])
     played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][:10])])
-    assert not engine.reported
+    assert not engine.reports
     engine.add_navigation(navigation)
     played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][10:20], 10)])
-    assert [text.startswith("no longer so: ionosphere") for text in engine.reported] == [True]
+    assert [text.startswith("no longer so: ionosphere") for text in engine.reports] == [True]
 
 
 def test_a_clock_step_is_counted(logs: dict[str, tuple[Observations, ...]]) -> None:

@@ -235,7 +235,7 @@ def test_a_caster_keeps_the_last_valid_place_while_there_is_none(filtered: Resul
     good = LiveOutput(message=create_message(one, LiveSettings()).replaced(status=MessageStatus.POSITION), result=one)
     bad = LiveOutput(message=good.message.replaced(status=MessageStatus.DOUBTFUL), result=one)
     polled = [[good], [bad], []]
-    engine: Any = SimpleNamespace(poll=lambda **_: polled.pop(0), settings=LiveSettings(gga_s=10.0), reported=[])
+    engine: Any = SimpleNamespace(poll=lambda **_: polled.pop(0), settings=LiveSettings(gga_s=10.0), reports=[])
     session = _Session(engine=engine, sinks=[], metrics=Metrics(), hooks=Hooks())
     while polled:
         session.emit(0, None)

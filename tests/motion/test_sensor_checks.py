@@ -201,7 +201,7 @@ def test_exchanged_axes_are_told_and_nothing_else_rests_on_them() -> None:
     assert "inertial: gravity is in force_forward_mps2, not in force_down_mps2; swap the columns" in notes[0]
     assert not any("tachometer" in note for note in notes)
     right = checks.notes(on_the_circle(1.0), None, round_line(), SensorLimits())
-    assert any("tachometer: the distance of its wheel" in note for note in right)
+    assert any("tachometer: the distance by its wheel" in note for note in right)
 
 
 @pytest.mark.requirement("E4")

@@ -130,7 +130,7 @@ def test_the_run_says_unasked_that_its_logs_are_exchanged(tmp_path: Path, exchan
 def test_the_live_engine_tells_it_once(exchanged: bool) -> None:
     front, rear = paths()
     engine = LiveEngine(EpochProcessor(Config(filter="off"), {"front": front, "rear": rear}), LiveSettings())
-    engine.reported.clear()
+    engine.reports.clear()
     ends = {"front": SPACING_M / 2.0, "rear": -SPACING_M / 2.0}
     for k, middle in enumerate(RISING):
         time = np.array(["2024-03-05T03:10:00"], dtype="datetime64[ns]") + np.timedelta64(k, "s")
@@ -144,5 +144,5 @@ def test_the_live_engine_tells_it_once(exchanged: bool) -> None:
         }
         engine._check_order(SimpleNamespace(antennas=antennas))  # type: ignore[arg-type]
         engine._check_order(SimpleNamespace(antennas={"front": antennas["front"]}))  # type: ignore[arg-type]
-    assert [note for note in engine.reported if "exchanged" in note] == list(engine.reported)
-    assert len(engine.reported) == exchanged
+    assert [note for note in engine.reports if "exchanged" in note] == list(engine.reports)
+    assert len(engine.reports) == exchanged

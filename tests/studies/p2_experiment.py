@@ -248,7 +248,7 @@ def start_lines() -> Iterator[str]:
 
 
 def measured(seed: int) -> tuple[pl.DataFrame, stage.SensedMotion]:
-    """What a run over the test line measures of it, by the distance of the wheel alone."""
+    """What a run over the test line measures of it, by the distance of its wheel alone."""
     simulation = Simulation(scenario_with("p1-test-line", 180.0, seed))
     samples, _ = sensors_of(simulation)
     whole = sense(simulation, samples, SlipLimits())

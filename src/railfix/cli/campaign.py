@@ -100,7 +100,7 @@ def show_progress(*, done: int, failed: int, total: int, left_s: float) -> None:
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
-    """Give the executor, and the errors by which it reports that a worker process is gone.
+    """Yield the executor, and the errors by which it reports that a worker process is gone.
 
     SettingsError: there is no such scheduler, or `distributed` is not installed.
     """
@@ -152,7 +152,7 @@ def benchmark(
 
     `positions` are those of other programs (RTKLIB, NMEA, CSV), moved to the nearest point of the line and judged by
     the same code, as RTKLIB's single point is where `rnx2rtkp` is installed. `scenario` describes the recording as
-    EN 16803-2 requires of record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`.
+    EN 16803-2 requires for record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`.
     A case with `held_out` is for the benchmark alone: settings made from its files are refused.
 
     Into DIR come `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that is

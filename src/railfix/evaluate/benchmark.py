@@ -294,7 +294,7 @@ def _row(evaluation: Evaluation, run: EvaluatedRun, name: str, kind: str) -> dic
 
 
 def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
-    """Return time from the first epoch with observations to the first with a position [s]; None where there is none."""
+    """Return the time from the first epoch with observations to the first with a position [s]; None without one."""
     observed, placed = (
         epochs.filter(mask)["time_gpst"].to_numpy() for mask in (pl.col("observed"), has_position(kind))
     )

@@ -323,7 +323,7 @@ def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
 
 
 def at_largest(column: str, by: str) -> pl.Expr:
-    """Return value of a column where another is largest, the first of equals; null where that is null throughout."""
+    """Return the value of a column where another is largest, the first of equals; null where all of that are null."""
     return pl.col(column).get(pl.col(by).arg_max())
 
 

@@ -129,7 +129,7 @@ class RunFolder(RunRecord):
         return float(limit)
 
     def prefix_column(self, name: str) -> str:
-        """Return name of a column of the positions in tables of several runs: levels are prefixed with their kind."""
+        """Return the name of a column of the positions in tables of several runs: levels have their kind as prefix."""
         return f"{self.level_kind}_{name}" if name.startswith("protection_") and self.level_kind else name
 
     @property

@@ -307,7 +307,7 @@ async def run_demo(
 
 
 async def _relays(centre: CentreLinks, seed: int) -> dict[tuple[int, LinkName], Relay]:
-    """Return the disturbed ways to the centre, by train and bearer."""
+    """Open relays that disturb the links to the centre; return them by train and bearer."""
     relays = {}
     for number in (1, 2):
         for k, bearer in enumerate(BEARERS):

@@ -154,7 +154,7 @@ def coverage(meters: Iterable[LinkMeter]) -> dict[int, dict[int, tuple[int, int]
 
 
 def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
-    """Return time from the first frame [s], chainage [m] and round trip [s] of all frames, NaN: not answered."""
+    """Return the time from the first frame [s], chainage [m] and round trip [s] of all frames, NaN: not answered."""
     results = sorted(result for meter in meters for result in meter.results)
     table = np.array(results, dtype=np.float64).reshape(-1, 3)
     return table[:, 0] - table[:1, 0].sum(), table[:, 1], table[:, 2]

@@ -60,7 +60,7 @@ class Sessions:
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
     def log_in(self, password: str, address: str = "") -> str | None:
-        """Return the token of a new session; None where the password is wrong, or too many of the address were."""
+        """Open a session and return its token; None where the password is wrong, or too many of the address were."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}

@@ -217,7 +217,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
             if other < n and not root[m] > 0.0:
                 used[other] = m
                 other += 1
-        # Misfits summed by clock, and the place that they ask for.
+        # Misfits summed by clock, and the place that they imply.
         for g in range(clocks):
             requested[g] = 0.0
         for a in range(3):

@@ -17,7 +17,7 @@ _STEPS = 60
 _HALVING = 8
 #: Share of the risk that is left over.
 _AIM = 0.002
-#: Share of the largest part within which two hypotheses ask for the same: the first is named.
+#: Share of the largest part within which two hypotheses require the same level: the first is named.
 _ALIKE = 1e-9
 #: Q(x) is the density at x over ``(1 - a) x + a sqrt(x^2 + b)`` to 0.3 %, x >= 0 (Borjesson and Sundberg 1979).
 _MILLS = (0.339, 5.510)

@@ -198,7 +198,7 @@ def _whiten(
             asked[clock[m]] += roots[n] * misfit[t, m]
             x, y, z = x + misfit[t, m] * along[n], y + misfit[t, m] * across[n], z + misfit[t, m] * up[n]
             n += 1
-    # The map error alike in all horizontal directions, and the place that the residuals ask for then.
+    # The map error alike in all horizontal directions, and the place that the residuals then imply.
     normal = _inverse(covariance_m2[t])
     of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
     of_map[2] = (noise / sigma_m[1]) ** 2

@@ -104,7 +104,7 @@ class LiveEngine:
         "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
         "skipped, behind the receivers", "dropped, too many waiting", "tachometer silent" and the like (not heard up to
         the epoch in time).
-    reported : deque of str
+    reports : deque of str
         Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
         restarts, what became of a saved state.
     """
@@ -114,7 +114,7 @@ class LiveEngine:
         self.processor = processor
         self.settings = settings
         self.counts: Counter[str] = Counter()
-        self.reported: deque[str] = deque(processor.notes, maxlen=100)
+        self.reports: deque[str] = deque(processor.notes, maxlen=100)
         self._notes = processor.received.notes
         self._order, self._ordered_at_m = processor.antenna_order(), float("-inf")
         self._antennas = tuple(processor.trajectories)
@@ -160,7 +160,7 @@ class LiveEngine:
             self._samples = self._samples.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
-        """Return sensors that have not been heard up to an epoch."""
+        """Return the sensors that have not been heard up to an epoch."""
         time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
         return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
 
@@ -189,7 +189,7 @@ class LiveEngine:
     def resume(self, saved: EngineState) -> None:
         """Continue from a saved state, if the first epoch comes within `LiveSettings.state_age_s` of its last one.
 
-        Otherwise its navigation records, SBAS messages and sequence number alone are used; `reported` says which.
+        Otherwise its navigation records, SBAS messages and sequence number alone are used; `reports` say which.
         """
         self._sequence = max(self._sequence, saved.sequence)
         self._saved = saved if saved.done_ns else None
@@ -207,8 +207,8 @@ class LiveEngine:
         if not self._in_order(antenna, waiting.tag_ns):
             return
         skips = self.lag.skips(waiting.tag_ns, now_ns)
-        self.reported += self.lag.reported
-        self.lag.reported.clear()
+        self.reports += self.lag.reports
+        self.lag.reports.clear()
         if skips:
             self.counts["skipped, behind the receivers"] += 1
             return
@@ -225,12 +225,12 @@ class LiveEngine:
         if 0.0 < age_s <= self.settings.state_age_s:
             self._state, self._done_ns, self._last_tag = saved.state, saved.done_ns, dict(saved.last_tag)
             self._samples = self._samples.between(GPS_EPOCH + np.timedelta64(saved.done_ns, "ns"), FOREVER)
-            self.reported.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
+            self.reports.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
         else:
             self._state = State(received=saved.state.received)
             side = "before" if age_s > 0.0 else "after"
             allowed = f"up to {self.settings.state_age_s:g} s before it (state_age_s) are allowed"
-            self.reported.append(
+            self.reports.append(
                 f"state file: not used but for ephemerides and the sequence number: its last epoch is "
                 f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
             )
@@ -239,7 +239,7 @@ class LiveEngine:
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Whether an epoch is new; a receiver that comes back with older tags restarts."""
+        """Return whether an epoch is new; restart after a receiver that comes back with older tags."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -266,7 +266,7 @@ class LiveEngine:
         """Restart after a receiver's restart: only what was received from satellites is kept."""
         self.counts["restart"] += 1
         self.lag.reset()
-        self.reported.append("a receiver came back with older time tags: positioning restarts")
+        self.reports.append("a receiver came back with older time tags: positioning restarts")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
         self._samples = SensorSamples()
@@ -274,7 +274,7 @@ class LiveEngine:
             self._waiting[name].clear()
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Return messages that are due: of complete pairs, of epochs that waited long enough, of periods without input.
+        """Return the messages due: of complete pairs, of epochs that waited long enough, of periods without input.
 
         `now_ns` is of the clock that `push` was given, `sent_ns` the GPS time of sending for the message; then one
         message goes out a period, that of the newest epoch. Without it (recorded epochs, the clock is that of their
@@ -388,7 +388,7 @@ class LiveEngine:
         return LiveOutput(message=create_message(result, self.settings), result=result)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
-        """Return samples since the epoch before up to an epoch; later ones wait."""
+        """Return the samples since the epoch before up to an epoch; later ones wait."""
         time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._late_sensors(tag_ns)
         self.counts.update(f"{name} silent" for name in silent)
         samples = self._samples.between(np.datetime64("NaT", "ns"), time)
@@ -396,10 +396,10 @@ class LiveEngine:
         return replace(samples, silent=silent)
 
     def _tell_changes(self, notes: tuple[str, ...]) -> None:
-        """Tell what is used in place of what was asked for since the received data changed, and what no longer is."""
+        """Report what is used in place of what was asked for since the received data changed, and what no longer is."""
         if notes is not self._notes:
-            self.reported.extend(note for note in notes if note not in self._notes)
-            self.reported.extend(f"no longer so: {note}" for note in self._notes if note not in notes)
+            self.reports.extend(note for note in notes if note not in self._notes)
+            self.reports.extend(f"no longer so: {note}" for note in self._notes if note not in notes)
             self._notes = notes
 
     def _check_order(self, result: Result) -> None:
@@ -415,5 +415,5 @@ class LiveEngine:
             (front.time, front.chainage_m, front.along_sigma_m), (rear.time, rear.chainage_m, rear.along_sigma_m)
         )
         if new and (note := self._order.note) is not None:
-            self.reported.append(note)
+            self.reports.append(note)
             self._order = None

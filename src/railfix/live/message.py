@@ -58,7 +58,7 @@ def create_message(result: Result, settings: LiveSettings) -> TrainMessage:
         if other.n_used[-1] > 0:
             sources |= _SOURCE_OF_ANTENNA.get(used, Source(0))
     place, status = _place_and_status(antenna, track)
-    sigma_m = float(antenna.along_sigma_m[-1] if not _filter(track) else track.tracked.sigma_m[-1])
+    sigma_m = float(antenna.along_sigma_m[-1] if not _has_place(track) else track.tracked.sigma_m[-1])
     values: dict[str, object] = {}
     level = _level_m(antenna)
     single = float(antenna.chainage_m[-1])
@@ -124,11 +124,11 @@ def _name_sources(track: AlongTrack) -> Source:
 
 
 def choose_antenna(result: Result) -> str:
-    """The antenna whose place goes out: one that has a place, of two the one with the smaller protection level."""
+    """Return the antenna to report: one that has a place, of two the one with the smaller protection level."""
 
     def worth(name: str) -> tuple[bool, float]:
         antenna, track = result.antennas[name], result.fusion.get(name)
-        if not _filter(track):
+        if not _has_place(track):
             return not math.isfinite(float(antenna.chainage_m[-1])), _level_m(antenna)
         level = float(track.tracked.level_m[-1])
         return False, level if math.isfinite(level) else _level_m(antenna)
@@ -136,7 +136,7 @@ def choose_antenna(result: Result) -> str:
     return min(result.antennas, key=worth)
 
 
-def _filter(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
+def _has_place(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
     """Return whether the filter along the track has a place."""
     return track is not None and len(track) > 0 and math.isfinite(float(track.chainage_m[-1]))
 
@@ -144,7 +144,7 @@ def _filter(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
     """Place [m], NaN without one, and what it is worth."""
     place = float(antenna.chainage_m[-1])
-    if not _filter(track):
+    if not _has_place(track):
         if not math.isfinite(place):
             return place, MessageStatus.NO_POSITION
         on_map = track is None or not len(track) or track.tracked.status[-1] != TrackStatus.OFF_MAP

@@ -273,8 +273,8 @@ class _Session:
                 sink.send(output)
             if self.hooks.observe is not None:
                 self.hooks.observe(output)
-        while self.engine.reported:
-            _LOG.warning("%s", self.engine.reported.popleft())
+        while self.engine.reports:
+            _LOG.warning("%s", self.engine.reports.popleft())
         return outputs
 
     def in_idle_time(self, outputs: Sequence[LiveOutput]) -> None:

@@ -147,7 +147,7 @@ async def _file(path: str) -> AsyncIterator[bytes]:
 
 
 async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
-    """Return what a call waits for, or TimeoutError.
+    """Return what a call waits for, or raise TimeoutError.
 
     It is asked once more at the end: what came while this program itself was busy counts. (`asyncio.wait_for` may lose
     a cancellation that comes at the same moment.)
@@ -196,7 +196,7 @@ async def _tcp(
 
 
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
-    """Yield a mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
+    """Yield the bytes of a mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
 
     With `LiveSettings.gga_s` it gets the train's position: in the request where that is known (NTRIP 2), and as lines
     from then on, for the virtual station that it makes there.
@@ -314,7 +314,7 @@ def _baud(source: str) -> int:
 
 
 async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
-    """Empty bytes once the line is open, then what arrives; a thread of its own reads, so that no byte overflows."""
+    """Yield empty bytes once the line is open, then what arrives; a thread reads, so that no byte overflows."""
     try:
         import serial
     except ModuleNotFoundError:

@@ -101,7 +101,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        return Loaded(session=None, outcome=f"state file {path}: there is none yet, positioning restarts")
+        return Loaded(session=None, outcome=f"state file {path}: there is none yet, positioning starts without one")
     except OSError as error:
         return _refuse(path, f"cannot be read ({error.strerror})")
     line, _, content = data.partition(b"\n")

@@ -58,7 +58,7 @@ class ReceivedData:
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
-    """What some bytes of a receiver complete, in the order of the stream; any cutting of the stream gives the same.
+    """Yield what some bytes of a receiver complete, in the order of the stream; any cutting of it gives the same.
 
     Each item ends with the message that completes an epoch, so that its navigation records came before its epoch.
     The state to go on with is that of the last item, `ReceivedData.after`; there is always one. Epochs with repeated or
@@ -131,7 +131,7 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 async def arrivals(
     source: str, state: ReceiverState, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
-    """What a source's data complete, item by item, and the breaks of its connection; `place` as for `read_source`."""
+    """Yield what a source's data complete, by items, and the breaks of its connection; `place`: see `read_source`."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and not is_receiver_log(read_head(path)):
         for piece in scan_observations(path, epochs=200):
@@ -288,7 +288,7 @@ class Lag:
 
     behind_s: float  #: With more delay epochs are skipped until it is a quarter of that; infinite: never.
     skipped: int = 0  #: Epochs skipped since the session fell behind.
-    reported: list[str] = field(default_factory=list)  #: To be reported of it.
+    reports: list[str] = field(default_factory=list)  #: Sentences that the session has not logged yet.
     _shortest_ns: float | None = None
     _at_ns: int = 0
     _since_ns: int = 0
@@ -309,16 +309,16 @@ class Lag:
         if self.skipped == 0:
             if lag_s <= self.behind_s:
                 return False
-            self.reported.append(f"{lag_s:.1f} s behind the receivers: epochs are skipped up to the present")
+            self.reports.append(f"{lag_s:.1f} s behind the receivers: epochs are skipped up to the present")
             self._steady = 0
         elif lag_s <= 0.25 * self.behind_s:
-            self.reported.append(f"at the present again, {self.skipped} epochs were skipped")
+            self.reports.append(f"at the present again, {self.skipped} epochs were skipped")
             self.skipped = 0
             return False
         if self._steady == 0 or abs(lag_s - self._steady_s) > STEADY_S:
             self._since_ns, self._steady_s, self._steady = now_ns, lag_s, 0
         elif self._steady >= STEADY_EPOCHS and (now_ns - self._since_ns) * 1e-9 > ADMITTED_S:
-            self.reported.append(
+            self.reports.append(
                 f"the receivers' time is {lag_s:.1f} s later than before; {self.skipped} epochs were skipped"
             )
             self.reset()

@@ -286,7 +286,7 @@ def without(ranges: Ranges, dropped: Masks) -> Ranges:
 
 
 def collect_conditions(config: Config) -> Conditions:
-    """Settings that the errors of the ranges depend on: the conditions of an error model made from such a run."""
+    """Collect settings that the errors of ranges depend on: the conditions of an error model made from such a run."""
     return Conditions(
         systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
         screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,

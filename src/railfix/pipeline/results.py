@@ -96,7 +96,7 @@ class State(NotebookTable):
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
     #: Navigation records and SBAS messages so far; None: those that the processor was made with.
     received: Received | None = None
-    base: BaseState | None = None  #: Of the base station.
+    base: BaseState | None = None  #: State of the base station.
     fusion: Mapping[str, FilterState] = field(default_factory=dict)  #: State of the filter along the track, by antenna.
 
     def __repr__(self) -> str:
@@ -148,7 +148,7 @@ class AntennaResult(NotebookTable, OnDemand):
     conventional_chainage_m: Floats
     conventional_offset_m: Floats
     reason: Bits  #: `reasons.Reason` bits, 0 = used; shape (T, M).
-    #: NaN where unknown; residuals of the position on the line; shape (T, M).
+    #: NaN where unknown; shape (T, M).
     elevation_deg: Floats
     azimuth_deg: Floats
     cn0_dbhz: Floats
@@ -159,14 +159,14 @@ class AntennaResult(NotebookTable, OnDemand):
     residual_m: Floats
     satellites: SatelliteStates  #: Of the channels in `columns`.
     columns: Indices  #: Channels that settings allow, in the order of the intermediate results below; shape (K,).
-    second: SecondCodes | None  #: Second codes of satellites, where two frequencies are used, shape (T, K).
+    second: SecondCodes | None  #: Second codes of satellites, where two frequencies are used; shape (T, K).
     combined: Combined | None  #: How they were combined with the first.
-    #: Metric and verdict of each screen that was on, by name,
-    #: shape (T, K); "antenna_spacing", which judges positions, has shape (T,).
+    #: Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which judges positions,
+    #: has shape (T,).
     screens: Mapping[str, Screened]
     single_point: SinglePoint  #: The conventional position: every constellation with a clock of its own.
     section: Section
-    constrained: Constrained
+    constrained: Constrained  #: Position on the line.
     #: Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
     phase: PhasePositions | None
     raim: RaimResult  #: Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
@@ -174,8 +174,8 @@ class AntennaResult(NotebookTable, OnDemand):
     map_offset: MapOffset  #: Mean offset of the 3-D positions of the last minutes from the line.
     interference: Interference | None  #: Jamming and spoofing suspected; None where that is off.
     araim: AraimResult | None  #: ARAIM levels; None without an integrity support message.
-    clocks: tuple[str, ...]  #: Letter of each receiver clock of the results above, length G.
-    #: Inter-system bias known before each epoch: that clock less the reference clock; shape (T, G).
+    clocks: tuple[str, ...]  #: Letter of each receiver clock of the results above; length G.
+    #: Inter-system bias known before each epoch (that clock less the reference clock), and its sigma; shape (T, G).
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats
 
@@ -200,7 +200,7 @@ class Result(NotebookTable):
     """Results of one chunk."""
 
     antennas: Mapping[str, AntennaResult]
-    notes: tuple[str, ...]  #: Differences between what was asked for and what was used, one sentence each.
+    notes: tuple[str, ...]  #: Differences between what was requested and what was used, one sentence each.
     #: Positions of the filter along the track, by antenna; empty where it is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
 

@@ -84,7 +84,7 @@ def ahead_m(trajectory: Trajectory) -> float:
 class RateSeries:
     """Rates of the body at K ticks."""
 
-    #: At which they hold, and when they were known; shape (K,).
+    #: Times at which they hold, and when they were known; shape (K,).
     time: Datetimes
     known: Datetimes
     distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).
@@ -108,7 +108,7 @@ class FeatureState:
 
     distance_m: float = 0.0  #: Distance at the last tick.
     angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch there, from any beginning [rad].
-    #: Whole metres of distance passed without a break, in the order of travel; shape (M,).
+    #: Whole metres passed without a break, in the order of travel; shape (M,).
     metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: At each, shape (M,).
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))

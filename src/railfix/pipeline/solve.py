@@ -70,7 +70,7 @@ def place_on_lines(ranges: Ranges, antennas: AntennaRows, point: SinglePoint, co
 
 
 def solve_again(ranges: Ranges, index: SearchIndex, place: Place, epochs: Indices, config: Config) -> Place:
-    """Return positions of which those of some epochs of one antenna are solved again, from other ranges."""
+    """Solve some epochs of one antenna again, from other ranges; return the positions of all."""
     part = ranges.take(epochs)
     point = single_point(part, place.point.ecef_m[epochs], limits=config.single_point)
     solved = place_on_line(part, index, point, config)

@@ -351,7 +351,7 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
 _TIME: Final = pl.Datetime("ns")
 
 
-def _get_field(name: str) -> Any:
+def _getter(name: str) -> Any:
     """Return a getter of one field of all passings."""
     return lambda passings: np.array([getattr(passing, name) for passing in passings])
 
@@ -359,30 +359,30 @@ def _get_field(name: str) -> Any:
 #: Columns of the table of passings.
 PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
     (
-        Column("time_gpst", "when the place was passed, by the filter; or a reading that is wrong", _get_field("time"),
+        Column("time_gpst", "when the place was passed, by the filter; or a reading that is wrong", _getter("time"),
                dtype=_TIME),
         Column("earliest_gpst", "begin of the interval of the passing, by the level: before, the train was not there",
-               _get_field("earliest"), dtype=_TIME),
-        Column("latest_gpst", "its end", _get_field("latest"), dtype=_TIME),
+               _getter("earliest"), dtype=_TIME),
+        Column("latest_gpst", "its end", _getter("latest"), dtype=_TIME),
         EPOCH[1],
-        Column("balise", "name in the list, or as read", _get_field("balise"), dtype=pl.String()),
+        Column("balise", "name in the list, or as read", _getter("balise"), dtype=pl.String()),
         Column(
             "verdict",
             "`virtual`: no balise; `read`, `missing`: passed with and without a reading; `contradicts`: read where the "
             "filter excludes it; `not_listed`",
-            _get_field("verdict"), words=VERDICTS,
+            _getter("verdict"), words=VERDICTS,
         ),
-        Column("chainage_m", "as listed", _get_field("chainage_m")),
-        Column("read_gpst", "time of the reading", _get_field("read"), dtype=_TIME),
+        Column("chainage_m", "as listed", _getter("chainage_m")),
+        Column("read_gpst", "time of the reading", _getter("read"), dtype=_TIME),
         Column("read_error_m", "of a reading that contradicts: listed place less that of the filter",
-               _get_field("read_error_m")),
-        Column("speed_mps", "at the passing, + toward rising chainage", _get_field("speed_mps")),
-        Column("protection_level_m", "of the place at the passing", _get_field("level_m")),
+               _getter("read_error_m")),
+        Column("speed_mps", "at the passing, + toward rising chainage", _getter("speed_mps")),
+        Column("protection_level_m", "of the place at the passing", _getter("level_m")),
         Column("doubt_over_m", "how far the train may be behind the place: `L_DOUBTOVER` less `Q_LOCACC`",
-               _get_field("amount_m")),
-        Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _get_field("amount_m")),
+               _getter("amount_m")),
+        Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _getter("amount_m")),
         Column("odometer_m", "for comparison: 5 m and 5 % of the distance since the last balise read (SUBSET-041)",
-               _get_field("odometer_m")),
+               _getter("odometer_m")),
     )
 )  # fmt: skip
 

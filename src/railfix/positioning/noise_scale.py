@@ -82,7 +82,7 @@ class RobustFit:
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
-    """Return inverse covariance of the place across and above sections of the line, shape (T, 3, 3) [1/m^2] in ECEF."""
+    """Return the inverse covariance of the place across and above sections of a line, ECEF, shape (T, 3, 3) [1/m^2]."""
     return compute_information(trajectory.get_axes(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 
@@ -215,7 +215,7 @@ class RobustClock:
 def robust_clock(
     residual_m: Floats, sigma_m: Floats, groups: tuple[slice, ...], *, least_ranges: int = 4
 ) -> RobustClock:
-    """Return receiver clock of each group of channels: Huber-weighted mean of the residuals, starting at their median.
+    """Return the receiver clock of each group of channels: Huber-weighted mean of residuals, starting at their median.
 
     `residual_m`, `sigma_m`, shape (T, K): range errors plus the clock, NaN is ignored; `least_ranges`: fewest ranges
     from which a clock is estimated.

@@ -158,7 +158,7 @@ def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> 
 class ConstrainedLimits(Settings):
     """Limits of the iteration along the line."""
 
-    #: Last step inside a section: one of 5 m leaves 0.03 mm (`after_step`).
+    #: Last step inside a section: one of 5 m leaves 0.03 mm (`railfix.kernels.ranges`).
     tolerance_m: float = Field(default=5.0, gt=0)
     max_iterations: int = Field(default=40, ge=1)  #: Steps, walks into a neighbouring section included.
 
@@ -238,7 +238,7 @@ def _on_line(
 def _from(
     vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """`iterate_along` of a trajectory, from points of it."""
+    """Run `iterate_along` on a trajectory, from points of it."""
     line = SectionArrays(
         trajectory.ecef_m[:-1], trajectory.tangent, trajectory.across, trajectory.up, trajectory.length_m,
         trajectory.sigma_plan_m, trajectory.sigma_height_m,
@@ -261,7 +261,7 @@ class SectionArrays(NamedTuple):
 class SinglePointLimits(Settings):
     """Limits of the iteration, and of the validation of its position (`conventional_status`)."""
 
-    tolerance_m: float = Field(default=1.0, gt=0)  #: The last step: one of 1 m leaves 0.01 mm (`after_step`).
+    tolerance_m: float = Field(default=1.0, gt=0)  #: The last step: one of 1 m leaves 0.01 mm.
     max_iterations: int = Field(default=12, ge=1)  #: Steps at most.
     #: Probability that noise alone fails the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)

@@ -263,7 +263,7 @@ def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
-    """Return covariance of all places, shape (2 A, 2 A): common errors and the map's are the same for every antenna."""
+    """Return the covariance of all places, shape (2 A, 2 A): common errors and the map's are alike for all antennas."""
     nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
     step = np.diff(nearest.points_m, axis=0)
     middle = nearest.points_m[:-1] + step / 2.0

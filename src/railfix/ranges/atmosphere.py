@@ -47,7 +47,7 @@ _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
-    """Return slant over vertical delay of an ionosphere in a thin shell (DO-229D A.4.4.10.4); NaN below the horizon."""
+    """Return the slant over vertical delay of a thin-shell ionosphere (DO-229D A.4.4.10.4); NaN below the horizon."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
 
@@ -89,7 +89,7 @@ def klobuchar_delay_m(
 def saastamoinen_delay_m(
     latitude_deg: Floats, height_m: Floats, elevation_deg: Floats, *, relative_humidity: float = 0.7
 ) -> Floats:
-    """Return tropospheric delay of Saastamoinen in the standard atmosphere (J. Saastamoinen, 1972), shape (T, M) [m].
+    """Return the tropospheric delay of Saastamoinen in the standard atmosphere (Saastamoinen, 1972), shape (T, M) [m].
 
     Both parts are mapped by 1/sin(elevation). Ellipsoidal heights below sea level count as sea level. NaN where an
     input is NaN, at or below the horizon, and outside -100 m to 10 km.

@@ -285,7 +285,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
 def judge_travel(
     fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """Reject rows by the way between them against the way travelled and its variance (P2 3.3): kept is the chain of
+    """Reject rows by the distance between them against that travelled and its variance (P2 3.3): kept is the chain of
     agreeing runs with most fixes, less joints that disagree.
     """
     rows = fixes.good

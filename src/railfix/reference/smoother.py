@@ -198,7 +198,7 @@ def _with_wheel(
 
 
 def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
-    """Return the accelerometer's offset, a random walk."""
+    """Add the accelerometer's offset, a random walk."""
     if unknowns.offset >= 0:
         chain = _with_prior(chain, unknowns.offset, ACCELERATION_BIAS_MPS2)
         chain = _with_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
@@ -206,7 +206,7 @@ def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
 
 
 def _with_prior(chain: Chain, unknown: int, sigma: float) -> Chain:
-    """Return an unknown of expectation 0 at the first instant."""
+    """Add the expectation 0 of an unknown at the first instant."""
     row = np.eye(chain.right.shape[1])[unknown]
     return chain.with_observations(np.array([0]), row, np.zeros(1), np.full(1, sigma**-2))
 

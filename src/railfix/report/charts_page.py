@@ -234,7 +234,7 @@ class PagePart:
 
 
 def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block], *, lead: Sequence[Block] = ()) -> str:
-    """Return HTML of a page of sentences, charts, and tables under them."""
+    """Return the HTML of a page of sentences, charts, and tables under them."""
     numbers = count()
     figures = PagePart(title="", figures=[figure(chart, numbers) for chart in charts])
     return render("charts.html.j2", title, charts=figures, tables=tables, lead=lead)
@@ -250,7 +250,7 @@ def read_template(name: str) -> Template:
 
 
 def render(template: str, title: str, **content: Any) -> str:
-    """Return HTML of a page of this package, with its style and scripts."""
+    """Return the HTML of a page of this package, with its style and scripts."""
     return read_template(template).render(
         title=title,
         created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),

@@ -185,7 +185,7 @@ def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart
 def antenna_groups(
     run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS, background: Sequence[Floats] = ()
 ) -> Iterator[Group]:
-    """Charts of one antenna of a run; `sky`: most epochs of the sky plot, `background`: lines below the plan [deg]."""
+    """Yield the charts of one antenna; `sky`: most epochs of the sky plot, `background`: lines below the plan [deg]."""
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     start = find_start(positions)
     yield Group(title="The line", charts=_keep(_plan(run, antenna, background)), start=start)

@@ -84,7 +84,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
         np.percentile(size, [50.0, 95.0]) for size in (compared.on_map_m, compared.conventional_m)
     )
     worst, other_worst = float(compared.on_map_m.max()), float(compared.conventional_m.max())
-    filtered = _filter(run, antenna)
+    filtered = _filter_errors(run, antenna)
     whose = "an epoch by itself" if filtered else "the train"
     verdict = (
         f"At {share(compared.rate, 1)} of the epochs with satellite signals {whose} has a position on the line that "
@@ -160,7 +160,7 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
     )
 
 
-def _filter(run: ReportedRun, antenna: str) -> dict[str, float]:
+def _filter_errors(run: ReportedRun, antenna: str) -> dict[str, float]:
     """Return the error sizes and rate of the filter along the track over all its epochs; empty without it."""
     table = run.filter_rows(antenna)
     known = pl.DataFrame() if table is None else table.filter("positioned", "reference_good")

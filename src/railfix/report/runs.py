@@ -58,7 +58,7 @@ class ReportedRun:
     notes: tuple[str, ...]
 
     def name_in(self, evaluation: Evaluation, table: str = POSITIONS_TABLE) -> str:
-        """Return name of one of its tables of positions in the tables of an evaluation; empty where it is not there."""
+        """Return the name of one of its tables of positions in the tables of an evaluation; empty if not there."""
         mine = (run for run in evaluation.runs if run.path.resolve() == self.folder.path.resolve())
         return next((run.name for run in mine if run.table == table), "")
 
@@ -191,7 +191,7 @@ def _observations(path: Path) -> pl.LazyFrame | None:
 
 
 def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[str, ...]]:
-    """Return C/N0 curve that the run used, or a note on why it is not drawn."""
+    """Return the C/N0 curve that the run used, or a note on why it is not drawn."""
     if config.cn0_curve is None:
         return None, ()
     path = next(iter(folder.input_paths("cn0_curve")), Path(config.cn0_curve))

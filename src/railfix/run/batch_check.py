@@ -88,7 +88,7 @@ def add_batch(checks: Mapping[str, BatchCheck], folder: OutputFolder) -> list[st
 
 
 def _note(name: str, batch: BatchTrack, apart: Floats, wrong: Masks, trajectory: Trajectory) -> Iterator[str]:
-    """Say at how many epochs the two differ, where and by how much."""
+    """Yield a note on the epochs where the two differ: how many, where and by how much."""
     compared = int(np.isfinite(apart).sum())
     if not compared:
         yield f"{name}: batch check: nothing to compare; there are no places of the filter and of codes together"

@@ -348,7 +348,7 @@ def _describe_detectable(detectable_m: Floats) -> str:
 
 
 def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
-    """Return notes on assumptions of the protection levels that this run contradicts."""
+    """Yield notes on assumptions of the protection levels that this run contradicts."""
     if not any(antenna.level_status for antenna in tally.antennas.values()):
         return
     for name, of_antenna in tally.antennas.items():

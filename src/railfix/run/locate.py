@@ -136,7 +136,7 @@ def likely_cause(observations: Observations, received: Received, config: Config,
 
 
 def _shifts_s() -> Iterator[int]:
-    """Give shifts of time tags that mistakes make, the smallest first [s]."""
+    """Yield shifts of time tags that mistakes make, the smallest first [s]."""
     for seconds in (_LEAP_S, _BEIDOU_S):
         yield from (seconds, -seconds)
     for hours in range(1, _HOURS + 1):

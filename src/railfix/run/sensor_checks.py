@@ -175,7 +175,7 @@ def _centre(values: Floats) -> Floats:
 
 
 def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
-    """The mean force is gravity, upward: -9.8 m/s2 on the axis that points down."""
+    """Check that the mean force is gravity, upward: -9.8 m/s2 on the axis that points down."""
     if not np.isfinite(inertial.force_mps2).any(axis=0).all():
         return
     forward, right, down = np.nanmedian(inertial.force_mps2, axis=0).tolist()
@@ -337,7 +337,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
         fits = f"sensors.tachometer.wheel_diameter_m = {real:.3f}"
         if found is not None and abs(found.ratio - 1.0) > _OTHER_TEETH:
             fits = f"sensors.tachometer.pulses_per_turn = {found.ratio * tachometer.pulses_per_turn:.0f} or {fits}"
-        scale = f"the distance of its wheel is {{:+.1f}} % off that by satellites; {fits} would fit"
+        scale = f"the distance by its wheel is {{:+.1f}} % off that by satellites; {fits} would fit"
         notes += _sentences("tachometer", found, scale)
     return tuple(notes)
 

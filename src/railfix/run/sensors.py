@@ -222,14 +222,14 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
     if len(falling):
         raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
     if kind in _SILENT:  # a stream that was recorded has rows with the time alone (`railfix.live.stream`)
-        table = table.filter(~pl.all_horizontal(_list_columns(table, kind).is_null()))
+        table = table.filter(~pl.all_horizontal(_select_columns(table, kind).is_null()))
         if not len(table):
             raise InputFileError(path, f"has no row of the {kind} but its time; leave the file out")
     return table
 
 
-def _list_columns(table: pl.DataFrame, kind: str) -> pl.Expr:
-    """Return those that the table has beside the time."""
+def _select_columns(table: pl.DataFrame, kind: str) -> pl.Expr:
+    """Return the columns of a sensor that the table has, without the time."""
     return pl.col([name for name in _names_of_columns(kind) if name in table.columns])
 
 
@@ -253,7 +253,7 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
         raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
     if not len(table):
         raise InputFileError(path, f"has no rows; expected those of the {kind}, or leave the file out")
-    empty = table.select(pl.all_horizontal(_list_columns(table, kind).is_null())).to_series()
+    empty = table.select(pl.all_horizontal(_select_columns(table, kind).is_null())).to_series()
     return table.with_columns(
         _numbers(path, table[name], may_be_empty=empty if name == "pulse" else pl.Series([name != "chainage_m"]))
         for name in _names_of_columns(kind)

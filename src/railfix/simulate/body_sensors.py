@@ -187,7 +187,7 @@ def gravity_mps2(latitude_deg: Floats, height_m: Floats) -> Floats:
 
 
 def _pose(simulation: Simulation, offset_m: tuple[float, float, float], time_s: Floats) -> tuple[Floats, Floats]:
-    """Return structures, shape (n, 3) [m], and the axes forward, right, down in its rows, shape (n, 3, 3)."""
+    """Return points of the body, shape (n, 3) [m], and the axes forward, right, down in its rows, shape (n, 3, 3)."""
     along, across, up = offset_m
     truth, _ = simulation.body_truth(offset_m, time_s)
     aside, _ = simulation.body_truth((along, across + _LEVER_M, up), time_s)

@@ -62,12 +62,12 @@ class Interpolated:
 
 
 def nodes_before(spacing_s: float) -> int:
-    """Return nodes before second 0."""
+    """Return the number of nodes before second 0."""
     return max(_BEFORE, int(np.ceil(_ROOM_S[0] / spacing_s)) + 1)
 
 
 def node_count(duration_s: float, spacing_s: float) -> int:
-    """Return the nodes that a run of a duration needs, with the room before and after it."""
+    """Return the number of nodes that a run of a duration needs, with the room before and after it."""
     return nodes_before(spacing_s) + int(np.ceil((duration_s + _ROOM_S[1]) / spacing_s)) + 4
 
 

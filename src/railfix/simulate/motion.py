@@ -108,7 +108,7 @@ _RAIL_HEAD_M: Final = 0.070  #: Contact points of the wheels lie further apart t
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
-    """Return motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or the like are given.
+    """Return the motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or such are given.
 
     Its duration is the scenario's unless given; 0: one way, to the last stop and its stand. SettingsError: when the
     train has no room on the line.

@@ -62,7 +62,7 @@ AngleBetween = Annotated[tuple[Finite, Finite], AfterValidator(_rising)]
 
 
 def _gps_time(value: Any) -> np.datetime64:
-    """Return GPS time of a TOML time, a text or a datetime64."""
+    """Return the GPS time of a TOML time, a text or a datetime64."""
     with suppress(ValueError):
         if isinstance(value, str | datetime | np.datetime64) and not np.isnat(time := gps_time(value)):
             return time

@@ -361,7 +361,7 @@ def _modern_frame(crs: str) -> tuple[str, float]:
 
 
 def _share_covered(crs: CRS, other: CRS) -> float:
-    """Return share of the area of use of a CRS, in degrees, that that of another covers; 0 where either is unknown."""
+    """Return the share of the area of use of a CRS, in degrees, that another's covers; 0 where either is unknown."""
     area, by = crs.area_of_use, other.area_of_use
     if area is None or by is None:
         return 0.0

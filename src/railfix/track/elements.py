@@ -61,24 +61,24 @@ class PlanElement:
     length_m: float
     law: str = "linear"  #: Key of `LAWS`.
     #: Of a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
-    #: rail rises. The law is of the way of the centre of gravity; the track lies beside it by so much.
+    #: rail rises. The law is of the path of the centre of gravity; the track lies beside it by so much.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
-        """Return the curvature [1/m] at ways from the first point."""
+        """Return the curvature [1/m] at distances from the first point."""
         t = way_m / self.length_m
         bend = self.lean_m / self.length_m**2 * 420.0 * t**2 * (1.0 - t) ** 2 * (1.0 - 2.0 * t)
         return np.asarray(self.first + (self.last - self.first) * LAWS[self.law][0](t) - bend)
 
     def direction_at(self, way_m: Floats) -> Floats:
-        """Return the direction [rad] at ways from the first point."""
+        """Return the direction [rad] at distances from the first point."""
         t = way_m / self.length_m
         change = (self.last - self.first) * self.length_m * LAWS[self.law][1](t)
         change = change - self.lean_m / self.length_m * 140.0 * t**3 * (1.0 - t) ** 3
         return np.asarray(self.direction_rad + self.first * way_m + change)
 
     def place_at(self, way_m: Floats) -> Floats:
-        """Return the easting and northing at ways from the first point, shape (n, 2) [m]."""
+        """Return the easting and northing at distances from the first point, shape (n, 2) [m]."""
         turn = max(abs(self.first), abs(self.last)) * self.length_m
         pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))  # even: Helmert's law has its knot in the middle
         knots = np.linspace(0.0, self.length_m, pieces + 1)

@@ -32,7 +32,7 @@ class ThinningLimits(Settings):
     #: Where positions between two points deviate from their chord by more, the furthest becomes a point too (P1 4.1(3):
     #: chords within 0.30 m of the curve). Requires times, to distinguish a bend from noise while stationary.
     chord_m: float = Field(default=0.30, gt=0)
-    #: Below this horizontal speed over `standing_window_s` the antenna is stationary and its positions are noise or
+    #: Below this horizontal speed over `_STANDING_WINDOW_S` the antenna is stationary and its positions are noise or
     #: drift. Requires times; 0 keeps all.
     standing_mps: float = Field(default=0.2, ge=0)
     #: Neighbouring points further apart, joined by a straight line, are reported.

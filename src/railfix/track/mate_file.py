@@ -128,7 +128,7 @@ def _number(path: str, row: Row, name: str) -> float:
 
 
 def _find_crs(cell: str) -> str | None:
-    """Return CRS of a UTM cell ("32T"), or of the Swiss grid."""
+    """Return the CRS of a UTM cell ("32T"), or of the Swiss grid."""
     if cell.strip().upper() == "LV95":
         return "EPSG:2056"
     zone = re.fullmatch(r"\s*(\d{1,2})\s*([C-X])?\s*", cell.upper())
@@ -155,14 +155,14 @@ def _end(element: PlanElement) -> tuple[np.ndarray, float]:
 
 
 def _gap(before: PlanElement, after: PlanElement) -> float:
-    """Return distance between the end of an element and the start of the next, and of their directions over 10 m."""
+    """Return the distance from the end of an element to the start of the next, plus that of directions over 10 m."""
     place, direction = _end(before)
     turn = np.angle(np.exp(1j * (direction - after.direction_rad)))
     return float(np.hypot(*(place - (after.x_m, after.y_m))) + 10.0 * abs(turn))
 
 
 def _forms(path: str, row: Row) -> list[PlanElement]:
-    """Return elements that a row may mean, the likeliest first."""
+    """Return the elements that a row may mean, the likeliest first."""
     kind = row.get("TRACK_SEGMENT_TYPE", "").lower()
     east, north, length = (_number(path, row, name) for name in ("EAST", "NORTH", "TRACK_SEGMENT_LENGTH"))
     if kind == "line":

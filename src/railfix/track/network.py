@@ -279,7 +279,7 @@ class Network:
         return kilometrage
 
     def find_index(self, name: str) -> int:
-        """Number of the track of a name, of a way of OpenStreetMap also by its id alone; SettingsError without one."""
+        """Return the number of a track by name, a way of OpenStreetMap also by its id; SettingsError without one."""
         drawn = [k for k, track in enumerate(self.tracks) if "origin" in track.metadata]
         by_id = [k for k in drawn if self.tracks[k].metadata.get("name", "").startswith(f"{name} ")]
         if name not in self.names and len(by_id) == 1:

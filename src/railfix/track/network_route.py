@@ -200,7 +200,7 @@ def _legs(network: Network, passed: list[int]) -> list[list[int]]:
 
 
 def _choose_route(network: Network, passed: list[int], share: Mapping[int, float]) -> list[int]:
-    """A route over the most probable tracks, in the order in which each first comes: every part of one is a route."""
+    """Choose a route over the most probable tracks, in the order in which each first comes: its parts are routes."""
     rest, kept = sorted(share, key=lambda track: -share[track]), list[int]()
 
     def is_none(count: int) -> int:

@@ -25,7 +25,7 @@ _KINK_DEG: Final = 3.0
 _SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, else a warning.
 #: Largest deviation of the height of a point from the line through its neighbours.
 _HEIGHT_SPIKE_M: Final = 0.50
-#: Largest difference of the gradient attribute from the heights, over `gradient_window_m`.
+#: Largest difference of the gradient attribute from the heights, over `_GRADIENT_WINDOW_M`.
 _GRADIENT_DIFFERENCE_PERMILLE: Final = 5.0
 _GRADIENT_WINDOW_M: Final = 100.0
 

@@ -63,8 +63,8 @@ class Budget:
     prior: tuple[float, ...]
     #: Sigmas that noise exceeds on one side with the risk over that probability: the least that a sub-filter requires.
     k_fault: tuple[float, ...]
+    #: The same two for the speed's bound, which has `SPEED_SHARE` of the risk on top, in equal parts for all sources.
     k_speed: float
-    #: The same of the bound on the speed, which has `SPEED_SHARE` of the risk on top, in equal parts for all sources.
     k_speed_fault: tuple[float, ...]
 
 

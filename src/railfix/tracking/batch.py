@@ -48,7 +48,7 @@ class BatchTrack:
     """Places of T epochs by all measurements together."""
 
     time: Datetimes  #: Shape (T,).
-    #: NaN in a piece without codes; shape (T,).
+    #: Arc length and its standard deviation; NaN in a piece without codes; shape (T,).
     arc_m: Floats
     sigma_m: Floats
     speed_mps: Floats  #: Shape (T,).

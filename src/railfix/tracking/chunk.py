@@ -43,12 +43,12 @@ class Chunk:
     #: Code [m], change of the phase since the epoch before [m] and range rate [m/s]; NaN where there is none;
     #: shape (3, T, K).
     measured: Floats
-    has: Masks  #: Where it is finite; shape (3, T, K).
-    #: Of their white errors, before the scales learnt from residuals; of codes the mean over a second; shape (3, T, K).
+    has: Masks  #: Where `measured` is finite; shape (3, T, K).
+    #: Of white errors, before the scales learnt from residuals; of codes the mean over a second; shape (3, T, K).
     variance: Floats
     #: Epochs with phases or Dopplers of at least four satellites: they carry the place on without codes; shape (T,).
     motion_measured: Masks
-    code_sigma_m: Floats  #: Of the satellite's correlated error; shape (T, K).
+    code_sigma_m: Floats  #: Of the satellite's correlated code error; shape (T, K).
     fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
     off_map: Masks  #: The train is away from the line; shape (T,).
     remembered: Masks  #: Satellites whose error lasts from before an epoch; shape (T, S).
@@ -59,7 +59,7 @@ class Chunk:
 
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
-    """Return the chunk; the state gets an error for each satellite measured in it."""
+    """Return the chunk, and give the state an error for each satellite measured in it."""
     phase, before = _previous(epochs, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
     placed = np.isfinite(epochs.sat_ecef_m).all(axis=2)

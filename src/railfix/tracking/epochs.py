@@ -65,7 +65,7 @@ class GnssEpochs:
 class RangeEpochs:
     """Ranges to ground units since the epoch before, up to R an epoch; NaN where there is none."""
 
-    #: Measured so long before the epoch; shape (T, R).
+    #: Ranges, standard deviations, and how long before the epoch each was measured; shape (T, R).
     range_m: Floats
     sigma_m: Floats
     age_s: Floats
@@ -83,8 +83,8 @@ class RangeEpochs:
 class BaliseEpochs:
     """Balises read since the epoch before, by turns: NaN, and any time, where there is none."""
 
-    time: Datetimes  #: At which each was passed; shape (T, 2).
-    #: Arc length of the trajectory's point then; shape (T, 2).
+    time: Datetimes  #: When each was passed; shape (T, 2).
+    #: Arc length of the trajectory's point then, and its standard deviation; shape (T, 2).
     place_m: Floats
     sigma_m: Floats
 
@@ -111,7 +111,7 @@ class BaliseEpochs:
 class SensorEpochs:
     """Sensor measurements at the same epochs, shape (T,) each, NaN where there is none; None without the sensor."""
 
-    #: Way since the epoch before by the wheel, + toward rising chainage.
+    #: Distance since the epoch before by the wheel, + toward rising chainage.
     wheel_m: Floats | None = None
     wheel_sigma_m: Floats | None = None
     #: "unknown": the distance has no sign and takes that of the speed.
@@ -125,7 +125,7 @@ class SensorEpochs:
     #: Arc length, by a feature of the line.
     place_m: Floats | None = None
     place_sigma_m: Floats | None = None
-    balises: BaliseEpochs | None = None
+    balises: BaliseEpochs | None = None  #: Balises read.
     ranges: RangeEpochs | None = None  #: Two-way ranges to ground units.
 
 

@@ -135,7 +135,7 @@ class Recursion:
     ) -> None:
         """Take an epoch back, and add what the smoother needs of it."""
         hypotheses = state.hypotheses
-        updated, cut = handed.update_epoch(state, epoch)
+        updated, cut = handed.collect_update(state, epoch)
         cut[:, SATELLITES + self.chunk.fresh[epoch].nonzero()[0]] = True
         handed.take_back(state, epoch, epoch + 1)
         step = Step(
@@ -185,7 +185,7 @@ def _columns(sensors: SensorEpochs, time: Datetimes) -> dict[str, Floats]:
 
 @lru_cache(maxsize=8)
 def _parameters(limits: TrackingLimits, branch_m: float) -> layout.Parameters:
-    """Return settings as the kernel takes them."""
+    """Return the settings as the kernel takes them."""
     budget = bank.budget(limits)
     given: dict[str, Any] = {
         "degrees": tuple(limits.tails),

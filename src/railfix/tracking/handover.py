@@ -183,7 +183,7 @@ class Handover:
         variance[OFFSETS:SATELLITES] += self.recursion.limits.offset_walk_m**2 * elapsed_s
         return mean, variance
 
-    def update_epoch(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
+    def collect_update(self, state: TrackState, epoch: int) -> tuple[Updated | None, Masks]:
         """Return the update of an epoch, None where nothing was used, and the unknowns that have restarted."""
         work, count, both = self.work, state.hypotheses, self.both
         cut = np.zeros(state.mean.shape, dtype=np.bool_)
@@ -207,7 +207,7 @@ class Handover:
 
 
 def _in_use(state: TrackState, chunk: Chunk, sensed: Masks, first: int, last: int) -> Masks:
-    """Return unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
+    """Return the unknowns that are measured in some epochs, or correlated with others, shape (N,)."""
     used = (state.covariance != 0.0).sum(axis=1).max(axis=0) > 1
     if state.bank is not None and len(state.bank.without):
         used |= (state.bank.covariance != 0.0).sum(axis=1).max(axis=0) > 1

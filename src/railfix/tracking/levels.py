@@ -37,20 +37,20 @@ class AccumulatedIncrement:
 
     #: First epoch of the log: epochs are taken where a period from there is rounded to another number.
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    number: int = -1  #: Of periods from `start` to the last epoch taken; -1 before the first.
-    epochs: int = 0  #: Since then.
+    number: int = -1  #: Number of periods from `start` to the last epoch taken; -1 before the first.
+    epochs: int = 0  #: Epochs since then.
     #: Satellites whose carrier phase went on at all of them; None where there was no epoch.
     unbroken: frozenset[str] | None = None
-    #: Sums over them of the distances by wheel and radar [m] and of the force [m/s2], and of the variances; shape (3,).
+    #: Sums over these epochs of distances by wheel and radar [m] and force [m/s2], and of variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
     variance: Floats = field(default_factory=lambda: np.zeros(3))
-    balises: BaliseEpochs | None = None  #: Read since then, as one epoch.
+    balises: BaliseEpochs | None = None  #: Balises read since then, as one epoch.
 
 
 def thin_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Return which epochs are taken, these with what was measured since the one before, and what to go on with.
+    """Return which epochs are taken, these with what was measured since the one before, and what is left after them.
 
     None for these where none is. A carrier phase goes on where it did so at all epochs between. Ways between epochs are
     added, the force is their mean; balises at the next epoch taken; places by features and ranges to ground units at
@@ -115,7 +115,7 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
 def _balises(
     sensors: SensorEpochs, since: AccumulatedIncrement, interval: Indices, taken: int
 ) -> tuple[BaliseEpochs | None, BaliseEpochs | None]:
-    """Return balises at the epochs that are taken, and those read after them, with what was left before."""
+    """Return the balises at the epochs that are taken, and those read after them, with what was left before."""
     if sensors.balises is None and since.balises is None:
         return None, None
     before = since.balises or BaliseEpochs.none(1)
@@ -143,7 +143,7 @@ def _names(epochs: GnssEpochs, unbroken: Masks, *, restarted: bool) -> frozenset
 
 
 def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats) -> SensorEpochs:
-    """Return sensors at the epochs that are taken."""
+    """Return the sensors at the epochs that are taken."""
     values: dict[str, Any] = {}
     for column, names in enumerate(_SUMMED):
         if getattr(sensors, names[0]) is not None:
@@ -171,8 +171,8 @@ class LevelState:
     track: TrackState | None = None
     every: bool = True  #: It has taken every epoch so far: it is the filter itself.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of its last epoch.
-    #: Its place, speed, levels with parts, amount and status there; shape (9,).
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Its last epoch.
+    #: Its place, speed, levels with parts, amount and status at that epoch; shape (9,).
     values: Floats = field(default_factory=lambda: np.full(len(_KEPT), np.nan))
 
 
@@ -273,5 +273,5 @@ def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
 
 
 def _since(last: Datetimes, time: Datetimes) -> Floats:
-    """Return seconds since the last epoch with sub-filters; NaN before the first."""
+    """Return the seconds since the last epoch with sub-filters; NaN before the first."""
     return np.where(np.isnat(last), np.nan, seconds(time - last))

@@ -72,7 +72,7 @@ class Tracked:
     speed_sigma_mps: Floats
     acceleration_mps2: Floats
     probability: Floats  #: Of the hypothesis given; shape (T,).
-    hypotheses: Integers  #: Shape (T,).
+    hypotheses: Integers  #: Number of hypotheses; shape (T,).
     #: Mean weights of codes, and of Dopplers and phases; shape (T,).
     code_weight: Floats
     motion_weight: Floats
@@ -81,15 +81,14 @@ class Tracked:
     force_offset_mps2: Floats
     radar_scale: Floats
     map_scale: Floats  #: Factor on the error of the map's lengths, 1 where codes do not contradict them; shape (T,).
-    #: Of the error along the line; of the straight distance, all branches and a map aside included; without faults and
-    #: branches; and the largest separation of a sub-filter. NaN where levels are off; shape (T,).
+    #: Of the error along the line; of the straight distance, all branches and a map aside included; and without faults
+    #: and branches. NaN where levels are off; shape (T,).
     level_m: Floats
     ground_level_m: Floats
     level_noise_m: Floats
     #: Bound of the error of the speed, which carries the level on to the next epochs; shape (T,).
     level_speed_mps: Floats
-    #: Of the error along the line; of the straight distance, all branches and a map aside included; without faults and
-    #: branches; and the largest separation of a sub-filter. NaN where levels are off; shape (T,).
+    #: Largest separation of a sub-filter. NaN where levels are off; shape (T,).
     separation_m: Floats
     #: Over- and under-reading amount: the level, and never less than the bound of the scale times the distance since
     #: codes were used (SUBSET-026 3.6.8); shape (T,).

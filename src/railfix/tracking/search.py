@@ -48,7 +48,7 @@ _KEPT: Final = np.array([StateIndex.WHEEL, StateIndex.FORCE_OFFSET, StateIndex.R
 
 
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tuple[Floats, Floats]:
-    """Return places along the line that the codes of an epoch are consistent with.
+    """Return the places along the line that the codes of an epoch are consistent with.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
 
 
 def _thin(line: Line) -> Indices:
-    """Return vertices about `_SPACING_M` apart."""
+    """Return the vertices about `_SPACING_M` apart."""
     marks = np.arange(line.arc_m[0], line.arc_m[-1] + _SPACING_M, _SPACING_M)
     return np.unique(np.minimum(np.searchsorted(line.arc_m, marks), len(line.arc_m) - 1))
 
@@ -148,7 +148,7 @@ def begin(
 def split(
     mean: Floats, covariance: Floats, log_probability: float, arc_m: Floats, sigma_m: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the narrower hypotheses within a wide one, about places; probabilities by its density there.
+    """Return narrower hypotheses within a wide one, about places; probabilities by its density there.
 
     Parameters
     ----------
@@ -199,18 +199,18 @@ class SplitHypothesis:
     """One of the narrower hypotheses that a wide one was split into."""
 
     parent: int  #: The wide one.
-    #: Of the wide one; shapes (N,), (N, N).
+    #: Mean and covariance of the wide one; shapes (N,), (N, N).
     mean: Floats
     covariance: Floats
-    #: Of the narrower one.
+    #: Place of the narrower one, and its standard deviation.
     place_m: float
     sigma_m: float
 
 
 class Sought(NamedTuple):
-    """What was sought before an epoch."""
+    """Result of the search before an epoch."""
 
-    lost: bool  #: Whether the track was lost.
+    lost: bool  #: The track was lost.
     parent: Indices  #: Hypothesis of the epoch before that each one goes on from; -1 where it began; shape (H,).
     splits: list[SplitHypothesis | None] | None  #: Hypotheses that began at this epoch within wider ones.
 

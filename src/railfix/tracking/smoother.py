@@ -43,7 +43,7 @@ class Updated:
 class Step:
     """One epoch of the filter with H hypotheses, as it was left."""
 
-    dt: float  #: [s].
+    dt: float  #: Since the epoch before [s].
     cut: Masks  #: Unknowns that have restarted at this epoch; shape (H, N).
     satellite: Strings  #: Shape (N - SATELLITES,).
     #: After the epoch; shapes (H, N), (H, N, N).
@@ -68,7 +68,7 @@ class Step:
             self.updated = self.updated.take(chosen)
 
     def before(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-        """Carry what later epochs say of hypothesis h backward through its measurements."""
+        """Carry the information of later epochs on hypothesis h backward through its measurements."""
         if self.updated is not None:
             vector, matrix = _before_measurements(self.updated, h, vector, matrix)
         part = None if self.splits is None else self.splits[h]
@@ -86,7 +86,7 @@ class Step:
 
 
 def _before_measurements(updated: Updated, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Carry what later epochs say of hypothesis h backward through an update."""
+    """Carry the information of later epochs on hypothesis h backward through an update."""
     gain = updated.combine[h].T @ updated.information[h]
     gained = gain @ updated.combine[h] - gain @ updated.covariance[h] @ gain.T
     back = np.eye(len(vector)) - gained @ updated.prior[h]
@@ -95,10 +95,10 @@ def _before_measurements(updated: Updated, h: int, vector: Floats, matrix: Float
 
 @dataclass(frozen=True, kw_only=True)
 class BackwardInformation:
-    """What all later epochs say of the unknowns after an epoch."""
+    """Information of all later epochs on the unknowns after an epoch."""
 
     place_m: float  #: Of the hypothesis that they go on from; NaN for none.
-    #: Shapes (N,), (N, N).
+    #: Of the unknowns; shapes (N,), (N, N).
     vector: Floats
     matrix: Floats
     satellite: Strings  #: Shape (N - SATELLITES,).
@@ -111,7 +111,7 @@ class Smoothed:
     #: Shape (T,).
     arc_m: Floats
     sigma_m: Floats
-    speed_mps: Floats  #: Shape (T,).
+    speed_mps: Floats
 
 
 def smooth_steps(

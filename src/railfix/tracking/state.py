@@ -57,7 +57,7 @@ OFFSETS: Final = len(StateIndex)
 SATELLITES: Final = OFFSETS + len(CLOCKS)
 #: Bounds of the speed where nothing is known of it [m/s].
 ANY_SPEED: Final = (-np.inf, np.inf)
-#: Unknowns that restart at every epoch: clock of the codes, displacements of the map.
+#: Unknowns that start again at every epoch: clock of the codes, displacements of the map.
 FRESH: Final = slice(StateIndex.CODE_CLOCK, StateIndex.MAP_LENGTH_ERROR + 1)
 
 
@@ -79,7 +79,7 @@ class Bank:
 
 @dataclass(kw_only=True)
 class TrackState:
-    """What one epoch leaves to the next: H hypotheses of N unknowns. Its arrays are never written to."""
+    """State after an epoch: H hypotheses of N unknowns. Its arrays are never written to."""
 
     time: np.datetime64  #: Of the last epoch; NaT before the first.
     mean: Floats  #: Shape (H, N).
@@ -93,16 +93,16 @@ class TrackState:
     measured: np.datetime64  #: Last epoch with measurements that the filter used.
     #: Last epoch whose codes counted (`TrackingLimits.code_period_s`); NaT where the next ones do.
     coded: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    #: How long the mean weights have been low.
+    #: How long the mean weights of motion and codes have been low [s].
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
     #: Logarithm of the variance of Dopplers and of phases against that of the limits.
     log_scale: tuple[float, float] = (0.0, 0.0)
-    #: Mean of the shifts that codes ask for over the last epochs, and its variance.
+    #: Mean of the shifts that codes imply over the last epochs, and its variance.
     code_shift: tuple[float, float] = (0.0, 0.0)
     #: Logarithm of the variance of lengths along the map against that of the limits, at least 0.
     map_log_variance: float = 0.0
-    #: Part of it that the codes gave (`railfix.kernels.tracking.branches`); shape (H,).
+    #: Part of `log_probability` that the codes gave (`railfix.kernels.tracking.branches`); shape (H,).
     log_code: Floats = field(default_factory=lambda: np.empty(0))
     #: Mean innovation of each satellite's codes (`railfix.kernels.tracking.learning`); shape (N - SATELLITES,).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
@@ -113,7 +113,7 @@ class TrackState:
     #: shape (H,).
     log_recent: Floats = field(default_factory=lambda: np.empty(0))
     across: float = 0.0  #: Sum of the contradictions of the velocity (`railfix.kernels.tracking.monitors`).
-    #: How long all codes have asked for another place, how long the level is withheld still, and how long that along
+    #: How long all codes have implied another place, how long the level is withheld still, and how long that along
     #: the line, as other places of it were more probable than the risk.
     step_s: float = 0.0
     withheld_s: float = 0.0
@@ -122,8 +122,8 @@ class TrackState:
     #: Time and distance since the hypotheses began.
     branch_s: float = 0.0
     branch_m: float = 0.0
-    bank: Bank | None = None  #: Where levels are asked for.
-    distance_since_code_m: float = 0.0  #: Distance since codes were used.
+    bank: Bank | None = None  #: None without levels.
+    distance_since_code_m: float = 0.0
     direction: float = 0.0  #: Sign of the last speed with a direction.
     #: Speeds that are possible after those measured so far (`railfix.kernels.tracking.prediction`); no bounds while
     #: there are several hypotheses.

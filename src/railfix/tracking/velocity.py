@@ -27,7 +27,7 @@ class Velocity:
 
     velocity_mps: Floats  #: ECEF; shape (T, 3).
     covariance: Floats  #: By the white errors of the measurements, larger where the residuals are; shape (T, 3, 3).
-    age_s: Floats  #: How long before the epoch it was so: half of the interval by phases, 0 by Dopplers; shape (T,).
+    age_s: Floats  #: How long before the epoch they hold: half of the interval by phases, 0 by Dopplers; shape (T,).
 
 
 def compute_velocity(
@@ -85,7 +85,7 @@ def compute_velocity(
 
 
 def _fit(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floats) -> tuple[Floats, Floats]:
-    """Return velocities by arrays in C order, so that the kernel is compiled for one kind of them."""
+    """Fit velocities to arrays in C order, so that the kernel is compiled for one kind of them."""
     from railfix.kernels.tracking.velocity import fitted_velocities
 
     return fitted_velocities(

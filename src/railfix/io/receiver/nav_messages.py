@@ -347,7 +347,7 @@ def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values
 def _of_kinds(
     bits: Bytes, valid: Masks, kind: Integers, layouts: Mapping[int, Mapping[str, Field]], first: int = 0
 ) -> Pages:
-    """Return the row, number (`first` and the kind) and fields of the valid pages of each kind."""
+    """Yield the row, number (`first` and the kind) and fields of the valid pages of each kind."""
     for k, layout in layouts.items():
         rows = np.flatnonzero(valid & (kind == k))
         table = fields(bits[rows], layout)
@@ -370,7 +370,7 @@ def _with_crc(
 
 
 def _lnav(part: Subframes, counts: Counter[str]) -> Pages:
-    """Return LNAV and CNAV."""
+    """Yield the pages of LNAV and CNAV."""
     letter, civil = str(part.satellite[0][0]), part.signal == 0
     cnav = np.isin(part.signal, _CNAV_SIGNALS[letter])
     counts[f"{letter} pages of other messages"] += int(np.count_nonzero(~cnav & ~civil))
@@ -384,7 +384,7 @@ def _lnav(part: Subframes, counts: Counter[str]) -> Pages:
 
 
 def _galileo(part: Subframes, counts: Counter[str]) -> Pages:
-    """I/NAV and F/NAV."""
+    """Yield the pages of I/NAV and F/NAV."""
     e5b, fnav = np.isin(part.signal, _UBX_E5B), np.isin(part.signal, _UBX_E5A)
     inav, fault = (part.signal == 1) | e5b, "E pages without valid CRC"
     counts["E pages of other messages"] += int(np.count_nonzero(~inav & ~fnav))
@@ -397,7 +397,7 @@ def _galileo(part: Subframes, counts: Counter[str]) -> Pages:
 
 
 def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
-    """D1, D2, B-CNAV1 and B-CNAV2."""
+    """Yield the pages of D1, D2, B-CNAV1 and B-CNAV2."""
     legacy, first, b2a = (np.isin(part.signal, signals) for signals in (_D_SIGNALS, _B1C, _B2A))
     frame = part.signal == BCNAV1_PAGE
     counts["C pages of B-CNAV1 of UBX (that of SBF is read)"] += int(np.count_nonzero(first))

@@ -193,7 +193,7 @@ def find_unfinished_epoch(frames: Frames) -> int | None:
 def _of_number(
     frames: Frames, number: int, near: np.datetime64, channels: ChannelNews
 ) -> Iterator[tuple[Integers, Measurements]]:
-    """Measurements of one kind of message, those with equal masks together; and each message's place in the stream."""
+    """Yield measurements of one kind of message, those with equal masks together; and the places of the messages."""
     chosen = frames.of("rtcm3", number)
     if not len(chosen):
         return

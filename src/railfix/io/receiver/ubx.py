@@ -208,7 +208,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
 
 
 def find_date(frames: Frames) -> np.datetime64:
-    """Day of the last NAV-PVT with a valid date (UTC, which is near enough to resolve weeks); NaT without one."""
+    """Return the day of the last NAV-PVT with a valid date (UTC, near enough to resolve weeks); NaT without one."""
     days, _, _ = _date(frames)
     return days[-1] if len(days) else np.datetime64("NaT", "ns")
 

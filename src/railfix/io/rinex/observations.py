@@ -208,7 +208,7 @@ def scan_observations(
     end: np.datetime64 | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Yield the observations of one receiver in pieces of `epochs` epochs at most; other arguments as
+    """Return the observations of one receiver in pieces of `epochs` epochs at most; other arguments as
     `railfix.read_observations`.
 
     The first piece is short (`in_pieces`). Each has the channels that occur in it; concatenated they are the log.

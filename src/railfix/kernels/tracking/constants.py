@@ -96,7 +96,7 @@ BIAS_SATELLITES: Final = 2
 BIAS_INFLATED: Final = 1e6
 #: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
 FREED_M: Final = 15.0
-#: Not where all codes ask for another place by more standard deviations: they may have stepped together.
+#: Not where all codes imply another place by more standard deviations: they may have stepped together.
 FREED_SIGMAS: Final = 3.0
 
 # Lengths of the map.
@@ -154,7 +154,7 @@ ACROSS_DOUBT: Final = 12.0
 ACROSS_LOST: Final = 30.0
 #: The sum after a takeover: more than a velocity across the line gives.
 ACROSS_TAKEN: Final = 60.0
-#: Mean of the places that codes ask for, over its standard deviation, and logarithm of the variance of lengths of the
+#: Mean of the places that codes imply, over its standard deviation, and logarithm of the variance of lengths of the
 #: map, 6 times their error: beyond them codes contradict motion, by a step of all codes, a pull, or a wrong map.
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_LOG: Final = 2.0 * math.log(6.0)
@@ -169,7 +169,7 @@ BESIDE_M: Final = 8.0
 #: Young hypotheses bound nothing before one of them is this probable: the right place may not be among them yet.
 YOUNG: Final = 0.99
 YOUNG_HELD_S: Final = 1.0
-#: Codes that ask for another place by more than so many standard deviations for so long [s] have stepped together.
+#: Codes that imply another place by more than so many standard deviations for so long [s] have stepped together.
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
 #: The level is withheld for so long after a step of all codes [s]: the place after it is the codes' own.

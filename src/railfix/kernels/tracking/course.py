@@ -11,7 +11,7 @@ from railfix.kernels.tracking.layout import ARC, LineArrays, Work
 
 @borrowing
 def on_course(line: LineArrays, arc: float) -> float:
-    """Return arc length on the line of a place beyond an end of a closed one (`railfix.tracking.line.Line.round_m`)."""
+    """Return the arc length on the line of a place beyond its end if closed (`railfix.tracking.line.Line.round_m`)."""
     first, last = line.arc_m[0], line.arc_m[-1]
     if arc > last and line.end_turn_m > 0.0:
         return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)

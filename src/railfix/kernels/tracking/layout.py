@@ -16,7 +16,7 @@ OF_EPOCH = 7
 #: Combinations of phases and Dopplers after the clock of the codes.
 C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
 COMBINED = 7
-#: Those of phases and Dopplers, and their order with clock and drift first, from the distance on.
+#: Those of phases and Dopplers, and their order with clock and drift first, from `C_WAY` on.
 MOTION = 6
 CLOCKS_FIRST = 1, 5, 0, 4, 2, 3
 #: Numbers in a vector of the processor: rows of the matrices in the work space are whole vectors.

@@ -1,4 +1,4 @@
-"""What an epoch teaches: noise of phases and Dopplers, doubt, the map's lengths, faulty satellites.
+"""Learning from an epoch: noise of phases and Dopplers, doubt, the map's lengths, faulty satellites.
 
 The innovation of a code over its standard deviation has a mean near 0 over a minute, reflections included: they come
 and go. A clock record that is wrong, or a reflection that lasts, keeps its sign. The mean of the innovations, each
@@ -146,7 +146,7 @@ def write_rows(outputs: Outputs, rows: Rows, work: Work, t: int, best: int, beli
 
 @borrowing
 def code_shift(rows: Rows, work: Work, h: int) -> float:
-    """Return shift of the place that the codes of an epoch ask for, over its standard deviation; 0 with too few codes.
+    """Return the shift of the place that the codes of an epoch imply, over its standard deviation; 0 with few codes.
 
     The score of the innovations against a shift: standard normal and white over epochs where the model holds.
     """

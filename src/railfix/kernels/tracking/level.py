@@ -121,7 +121,7 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, parameters: Parame
 def _turn_map(wrong_m: float, work: Work, h: int) -> None:
     """Turn the displacement of a map that may be wrong with the line: what was across in a bend is along after it.
 
-    It is in the way on the map, not in that of the phases. What was along before is not known.
+    It is in the distance on the map, not in that of the phases. What was along before is not known.
     """
     mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
     length = n + MAP_LENGTH_ERROR
@@ -242,7 +242,7 @@ def advance_subfilters(
             own = epochs.slot[k] if satellite else slots + epochs.offset[k]
             out = own == b or (b == others + ALL_DOPPLERS and i >= nc + nph)
             out = out or (b == others + ALL_PHASES and nc <= i < nc + nph)
-            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)  # a distance ahead shortens its range
+            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)  # moving ahead shortens its range
             work.masked[i] = math.inf if out else work.variance[i]
         for j in range(rows.counts[3]):
             own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
@@ -294,7 +294,7 @@ def _add_pairs(
     is known with all in view. The standard deviation is mostly within a tenth of that of a filter without both; with
     few satellites it can be half of it.
 
-    Returns the number of rows, and the risk that is spent on pairs that have none: those that ask for less than the
+    Returns the number of rows, and the risk that is spent on pairs that have none: those that require less than the
     level `start`, and those without whose satellites nothing is known, which nothing bounds.
     """
     place, in_view, spent = state.mean[0, ARC], len(bank.running) - OTHERS + ALL_IN_VIEW, 0.0
@@ -384,7 +384,7 @@ def _solve(
     which: int,
     start: float,
 ) -> float:
-    """Level at which all hypotheses together have the risk; `which` is the column of distances of branches and pairs.
+    """Find the level with the risk of all hypotheses together; `which`: column of distances of branches and pairs.
 
     Newton's steps of its logarithm within a bracket, from the largest that one hypothesis alone requires: they must
     not begin where a branch makes it flat.

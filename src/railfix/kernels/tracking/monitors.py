@@ -105,7 +105,7 @@ def watch(
 ) -> None:
     """Take the contradictions of an epoch into the state.
 
-    `square` is `contradiction` of the most probable hypothesis, `shift` the one that its codes ask for, `beyond_m` how
+    `square` is `contradiction` of the most probable hypothesis, `shift` the one that its codes imply, `beyond_m` how
     far its place is beyond an open end of the line, `code_s` the time that the codes stand for.
     """
     scalars = state.scalars

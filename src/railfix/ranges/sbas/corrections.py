@@ -49,7 +49,7 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """Return PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
+    """Return the PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
 
     The choice looks at all messages: make it on recorded messages before the positioning begins. What is
     received while a train runs cannot be judged in advance; there the PRN is given.
@@ -261,7 +261,7 @@ class SbasState:
     band: Band = "L1"  #: Frequency of the messages.
 
     def add_messages(self, messages: SbasMessages) -> SbasState:
-        """The state after more messages; those of other PRNs, and repeated ones of a second receiver, are left out."""
+        """Return the state after more messages; other PRNs, and repeated ones of a second receiver, are left out."""
         joined = self.messages.merge(messages.of(self.prn))
         return replace(self, messages=joined.take(~joined.repeated()))
 

@@ -292,7 +292,7 @@ class DfmcService:
         return time[order], np.concatenate(issues)[order], np.concatenate(values)[order]
 
     def _indicator(self, time: Datetimes, mask: Integers, rank: Integers, sent: tuple[Integers, Floats]) -> Integers:
-        """Return indicator in force: of type 32, or of a later message of types 34 to 36; -1 where it is too old."""
+        """Return the indicator in force: of type 32, or of a later message of types 34 to 36; -1 where too old."""
         row, age = sent
         received, issue, values = self._indicators
         result = np.full(len(time), -1, dtype=np.int64)

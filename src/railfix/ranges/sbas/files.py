@@ -285,7 +285,7 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
 
 
 def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMessages:
-    """Return the parity, preamble and order."""
+    """Check the parity, preamble and order."""
     raw = gathered.raw
     text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
     bits = np.frombuffer(bytes.fromhex(text), dtype=np.uint8).reshape(-1, ROW_BYTES).copy()

@@ -68,7 +68,7 @@ def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.ge
 
 
 def _layout() -> tuple[Integers, Integers]:
-    """Return point of each bit of each band (-1 without), and the up to two (band, bit) cells of each point (-1)."""
+    """Return the point of each bit of each band (-1 without), and up to two (band, bit) cells of each point (-1)."""
     point = np.full((BANDS, BITS), -1, dtype=np.int64)
     cells = np.full((ROWS * COLUMNS, 2), -1, dtype=np.int64)
     for band in range(BANDS):
@@ -222,7 +222,7 @@ def _square_weights(x: Floats, y: Floats) -> Floats:
 
 
 def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], tuple[Floats, ...]]]:
-    """South-west corners and sizes of the cells to try, in order (A.4.4.10.2): the small one, then 10 by 10."""
+    """Yield the south-west corners and sizes of the cells to try, in order (A.4.4.10.2): small, then 10 by 10."""
 
     def small(at: Indices) -> tuple[Floats, ...]:
         lat, lon = latitude[at], longitude[at]

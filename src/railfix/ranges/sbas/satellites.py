@@ -99,7 +99,7 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return range-rate correction, its degradation per second, time between its two corrections, where there is none.
+    """Return the range-rate correction, degradation per second, time between its corrections, and where there is none.
 
     After an alarm (IODF 3) the earlier of the two is the one nearest to half the time-out before.
     """
@@ -124,7 +124,7 @@ def _rate(
 
 
 def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> Integers:
-    """Return earlier row of the same satellite whose time is nearest to `before` ahead of a row; the later of two."""
+    """Return the earlier row of the satellite whose time is nearest to `before` ahead of a row; the later of two."""
     wanted = fast.time[row] - before
     first = fast["fresh"][row]
     low = np.maximum(fast.newest(fast.series[row], wanted), first)

@@ -189,7 +189,7 @@ class SatelliteCorrections(FrozenArrays):
         return SatelliteCorrections(**{item.name: getattr(self, item.name)[:, which] for item in fields(self)})
 
     def sigma_flt_m(self, delta_udre: Floats | float = 1.0) -> Floats:
-        """Return standard deviation after fast and long-term correction, shape (T, K) [m] (DO-229D, A.4.5.1 and J.2.2).
+        """Return the standard deviation after fast and long-term corrections, (T, K) [m] (DO-229D, A.4.5.1, J.2.2).
 
         `delta_udre` is the factor on sigma UDRE (`SbasCorrections.delta_udre`).
         """

@@ -125,7 +125,7 @@ class MaskTable:
         self._stops = stops
 
     def resolve(self, iodp: Integers, slot: Integers, time: Datetimes) -> Integers:
-        """Return mask number of slots of messages, 0 where the mask leaves the slot out, -1 without an active mask."""
+        """Return the mask numbers of slots of messages, 0 where the mask leaves one out, -1 without an active mask."""
         mask = self.by_issue.newest(iodp, time)
         return np.where(self._in_force(self.by_issue, mask, time), self.by_issue["number"][mask, slot], -1)
 
@@ -224,14 +224,14 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """A row after one that was not monitored, or the first of its satellite, restarts."""
+    """Add the row where each series begins: the first of its satellite, or one after a row that was not monitored."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
 
 
 def _with_other(table: Series) -> Series:
-    """Return the number of the last row of the same satellite with another issue of data."""
+    """Add the number of the last row of the same satellite with another issue of data."""
     number, iode = table.series, table["iode"]
     changed = np.ones(len(number), dtype=bool)
     changed[1:] = (number[1:] != number[:-1]) | (iode[1:] != iode[:-1])

@@ -170,7 +170,7 @@ class Chart:
     @property
     def empty(self) -> bool:
         """Whether no layer has anything to draw."""
-        return not any(_draw(layer) for layer in self.layers)
+        return not any(_has_content(layer) for layer in self.layers)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,7 +198,7 @@ class SkyEpochs:
         return not len(self.satellite)
 
 
-def _draw(layer: Layer) -> bool:
+def _has_content(layer: Layer) -> bool:
     """Return whether a layer has anything to draw; text alone does not count."""
     if isinstance(layer, Marks):
         return False

@@ -168,7 +168,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
-    """Return minimum, mean and maximum error of each run by its name, on the map and conventional (P1 figure 11)."""
+    """Return the minimum, mean and maximum error of each run by name, on the map and conventional (P1 figure 11)."""
     names: list[str] = []
     values: list[Floats] = []
     for run, errors in runs.items():

@@ -96,7 +96,7 @@ def plan(
                 Points(label=f"{label} ({len(rows):,})", colour=colour, x=x, y=y, size=4.0, epoch_s=epoch[kept])
             )
     if filtered is not None:
-        layers += _filter(positions.filter(pl.Series(has)), filtered, frame, cell, find_start(positions))
+        layers += _filter_points(positions.filter(pl.Series(has)), filtered, frame, cell, find_start(positions))
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
     thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
@@ -108,7 +108,7 @@ def plan(
     )
 
 
-def _filter(
+def _filter_points(
     placed: pl.DataFrame, filtered: pl.DataFrame, frame: LocalFrame, cell: float, start: np.datetime64
 ) -> Iterator[Points]:
     """Yield the filtered positions of the epochs that have none of their own."""
@@ -148,11 +148,11 @@ class LocalFrame:
         )
 
     def plane(self, ecef_m: Floats) -> Floats:
-        """East and north of points, shape (P, 2) [m]."""
+        """Return the east and north of points, shape (P, 2) [m]."""
         return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
     def to_plane(self, latitude_deg: Floats, longitude_deg: Floats) -> Floats:
-        """East and north of points of the height of the origin, shape (P, 2) [m]."""
+        """Return the east and north of points of the height of the origin, shape (P, 2) [m]."""
         return self.plane(ecef_from_geodetic(latitude_deg, longitude_deg, np.full(len(latitude_deg), self.height_m)))
 
 
@@ -284,7 +284,7 @@ def interval_over_chainage(table: pl.DataFrame) -> Chart:
 
 
 def interval_distribution(table: pl.DataFrame) -> Chart:
-    """Return distribution of the distances from the previous position (P1 figure 12), of the table of `interval`."""
+    """Return the distribution of distances from the previous position (P1 figure 12), of the table of `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)

@@ -126,7 +126,7 @@ def _screen(picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
 def _blocks(
     picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
 ) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
-    """Give x, metric, reject and limit of a picture, `_BLOCK` rows at a time, flat: long runs need little memory."""
+    """Yield x, metric, reject and limit of a picture, `_BLOCK` rows at a time, flat: long runs need little memory."""
     limit = np.broadcast_to(picture.limit, picture.metric.shape)
     for first in range(0, len(picture.metric), _BLOCK):
         rows = slice(first, first + _BLOCK)

@@ -81,7 +81,7 @@ def track_paths(
 
 
 def _carrier(real: Singles, imaginary: Singles, rate_mps: Floats, anchor: Complexes) -> tuple[Floats, Floats]:
-    """Return phase of the sum of the paths [rad], and its rate beyond the main path's [m/s], at constant amplitudes."""
+    """Return the phase of the sum of paths [rad], and its rate beyond the main path's [m/s], at constant amplitudes."""
     carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
     angle = np.arctan2(
         quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag
@@ -136,7 +136,7 @@ def edge_amplitude(v: Floats) -> Floats:
 
 
 def strip_field(v: Floats, width_v: Floats) -> Complexes:
-    """Return field that a strip removes (Kirchhoff, Babinet): ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over it."""
+    """Return the field a strip removes (Kirchhoff, Babinet): ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over it."""
     sine_1, cosine_1 = fresnel(v - 0.5 * width_v)
     sine_2, cosine_2 = fresnel(v + 0.5 * width_v)
     return np.asarray(0.5 * (1.0 + 1.0j) * ((cosine_2 - cosine_1) - 1.0j * (sine_2 - sine_1)))

@@ -112,7 +112,7 @@ class Strips:
     value: dict[str, Floats]  #: Properties, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
-        """Return index of the nearest structure on a side (0 left, 1 right); both sides always hold at least one."""
+        """Return the index of the nearest structure on a side (0 left, 1 right); both sides have at least one."""
         low = np.clip(chainage_m, -0.25 * self.reach_m, 0.5 * self.reach_m)
         return np.searchsorted(self.border_m, side * self.reach_m + low, side="right") - 1
 

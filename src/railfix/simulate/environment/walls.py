@@ -55,7 +55,7 @@ def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Fl
 
 
 def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
-    """Return Fresnel parameter of a ray at a wall with level top and vertical ends, positive inside its outline."""
+    """Return the Fresnel parameter of a ray at a wall with level top and vertical ends, positive inside its outline."""
     scale = per_metre(far_m, rays.wavelength_m)
     rise, level = _slants(across, rays.z)
     top = (row.value["height_m"][wall] - rays.height_m - z) * rise
@@ -64,7 +64,7 @@ def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m
 
 
 def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | float = 0.0) -> Floats:
-    """Return Fresnel parameter of the walls of a row that obstruct the satellites from `x0`, `y0`, shape (N,)."""
+    """Return the Fresnel parameter of the walls of a row that obstruct the satellites from `x0`, `y0`, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     begin = np.where(rays.y > 0.0, 1.0, -1.0) * y0
@@ -285,7 +285,7 @@ _SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of the lateral component of
 
 
 def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
-    """Return Fresnel parameter of the vehicles on a parallel track, positive where in the way, shape (N,)."""
+    """Return the Fresnel parameter of the vehicles on a parallel track, positive where in the way, shape (N,)."""
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     far = settings.lateral_m / lateral
     spacing = settings.spacing_m

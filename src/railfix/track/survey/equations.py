@@ -94,7 +94,7 @@ def _point(first: Indices, factor: Floats) -> list[tuple[Indices, Floats]]:
 def position_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> Equations:
-    """Return positions: the row's coordinates and the offset of the run."""
+    """Return the equations of positions: the row's coordinates and the offset of the run."""
     rows = np.flatnonzero(np.isfinite(run.ecef_m).all(axis=1))
     white = axes[None] / run.sigma_m[rows][:, :, None]
     value = np.einsum("nij,nj->ni", white, run.ecef_m[rows] - origin)
@@ -156,7 +156,7 @@ def _group_medians(value: Floats, group: Indices) -> Floats:
 def motion_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, limits: SurveyLimits, unknowns: int
 ) -> Equations:  # fmt: skip
-    """Return the evenness of the motion: the velocity changes little between neighbouring steps."""
+    """Return the equations of even motion: the velocity changes little between neighbouring steps."""
     dt = np.diff(run.seconds)
     rows = np.arange(1, len(run) - 1)
     mean = 0.5 * (dt[:-1] + dt[1:])
@@ -174,7 +174,7 @@ def motion_equations(
 
 
 def offset_equations(run: SurveyRun, columns: RunColumns, axes: Floats, unknowns: int) -> Equations:
-    """Return the offset of a run: zero within the errors that its positions share."""
+    """Return the equations of the offset of a run: zero within the errors that its positions share."""
     plan, height = run.common_sigma_m
     white = (axes / np.array([plan, plan, height])[:, None])[None]
     parts = _point(np.array([columns.offset]), white)
@@ -203,7 +203,7 @@ def tie_equations(
 
 
 def bend_equations(line: ReferenceLine, start: int, unknowns: int) -> Equations:
-    """Return the evenness of the line: it bends as the reference line does."""
+    """Return the equations of an even line: it bends as the reference line does."""
     count = len(line)
     middle = np.arange(count) if line.closed else np.arange(1, count - 1)
     neighbours = line.across[(middle - 1) % count], line.across[(middle + 1) % count]
