@@ -22,7 +22,7 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.processor import EpochProcessor, Models
 from railfix.pipeline.results import AntennaResult, State
-from railfix.positioning.antenna_rows import EVERY, AntennaRows, join_rows, stack_observations, take_rows
+from railfix.positioning.antenna_rows import EVERY, AntennaRows, join_epochs, stack_observations, take_epochs
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import ErrorModel
 from railfix.run.processor import make_processor
@@ -207,15 +207,15 @@ def test_antennas_on_maps_of_other_sigmas_are_refused() -> None:
 def test_joined_rows_are_taken_apart_again() -> None:
     logs = _inputs()[0]
     front, rear = logs["front"][:3], logs["rear"][:2]
-    both = join_rows([front, rear])
+    both = join_epochs([front, rear])
     assert both.time.tolist() == [*front.time.tolist(), *rear.time.tolist()]
     for part, rows in ((front, slice(0, 3)), (rear, slice(3, 5))):
-        again = take_rows(both, rows)
+        again = take_epochs(both, rows)
         assert is_dataclass(again)
         np.testing.assert_array_equal(again.code_m, part.code_m)
         np.testing.assert_array_equal(again.satellite, part.satellite)
-    assert take_rows(both, EVERY) is both
-    assert join_rows([both]) is both
+    assert take_epochs(both, EVERY) is both
+    assert join_epochs([both]) is both
 
 
 def test_rows_are_split_by_antenna() -> None:

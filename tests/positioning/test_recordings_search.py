@@ -20,7 +20,7 @@ from exhaustive_search import exhaustive_search
 from pipeline_cases import demo_observations, processor
 from railfix.pipeline import corrected_ranges, solve
 from railfix.positioning import normal_equations, section_search
-from railfix.positioning.antenna_rows import take_rows
+from railfix.positioning.antenna_rows import take_epochs
 from railfix.positioning.normal_equations import UNTIED_M, Constrained, ConstrainedLimits, Ranges, SinglePoint
 from railfix.positioning.section_search import SearchIndex, Section, SectionLimits
 from railfix.track.trajectory import Trajectory
@@ -57,7 +57,7 @@ def calls(monkeypatch) -> Calls:
         each = list(lines)
         result = section_search.search_lines(ranges, each, point, limits=limits)
         for index, rows in each:
-            found.searches.append((take_rows(ranges, rows), index.trajectory, take_rows(result, rows)))
+            found.searches.append((take_epochs(ranges, rows), index.trajectory, take_epochs(result, rows)))
         return result
 
     monkeypatch.setattr(solve, "search_lines", search_lines)
@@ -69,7 +69,7 @@ def calls(monkeypatch) -> Calls:
     ) -> Constrained:
         result = normal_equations.constrained_on_lines(ranges, lines, vertex, limits=limits)
         for line, rows in lines:
-            found.positions.append((take_rows(ranges, rows), line, take_rows(result, rows)))
+            found.positions.append((take_epochs(ranges, rows), line, take_epochs(result, rows)))
         return result
 
     monkeypatch.setattr(solve, "constrained_on_lines", positions)

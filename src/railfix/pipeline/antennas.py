@@ -23,7 +23,7 @@ from railfix.pipeline.filter_result import COORDINATES
 from railfix.pipeline.level_stage import apply_verdicts
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
-from railfix.positioning.antenna_rows import AntennaRows, join_rows
+from railfix.positioning.antenna_rows import AntennaRows, join_epochs
 from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.screens.base import on_pairs, pair_epochs
 from railfix.track.track import interpolate_kilometrage
@@ -125,7 +125,9 @@ def judge_pairs(
 def with_screens(corrected: CorrectedRanges, ranges: Mapping[str, CorrectedRanges]) -> CorrectedRanges:
     """Return the ranges of all antennas with what the screens and the carrier phases of each have changed."""
     names = ("reason", "sigma_m", "corrected_code_m", "bound_sigma_m", "bias_m", "combined", "slips")
-    return copy_with(corrected, **{name: join_rows([getattr(own, name) for own in ranges.values()]) for name in names})
+    return copy_with(
+        corrected, **{name: join_epochs([getattr(own, name) for own in ranges.values()]) for name in names}
+    )
 
 
 def position_verdicts(

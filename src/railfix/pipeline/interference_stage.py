@@ -29,7 +29,7 @@ from railfix.integrity.interference import (
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
-from railfix.positioning.antenna_rows import AntennaRows, join_rows, take_rows
+from railfix.positioning.antenna_rows import AntennaRows, join_epochs, take_epochs
 
 if TYPE_CHECKING:
     from railfix.pipeline.corrected_ranges import CorrectedRanges
@@ -204,8 +204,8 @@ def _on_all_epochs(
         every = latest = known[-1]
     else:
         row = due.group - (state.latest is None)
-        every = join_rows(known)
-        every, latest = take_rows(every, row), take_rows(every, row[-1:])
+        every = join_epochs(known)
+        every, latest = take_epochs(every, row), take_epochs(every, row[-1:])
     count = len(due.rows)
     after = copy_with(
         state, second=due.last, alarm=int(due.alarm[count]), broken=bool(due.broken[count]), latest=latest

@@ -43,7 +43,7 @@ from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensed_motion import LineFeatures
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.solution import Solution, solve
-from railfix.positioning.antenna_rows import AntennaRows, stack_observations, take_rows
+from railfix.positioning.antenna_rows import AntennaRows, stack_observations, take_epochs
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
@@ -350,7 +350,7 @@ class EpochProcessor:
         ranges, after = {}, []
         for name, rows in zip(names, antennas.parts, strict=True):
             before = state.antennas.get(name) or AntennaState()
-            own, states = take_rows(corrected, rows), dict(before.screens)
+            own, states = take_epochs(corrected, rows), dict(before.screens)
             for screen, limits in self._of_observations:
                 verdicts, screen_state = screen.judge(own, limits, self.setup, states.get(screen.name))
                 own = own.apply(verdicts)
@@ -387,7 +387,7 @@ class EpochProcessor:
                 screens[name][verdict.name] = verdict.screened
         results = antenna_results(corrected, antennas, copy_with(solution, status=status), chainage, self.config)
         return {
-            name: copy_with(take_rows(results, rows), screens=screens[name], interference=own)
+            name: copy_with(take_epochs(results, rows), screens=screens[name], interference=own)
             for (name, rows), own in zip(screened.rows.items(), interference, strict=True)
         }
 
@@ -397,7 +397,7 @@ class EpochProcessor:
         def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
             rows, sensors = solved.screened.rows[name], solved.screened.sensors
             return along_track(
-                take_rows(solved.ranges, rows),
+                take_epochs(solved.ranges, rows),
                 single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
                 self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
                 samples=sensors, references=self._line_references(name, sensors),

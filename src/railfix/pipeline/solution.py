@@ -30,7 +30,7 @@ from railfix.pipeline.solve import (
     validate_point,
     with_p4_level,
 )
-from railfix.positioning.antenna_rows import AntennaRows, take_rows
+from railfix.positioning.antenna_rows import AntennaRows, take_epochs
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
@@ -199,7 +199,7 @@ def solve(
         def own_phase(
             index: SearchIndex, rows: slice, state: CarrierState | None
         ) -> tuple[PhasePositions, CarrierState]:
-            own = take_rows(corrected, rows), take_rows(ranges, rows)
+            own = take_epochs(corrected, rows), take_epochs(ranges, rows)
             return code_and_phase(*own, index.trajectory, constrained.arc_m[rows], config, state or CarrierState())
 
         phase, carriers = antennas.each_with_state(own_phase, carriers)

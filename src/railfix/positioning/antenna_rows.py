@@ -76,14 +76,14 @@ class AntennaRows:
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
         """Return the same, joined."""
-        return join_rows(self.apart(function, *of_antennas))
+        return join_epochs(self.apart(function, *of_antennas))
 
     def each_with_state(
         self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
     ) -> tuple[Value, list[State]]:
         """Return the joined first results of a function for each antenna, and a list of its second ones."""
         found = self.apart(function, *of_antennas)
-        return join_rows([rows for rows, _ in found]), [state for _, state in found]
+        return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
         """Yield the search index and the rows of each antenna that has any of some rising ones."""
@@ -164,7 +164,7 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         return first, (EVERY,)
     ends = [0, *accumulate(map(len, observations))]
     same = all(_has_same_channels(first, other) for other in others)
-    stacked = join_rows(observations) if same else stack_parts(observations)
+    stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
 
 
@@ -189,7 +189,7 @@ def _defaults(kind: Any) -> tuple[str, ...]:
     return tuple(name for name in _members(kind) if hasattr(kind, name))
 
 
-def join_rows(values: Sequence[Value]) -> Value:
+def join_epochs(values: Sequence[Value]) -> Value:
     """Join arrays row after row, or those of dataclasses or of tuples; what is neither is that of the first."""
     first: Any = values[0]
     if len(values) == 1:
@@ -211,12 +211,12 @@ def _join(values: Sequence[Any]) -> Any:
     )
 
 
-def take_rows(value: Value, rows: slice | Indices) -> Value:
+def take_epochs(value: Value, rows: slice | Indices) -> Value:
     """Return some rows of an array, or of the arrays of a dataclass and of those within it."""
-    return value if rows is EVERY else cast(Value, _take_rows(value, rows))
+    return value if rows is EVERY else cast(Value, _take_epochs(value, rows))
 
 
-def _take_rows(value: Any, rows: slice | Indices) -> Any:
+def _take_epochs(value: Any, rows: slice | Indices) -> Any:
     if value.__class__ is np.ndarray:
         return value[rows]
     if not (has_rows := _members(value.__class__)):
@@ -227,14 +227,14 @@ def _take_rows(value: Any, rows: slice | Indices) -> Any:
             if item.__class__ is np.ndarray and has_rows[name]:
                 members[name] = item[rows]
         for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field is to be taken
-            members[name] = _take_rows(own[name], rows)
+            members[name] = _take_epochs(own[name], rows)
         return value.create(
-            lambda n: {n: _take_rows(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
+            lambda n: {n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
         )
     for name, of_rows in has_rows.items():
         item = own[name]
         if of_rows and item is not None:
-            item = item[rows] if item.__class__ is np.ndarray else _take_rows(item, rows)
+            item = item[rows] if item.__class__ is np.ndarray else _take_epochs(item, rows)
         members[name] = item
     return _make(type(value), members)
 
