@@ -15,8 +15,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,9 +32,9 @@ from railfix.core.errors import OutputError, SettingsError
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
 from railfix.live.console import SessionLog
 from railfix.live.engine import LiveOutput
-from railfix.live.forms import etcs_form
+from railfix.live.forms import etcs_form, forms
 from railfix.live.settings import LiveSettings
-from railfix.live.sinks import Outlet, open_sink
+from railfix.live.sinks import MqttTarget, Outlet, open_sink
 from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of
 
@@ -269,6 +271,28 @@ def test_mqtt_broker_that_goes_away_and_comes_back(tmp_path: Path) -> None:
     finally:
         process.terminate()
         process.wait(10)
+
+
+def test_mqtt_connection_that_breaks_while_a_message_is_handed_over() -> None:
+    """paho reports it by the return code, and raises RuntimeError once such a message is asked for."""
+    client = pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed")
+    broken, codes = client.MQTT_ERR_NO_CONN, []
+
+    def publish(*_: object, **__: object) -> Any:
+        info = client.MQTTMessageInfo(1)
+        info.rc = codes.pop(0)
+        return info
+
+    target = object.__new__(MqttTarget)
+    target.form, target.topic, target._waiting, target._sent = forms(LiveSettings())["json"], "x", 5, deque()
+    target._client = SimpleNamespace(is_connected=lambda: True, publish=publish)
+    codes += [0, broken, 0, 0]
+    target.send(output(1))
+    with pytest.raises(OutputError, match="the broker is not connected"):
+        target.send(output(2))
+    target.send(output(3))
+    target.send(output(4))
+    assert len(target._sent) == 3
 
 
 def test_mqtt_broker_that_asks_for_a_password(tmp_path: Path) -> None:

@@ -195,14 +195,17 @@ class MqttTarget:
         data = whole_message(self.form, output)
         if not data:
             return
-        while self._sent and self._sent[0].is_published():
-            self._sent.popleft()
         if not self._client.is_connected():
             self._sent.clear()
             raise OutputError("the broker is not connected")
+        while self._sent and self._sent[0].is_published():
+            self._sent.popleft()
         if len(self._sent) >= self._waiting:
             raise OutputError("the broker does not keep up")
-        self._sent.append(self._client.publish(self.topic, data, qos=0))
+        sent = self._client.publish(self.topic, data, qos=0)
+        if sent.rc:  # the connection broke since
+            raise OutputError("the broker is not connected")
+        self._sent.append(sent)
 
     def close(self) -> None:
         """Send what is left within `_LEFT_S`, and disconnect."""
