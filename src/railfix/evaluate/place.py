@@ -22,7 +22,7 @@ from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.trajectory import Trajectory, find_segments_near, short_way_m
+from railfix.track.trajectory import Trajectory, find_segments_near, short_distance_m
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 
@@ -105,7 +105,7 @@ def along_track_error(
     ways = arc_m[at][passes.position] - trajectory.arc_m[passes.segment] - passes.foot_m
     signed = np.concatenate([arc_m[at] - nearest_arc, ways[passing]])
     owner = np.concatenate([np.arange(len(at)), passes.position[passing]])
-    signed = short_way_m(signed, trajectory.turn_m)
+    signed = short_distance_m(signed, trajectory.turn_m)
     order = np.lexsort((np.abs(signed), owner))
     first = order[np.flatnonzero(np.r_[True, owner[order][1:] != owner[order][:-1]])]
     error[at[owner[first]]] = signed[first]
@@ -200,8 +200,10 @@ def compute_errors(
                 )  # what was given is that of the run
             return PlaceErrors(
                 method="chainage",
-                error_m=short_way_m(answers.chainage_m - answers.reference_chainage_m, turn),
-                conventional_error_m=short_way_m(answers.conventional_chainage_m - answers.reference_chainage_m, turn),
+                error_m=short_distance_m(answers.chainage_m - answers.reference_chainage_m, turn),
+                conventional_error_m=short_distance_m(
+                    answers.conventional_chainage_m - answers.reference_chainage_m, turn
+                ),
                 distance_m=np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1),
                 reference_chainage_m=answers.reference_chainage_m,
                 notes=(f"{antenna}: the line is closed, errors are the short way round",) if np.isfinite(turn) else (),
@@ -264,7 +266,7 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
         count = int((known & ~with_chainage).sum())
         return f"the reference has no chainage at {count} of {int(known.sum())} epochs", False
     point = run.chainage_of.get(antenna, "antenna")
-    difference = np.abs(short_way_m(answers.chainage_m - answers.reference_chainage_m, run.turn_m(antenna)))
+    difference = np.abs(short_distance_m(answers.chainage_m - answers.reference_chainage_m, run.turn_m(antenna)))
     apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
     both = np.isfinite(difference) & np.isfinite(apart)
     off = float(np.median(np.abs(difference - apart)[both])) if both.any() else 0.0

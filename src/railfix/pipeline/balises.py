@@ -18,7 +18,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, dataclass, join_row
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises
-from railfix.track.trajectory import Trajectory, short_way_m
+from railfix.track.trajectory import Trajectory, short_distance_m
 from railfix.tracking import BaliseEpochs, Tracked
 
 #: An identity read again within this time is the same passing [s]: a second balise of a group, or a train that stands.
@@ -205,13 +205,13 @@ def _judge(
         if mark < 0:
             wrong.append(own)
         elif near:
-            error = float(short_way_m(arcs_m[mark] - place, turn_m))
+            error = float(short_distance_m(arcs_m[mark] - place, turn_m))
             spread = np.sqrt(sigma**2 + np.fmax(readings.sigma_m[k], limits.sigma_m) ** 2 + listed.sigma_m[mark] ** 2)
             if abs(error) <= _CONTRADICTION_SIGMAS * spread:
                 read[mark] = at
                 right.append((at, place))
                 continue
-            real = np.where(listed.virtual, np.nan, np.abs(short_way_m(arcs_m - place, turn_m)))
+            real = np.where(listed.virtual, np.nan, np.abs(short_distance_m(arcs_m - place, turn_m)))
             here = "" if np.isnan(real).all() else str(listed.name[np.nanargmin(real)])
             chainage = float(listed.chainage_m[mark])
             wrong.append(replace(own, verdict=CONTRADICTS, chainage_m=chainage, read_error_m=error, here=here))
@@ -229,7 +229,7 @@ def _pass(
 ) -> tuple[list[Passing], PassingState]:
     """Return the passings that ended, and the state after."""
     level = np.where(np.isfinite(values[:, 3]), values[:, 3], np.inf)[:, None]
-    ahead = short_way_m(arcs_m - values[:, :1], turn_m)
+    ahead = short_distance_m(arcs_m - values[:, :1], turn_m)
     far = np.abs(ahead) > 0.25 * turn_m
     side = np.where(far, 0, np.where(ahead > level, -1, np.where(ahead < -level, 1, 0)))
     crossed = np.zeros(ahead.shape, dtype=np.bool_)

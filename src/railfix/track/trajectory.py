@@ -28,7 +28,7 @@ _FIRST_CANDIDATES = 6  #: Samples examined in the first round; four times as man
 _CHUNK = 2_000_000  #: Positions times candidates processed at once.
 
 
-def short_way_m(difference_m: Floats, turn_m: float) -> Floats:
+def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
     """Return differences of places the short way round a closed line of length `turn_m` (infinite: open)."""
     return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
 
