@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Masks, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Masks
 from railfix.core.epoch_rows import OnDemand
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds

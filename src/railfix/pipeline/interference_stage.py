@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, copy_with, dataclass, read_only
+from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, copy_with, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.epoch_rows import join_epochs, take_epochs
 from railfix.core.reasons import Reason, Status

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Floats, Indices, Masks, copy_with, dataclass
+from railfix.core.arrays import Codes, Floats, Indices, Masks, copy_with
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, Status

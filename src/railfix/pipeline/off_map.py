@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Masks, dataclass
+from railfix.core.arrays import Datetimes, Masks
 from railfix.core.timescale import seconds
 
 _NEVER: Final = np.datetime64("NaT", "ns")

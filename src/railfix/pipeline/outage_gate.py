@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.tracking import Line

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Strings, dataclass
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Strings
 from railfix.core.epoch_rows import OnDemand
 from railfix.core.reasons import Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text

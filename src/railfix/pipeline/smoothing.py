@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, dataclass, join_rows
+from railfix.core.arrays import Datetimes, Floats, join_rows
 from railfix.tracking import (
     BackwardInformation,
     GnssEpochs,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, dataclass, patch_rows
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status

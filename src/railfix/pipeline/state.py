@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.tables import NotebookTable
 from railfix.pipeline.base_station import BaseState
 from railfix.pipeline.carrier_stage import CarrierState

@@ -7,13 +7,14 @@ each antenna, and what they return is joined.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, dataclass
+from railfix.core.arrays import Floats, Indices
 from railfix.core.epoch_rows import EVERY, join_epochs
 from railfix.gnss.observations import Observations, stack_parts
 from railfix.positioning.section_search import SearchIndex
