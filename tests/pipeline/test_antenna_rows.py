@@ -20,8 +20,8 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline import processor as processing
 from railfix.pipeline.antennas import filter_verdicts, position_verdicts
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import correct_ranges
-from railfix.pipeline.processor import EpochProcessor, Models
+from railfix.pipeline.corrected_ranges import Models, correct_ranges
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations

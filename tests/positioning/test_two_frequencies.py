@@ -20,7 +20,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.channels import signal_delays
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.frequency_stage import NAME
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.positioning.two_frequencies import (
     Combined,
     SecondCodes,

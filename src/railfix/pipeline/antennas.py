@@ -193,7 +193,7 @@ def apply_wheel_sign(
         if wheel is None or found is None or not wheel.parted.any():
             continue
         found = replace(found, causes=np.where(wheel.parted, found.causes | int(Sign.WHEEL_PARTS), found.causes))
-        status = with_statuses(result.status, found.suspicion)
+        status = with_statuses(result.status, [found.suspicion])
         after[name] = copy_with(result, interference=found, status=status)
     return after
 

@@ -218,8 +218,14 @@ def _on_all_epochs(
     return every, after
 
 
-def with_statuses(status: Codes, kind: Codes) -> Codes:
-    """Return the statuses of positions with those of interference where they outrank, shape (T,)."""
+def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
+    """Return the statuses of positions (T,) with those of interference, where they outrank.
+
+    `suspected`: `Suspicion` of the epochs of each antenna, one after the other; empty where that is off.
+    """
+    if not suspected:
+        return status
+    kind = np.concatenate(suspected)
     jammed = (kind == int(Suspicion.JAMMING_SUSPECTED)) & (status == int(Status.OK))
     spoofed = (kind == int(Suspicion.SPOOFING_SUSPECTED)) & _UNDER_SPOOFING[status]
     status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)

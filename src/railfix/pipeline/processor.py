@@ -66,8 +66,6 @@ from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-__all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "ScreenedChunk", "SolvedChunk", "State"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenedChunk:
@@ -318,14 +316,13 @@ class EpochProcessor:
         interference, signs = judge_interference(
             corrected, single, antennas, [own.interference for own in own_states], self.config.interference
         )
-        if known := [own.suspicion for own in interference if own is not None]:
-            solution = copy_with(solution, status=with_statuses(solution.status, np.concatenate(known)))
+        status = with_statuses(solution.status, [own.suspicion for own in interference if own is not None])
         own_states = [copy_with(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         araim = compute_araim(
             corrected, solution.arc_m, solution.noise_scale, solution.place.constrained.section, antennas,
             self._support, self.config,
         )  # fmt: skip
-        solution = copy_with(solution, araim=araim)
+        solution = copy_with(solution, status=status, araim=araim)
         results = self._results(antennas, corrected, solution, interference, screened)
         solved = SolvedChunk(screened=screened, results=results, ranges=corrected, off_map=solution.off_map)
         return solved, copy_with(state, antennas={**state.antennas, **dict(zip(names, own_states, strict=True))})
