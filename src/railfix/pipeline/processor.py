@@ -175,7 +175,7 @@ class EpochProcessor:
         )
         self._track, self.units, self.balises = track, stations.units, stations.balises
         self._features: dict[str, LineFeatures] = {}
-        self._before_filter, self._lacking = FilterState(), self._inactive_notes()
+        self._lacking = self._inactive_notes()
 
     @cached_property
     def _threads(self) -> ThreadPoolExecutor:
@@ -408,7 +408,7 @@ class EpochProcessor:
             return along_track(
                 take_epochs(solved.ranges, rows),
                 filter_inputs(solved.results[name], solved.off_map[rows], self.config.map_offset),
-                self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
+                self.trajectories[name], self.config, state.fusion.get(name) or FilterState(),
                 samples=sensors, references=self._line_references(name, sensors),
             )  # fmt: skip
 
