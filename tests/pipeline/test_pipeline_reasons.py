@@ -55,7 +55,7 @@ def all_are(found: AntennaResult, status: Status) -> None:
 
 
 def line(points_ecef_m: np.ndarray) -> dict[str, Trajectory]:
-    return {"front": Trajectory.from_track(Track.from_ecef(points_ecef_m))}
+    return {"front": Trajectory.from_antenna_path(Track.from_ecef(points_ecef_m))}
 
 
 @pytest.mark.requirement("A3")

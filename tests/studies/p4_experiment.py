@@ -89,7 +89,7 @@ def line_between(first_ecef_m: Floats, last_ecef_m: Floats, *, spacing_m: float 
     latitude, longitude, _ = geodetic_from_ecef(first_ecef_m + share[:, None] * (last_ecef_m - first_ecef_m))
     heights = geodetic_from_ecef(np.stack([first_ecef_m, last_ecef_m]))[2]
     height = heights[0] + share * (heights[1] - heights[0])
-    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(latitude, longitude, height)))
+    return Trajectory.from_antenna_path(Track.from_ecef(ecef_from_geodetic(latitude, longitude, height)))
 
 
 def two_points(station_ecef_m: Floats, beside_m: float) -> tuple[Floats, Floats]:
