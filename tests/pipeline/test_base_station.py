@@ -20,8 +20,9 @@ from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
 from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
-from railfix.pipeline.results import State
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.state import State
 from railfix.ranges.base_station import BaseErrors
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory

@@ -23,7 +23,7 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.raim import Outcome, RaimLimits
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.run.processor import make_processor
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory

@@ -16,8 +16,9 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import timedelta
 from railfix.evaluate import evaluate_run
 from railfix.io.reference_log import AntennaReference
-from railfix.pipeline.filter_result import Replay, ReturnState, gated_codes, smooth
+from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.pipeline.smoothing import Replay, smooth
 from railfix.positioning.normal_equations import constrained_position, single_point
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
 from railfix.run.inputs import TrackReading

@@ -21,7 +21,8 @@ from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
-from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk, State
+from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk
+from railfix.pipeline.state import State
 from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
