@@ -22,7 +22,7 @@ from railfix.live.forms import cbor_bytes, forms, json_bytes
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
 from railfix.live.train_ends import CHANGED_ENDS_M, RunningEnd, TrainFrame
-from railfix.pipeline.results import State
+from railfix.pipeline.state import State
 from railfix.simulate.demonstration import demo_files
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import AntennaOffset, Vehicle
@@ -147,12 +147,16 @@ def test_the_true_ends_are_inside_the_bounds_in_every_message_of_every_form(
     assert np.abs(np.diff(places)).max() < 6.0  # no jump by the 18.2 m between the antennas
 
 
+def without_vehicle(path: Trajectory) -> Trajectory:
+    """The path of an antenna of which nothing else is known."""
+    return replace(path, body_chainage_m=None, front_end_m=None, rear_end_m=None, antenna_ahead_m=0.0)
+
+
 @pytest.mark.requirement("A8")
 def test_what_is_unknown_has_a_reason_of_its_own_and_the_bounds_cover_it() -> None:
     """Without a vehicle file nothing but the antenna's own place is known; more becomes known with each setting."""
     journey = ride("rising", slice(300, 330, 10))
-    plain = {"body_chainage_m": None, "front_end_m": None, "rear_end_m": None, "antenna_ahead_m": 0.0}
-    bare = {"front": replace(journey.paths["front"], **plain)}  # type: ignore[arg-type]
+    bare = {"front": without_vehicle(journey.paths["front"])}
     alone = Ride(paths=bare, logs={"front": journey.logs["front"]}, middle_m={})
     everything = Unknown.FACING | Unknown.FRONT_END | Unknown.LENGTH
     for values, unknown in (
@@ -183,7 +187,7 @@ def test_what_is_unknown_has_a_reason_of_its_own_and_the_bounds_cover_it() -> No
 def test_without_a_vehicle_file_the_place_is_that_of_the_first_antenna_alone() -> None:
     """How far the antennas are apart is not known: the second one says nothing of the first one's place."""
     journey = ride("rising", slice(300, 360, 10))
-    track = railfix.Trajectory.from_track(railfix.read_track([demo_files()["track"]]))
+    track = without_vehicle(journey.paths["front"])
     alone = replace(journey, paths={"front": track, "rear": track})
     outputs = list(outputs_of(alone, LONG, without={"front": slice(4, 6), "rear": slice(0)}))
     placed = [o.place.antenna for o in outputs if o.place is not None and o.message.chainage_cm is not None]

@@ -15,7 +15,7 @@ from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations
 from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
-from railfix.pipeline.processor import Result
+from railfix.pipeline.results import Result
 from railfix.tracking import TrackStatus
 from railfix.tracking.result import is_bounded
 from signal_attacks import Scene

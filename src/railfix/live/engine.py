@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
@@ -27,7 +26,8 @@ from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import merge_navigation
-from railfix.pipeline.results import Result, State
+from railfix.pipeline.results import Result
+from railfix.pipeline.state import State
 from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].
@@ -58,7 +58,8 @@ class EngineState:
     done_ns: int  #: Time tag of the last epoch, GPS time since 1980; 0 before the first.
     last_tag: Mapping[str, int]  #: Last time tag of each antenna.
     sequence: int  #: Number of the last message, or one that no message has reached when the next state is saved.
-    running: RunningEnd = RunningEnd(direction=0)  #: Direction in which the train's front end looks.
+    #: Direction in which the train's front end looks.
+    running: RunningEnd = field(default_factory=lambda: RunningEnd(direction=0))
 
 
 @dataclass(frozen=True, kw_only=True)

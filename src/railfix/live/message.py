@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, Final, TypeGuard
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
