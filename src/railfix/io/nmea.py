@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, dataclass
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, BrokenLines, FilePath, read_text_lines
 from railfix.core.geodesy import ecef_from_geodetic
