@@ -53,12 +53,12 @@ def convert_logs(
     for target in (out, nav_out):
         if target is not None:
             check_output_file(target, overwrite=overwrite, inputs=logs)
-    date = (reading or LogReading()).instant
+    reading = reading or LogReading()
     version: Literal["3.04", "4.02"] = "3.04" if rinex == "3" else "4.02"
     lines: list[str] = []
     if out is not None:
-        header, epochs, skipped = _scan(logs, date)
-        pieces = (piece for piece in scan_observations(logs, date=date) if len(piece))
+        header, epochs, skipped = _scan(logs, reading)
+        pieces = (piece for piece in scan_observations(logs, **reading.arguments) if len(piece))
         observables = {
             system: [kind + signal for signal in signals for kind in "CLDS"]
             for system, signals in header.signals.items()
@@ -67,7 +67,7 @@ def convert_logs(
         lines.append(f"wrote {out}: {epochs:,} epochs, RINEX {version}")
         lines += [f"passed over: {count:,} {what}" for what, count in sorted(skipped.items())]
     if nav_out is not None:
-        navigation, left_out = with_written_messages(read_navigation(logs, date=date), version)
+        navigation, left_out = with_written_messages(read_navigation(logs, **reading.arguments), version)
         write_navigation(navigation, nav_out, version=version)
         records = len(navigation.kepler) + len(navigation.glonass)
         lines.append(f"wrote {nav_out}: {records:,} ephemerides, RINEX {version}")
@@ -77,12 +77,12 @@ def convert_logs(
     return lines
 
 
-def _scan(logs: tuple[Path, ...], date: np.datetime64 | None) -> tuple[ObservationHeader, int, Counter[str]]:
+def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeader, int, Counter[str]]:
     """Return the header with the signals of the whole log, number of epochs, and what is passed over."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
     header, epochs, skipped = ObservationHeader(), 0, Counter[str]()
-    for piece in scan_observations(logs, date=date):
+    for piece in scan_observations(logs, **reading.arguments):
         header = piece.header if not epochs else header
         channels |= piece.header.glonass_channel
         epochs += len(piece)
