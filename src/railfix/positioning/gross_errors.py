@@ -1,0 +1,296 @@
+"""Detect grossly wrong codes before anything is fitted to all of them.
+
+A least-squares position absorbs a share of every error: one code 10 km off moves it by kilometres, to where no
+atmospheric model and no map is valid, and its residuals accuse other satellites. The position with the least sum of
+absolute residuals is not moved further by an error that grows: the sum is convex, and each range beyond the others
+pulls with the same force.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Integers, Masks, kernel_array
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint, normal_equations
+from railfix.track.trajectory import Trajectory
+
+#: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].
+GROSS_M: Final = 100.0
+#: Largest median residual of the codes that are left: they agree with each other [m].
+AGREEING_M: Final = 30.0
+#: Redundant ranges that are left after an exclusion in space, so that the rest is still checked.
+_LEFT_IN_SPACE: Final = 3
+#: Where only one or two are left, the other exclusions must fit worse by this factor.
+_CLEARER: Final = 5.0
+#: Scales of the residuals from which on a corrected code disagrees with the others.
+_DISAGREE: Final = 5.0
+_NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
+#: Iterations; the least residual that divides a weight, in sigmas, in the first ten of them and later.
+_STEPS: Final = 60
+_COARSE_STEPS: Final = 10
+_COARSE, _FINE = 1.0, 0.3
+_LONGEST_STEP_M: Final = 3e6
+_SETTLED_M: Final = 0.3
+_SINGULAR: Final = 1e-15  #: Determinant of a normal matrix of unit trace.
+
+
+def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
+    """Return the positions with the least sum of absolute weighted residuals, each clock free, shape (T, 3) [m].
+
+    Iteratively reweighted least squares from starts (T, 3) [m] within some thousand kilometres. NaN where the ranges
+    do not determine a position.
+    """
+    place, factor = start_ecef_m.copy(), np.ones(ranges.weight.shape)
+    root = np.sqrt(ranges.weight)
+    going = np.flatnonzero(ranges.n_used - ranges.n_clocks >= 3)
+    place[np.setdiff1d(np.arange(len(place)), going)] = np.nan
+    for k in range(_STEPS):
+        if not len(going):
+            break
+        part = replace(ranges.take(going), weight=kernel_array(ranges.weight[going] * factor[going]))
+        equations = normal_equations(part, place[going])
+        step = _step(equations.matrix, equations.vector)
+        place[going] += step
+        residual = equations.residual_m - np.einsum("tim,ti->tm", equations.design, step)
+        least = _COARSE if k < _COARSE_STEPS else _FINE
+        factor[going] = 1.0 / np.maximum(np.abs(residual) * root[going], least)
+        going = going[np.linalg.norm(step, axis=1) > _SETTLED_M]
+    return place
+
+
+def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
+    """Return residuals at positions (T, 3) [m], each clock at the median of its ranges; NaN where not used, (T, M)."""
+    even = replace(ranges, weight=kernel_array((ranges.weight > 0).astype(np.float64)), ties=None)
+    residual = normal_equations(even, np.nan_to_num(place_ecef_m)).residual_m
+    value = np.where(ranges.weight > 0, residual, np.nan)
+    for group in ranges.groups:
+        value[:, group] -= _median(value[:, group])[:, None]
+    return value
+
+
+def _median(values: Floats) -> Floats:
+    """Return the median of each row, NaN left out; 0 for a row without any, shape (T,)."""
+    some = np.isfinite(values).any(axis=1)
+    middle = np.zeros(len(values))
+    middle[some] = np.nanmedian(values[some], axis=1)
+    return middle
+
+
+def _freedom(ranges: Ranges, unknowns: int) -> Integers:
+    return np.asarray(ranges.n_used - ranges.n_clocks - unknowns, dtype=np.int64)
+
+
+def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
+    """Return the raw codes that are off by more than `GROSS_M`, shape (T, M), where the others agree on a position.
+
+    Three redundant ranges are left and agree. With fewer, one range is accused where leaving it out makes the others
+    agree, and leaving out any other one does not.
+    """
+    place = least_absolute(ranges, start_ecef_m)
+    residual = residuals_at(ranges, place)
+    gross = np.abs(residual) > GROSS_M
+    rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
+    located = np.isfinite(place[:, 0])
+    agree = _median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M
+    clear = (_freedom(rest, 3) >= _LEFT_IN_SPACE) & agree & located
+    found = gross & clear[:, None]
+    few = np.flatnonzero(gross.any(axis=1) & ~clear & located & (_freedom(ranges, 3) >= 2))
+    if len(few):
+        found[few] = _one_of_few(ranges.take(few), place[few])
+    return found
+
+
+def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
+    """Return the one range without which the others agree within `AGREEING_M`, shape (T, M); none where two explain."""
+    epochs, channels = ranges.weight.shape
+    epoch, channel = np.nonzero(ranges.weight > 0)
+    each = ranges.take(epoch)
+    weight = each.weight.copy()
+    weight[np.arange(len(epoch)), channel] = 0.0
+    each = replace(each, weight=weight)
+    place = start_ecef_m[epoch]
+    for _ in range(_COARSE_STEPS):
+        equations = normal_equations(each, place)
+        place = place + _step(equations.matrix, equations.vector)
+    even = replace(each, weight=kernel_array((each.weight > 0).astype(np.float64)))
+    freedom = _freedom(each, 3)
+    square = normal_equations(even, np.nan_to_num(place)).wsse / np.maximum(freedom, 1)
+    size = np.full((epochs, channels), np.inf)
+    size[epoch, channel] = np.where((freedom >= 1) & np.isfinite(place[:, 0]), np.sqrt(square), np.inf)
+    best = np.argmin(size, axis=1)
+    rows = np.arange(epochs)
+    least = size[rows, best]
+    others = size.copy()
+    others[rows, best] = np.inf
+    found = np.zeros((epochs, channels), dtype=np.bool_)
+    found[rows, best] = (least < AGREEING_M) & (others.min(axis=1) > np.maximum(_CLEARER * least, AGREEING_M))
+    return found
+
+
+def _step(matrix: Floats, vector: Floats) -> Floats:
+    """Return the steps of normal equations, shape (T, 3) [m]; NaN where they are singular."""
+    trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
+    singular = ~(np.linalg.det(matrix / np.maximum(trace, 1e-300)) > _SINGULAR)
+    solvable = np.where(singular[:, None, None], np.eye(3), matrix)
+    step = np.linalg.solve(solvable, vector[..., None])[..., 0]
+    step = np.where(singular[:, None], np.nan, step)
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    return np.asarray(step * np.minimum(1.0, _LONGEST_STEP_M / np.maximum(length, 1.0)))
+
+
+def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
+    """Return the corrected ranges that disagree with most others by their sigmas, shape (T, M).
+
+    Residuals at the position of least absolute residuals, beyond `_DISAGREE` robust scales (one sigma at least).
+    """
+    place = least_absolute(ranges, start_ecef_m)
+    white = np.abs(residuals_at(ranges, place)) * np.sqrt(ranges.weight)
+    freedom = _freedom(ranges, 3)
+    spread = _median(white) * np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN
+    found = white > _DISAGREE * np.maximum(1.0, spread)[:, None]
+    rest = replace(ranges, weight=np.where(found, 0.0, ranges.weight))
+    enough = (_freedom(rest, 3) >= _LEFT_IN_SPACE) & np.isfinite(place[:, 0])
+    return np.asarray(found & enough[:, None])
+
+
+#: Distance between the points of a line that are tried, and between those around the best one [m].
+_COARSE_M: Final = 100.0
+_FINE_M: Final = 12.5
+#: Points times epochs times channels that are computed at once.
+_BLOCK: Final = 2_000_000
+#: Other accusations must cost so much more: a share of one gross error.
+_CLEAR: Final = 0.7
+#: Redundant ranges that agree with a point of the line.
+_LEFT_ON_LINE: Final = 2
+
+
+class LineScan(NamedTuple):
+    """Best points of a line for raw ranges of T epochs by M channels."""
+
+    arc_m: Floats  #: Point with the least cost, shape (T,).
+    gross: Masks  #: Ranges that are off there by more than `GROSS_M`, shape (T, M).
+    agreed: Masks  #: Redundant ranges agree with the point, shape (T,).
+    clear: Masks  #: Points that accuse other ranges cost clearly more, shape (T,).
+
+
+def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
+    """Find the points of a line that most raw ranges agree on.
+
+    The cost of a point is the sum of the residuals about the median of their clock, each counted with `GROSS_M` at
+    most: a larger error costs no more. Points `_COARSE_M` apart are tried, then those around the best one.
+    """
+    epochs = len(ranges)
+    nodes = np.linspace(line.arc_m[0], line.arc_m[-1], max(int(np.ceil(np.ptp(line.arc_m) / _COARSE_M)), 1) + 1)
+    steps = np.arange(-8, 9) * _FINE_M
+    arc, gross = np.empty(epochs), np.empty(ranges.weight.shape, dtype=np.bool_)
+    residual, clear = np.empty(ranges.weight.shape), np.empty(epochs, dtype=np.bool_)
+    count = max(_BLOCK // (len(nodes) * max(ranges.weight.shape[1], 1)), 1)
+    for first in range(0, epochs, count):
+        rows = slice(first, min(first + count, epochs))
+        part = ranges.take(np.arange(rows.start, rows.stop))
+        coarse = _line_residuals(part, np.broadcast_to(line.at_arc(nodes), (len(part), len(nodes), 3)))
+        cost = _capped_cost(coarse)
+        near = np.clip(nodes[cost.argmin(axis=1)][:, None] + steps, nodes[0], nodes[-1])
+        fine = _line_residuals(part, line.at_arc(near.ravel()).reshape(*near.shape, 3))
+        own = _capped_cost(fine)
+        each, best = np.arange(len(part)), own.argmin(axis=1)
+        arc[rows], residual[rows] = near[each, best], fine[each, best]
+        gross[rows] = np.abs(residual[rows]) > GROSS_M
+        others = ((np.abs(coarse) > GROSS_M) & ~gross[rows][:, None]).any(axis=2)
+        rival = np.where(others, cost, np.inf).min(axis=1)
+        clear[rows] = rival - own[each, best] > _CLEAR * GROSS_M
+    rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
+    agreed = (_freedom(rest, 1) >= _LEFT_ON_LINE) & (_median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M)
+    return LineScan(arc, gross, agreed, clear)
+
+
+def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
+    """Return residuals at N places of each epoch, (T, N, 3) [m], each clock at its median, (T, N, M); NaN: not used."""
+    used, satellite = ranges.weight > 0, ranges.sat_ecef_m
+    square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
+    square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]
+    turn = satellite[:, None, :, 0] * place_ecef_m[..., 1, None] - satellite[:, None, :, 1] * place_ecef_m[..., 0, None]
+    value = ranges.code_m[:, None] - np.sqrt(square) - EARTH_ROTATION_RATE / SPEED_OF_LIGHT * turn
+    value = np.where(used[:, None], value, np.inf)
+    for group in ranges.groups:
+        n = used[:, group].sum(axis=1)
+        ordered = np.sort(value[..., group], axis=2)
+        middle = [np.maximum(k, 0)[:, None, None] for k in ((n - 1) // 2, n // 2)]
+        low, high = (np.take_along_axis(ordered, np.minimum(k, max(ordered.shape[2] - 1, 0)), axis=2) for k in middle)
+        some = (n > 0)[:, None, None]
+        value[..., group] -= np.where(some, 0.5 * (np.where(some, low, 0.0) + np.where(some, high, 0.0)), 0.0)
+    return np.asarray(np.where(used[:, None], value, np.nan))
+
+
+def _capped_cost(residual_m: Floats) -> Floats:
+    """Return the sum of absolute residuals, each with `GROSS_M` at most, shape (T, N)."""
+    return np.asarray(np.nansum(np.minimum(np.abs(residual_m), GROSS_M), axis=2))
+
+
+class GrossErrors(NamedTuple):
+    """Gross errors of raw ranges, T epochs by M channels."""
+
+    gross: Masks  #: Ranges that are grossly wrong, shape (T, M).
+    #: Arc of the best point of the line where nothing tells which range is grossly wrong; NaN elsewhere; shape (T,).
+    unsure_arc_m: Floats
+
+
+#: Root of the sum of squared raw residuals up to which an epoch is not examined; distance of its position from the
+#: line from which on it is [m].
+_QUIET_M: Final = 30.0
+_BESIDE_M: Final = 1000.0
+
+
+def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> GrossErrors:
+    """Find grossly wrong codes among raw ranges; `point`: their 3-D positions by least squares.
+
+    Epochs with large residuals, or positions far from the line, are examined: by the point of the line that most ranges
+    agree on, where redundant ranges do and no other accusation costs about as little; where the ranges agree with no
+    point of the line, in space.
+    """
+    gross, unsure = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
+    located = np.isfinite(point.ecef_m[:, 0])
+    suspect = ~located | ~(np.sqrt(np.nansum(point.residual_m**2, axis=1)) < _QUIET_M)
+    for index, rows in antennas.split(np.flatnonzero(located)):
+        suspect[rows] |= np.asarray(index.tree.query(point.ecef_m[rows])[0]) > _BESIDE_M
+    suspect &= _freedom(ranges, 1) > 0
+    for index, rows in antennas.split(np.flatnonzero(suspect)):
+        part = ranges.take(rows)
+        scan = scan_line(part, index.trajectory)
+        sure = scan.agreed & scan.clear
+        gross[rows[sure]] = scan.gross[sure]
+        unsure[rows[~sure]] = scan.arc_m[~sure]
+        left = np.flatnonzero(~scan.agreed)
+        if len(left):
+            found = gross_in_space(part.take(left), np.repeat(index.middle_ecef_m[None], len(left), axis=0))
+            gross[rows[left]] = found
+            unsure[rows[left[found.any(axis=1)]]] = np.nan
+    return GrossErrors(gross, unsure)
+
+
+def gross_alone(ranges: Ranges, clock_m: Floats, ties: ClockTies) -> Masks:
+    """Return the ranges that are alone on their clock and off by more than `GROSS_M` by the known biases, shape (T, M).
+
+    Nothing contradicts such a range while its clock is free. `clock_m` are the clocks of a position with free clocks,
+    shape (T, G); the common clock is their median by satellites, less the biases.
+    """
+    found = np.zeros(ranges.weight.shape, dtype=np.bool_)
+    count = np.add.reduceat((ranges.weight > 0).astype(np.int64), ranges.starts, axis=1)
+    known = (ties.sigma_m < UNTIED_M) & np.isfinite(clock_m)
+    rows = np.flatnonzero((known & (count == 1)).any(axis=1) & (known & (count > 1)).any(axis=1))
+    if not len(rows):
+        return found
+    common = np.where(known, clock_m - ties.offset_m, np.inf)[rows]
+    order = np.argsort(common, axis=1)
+    weight = np.take_along_axis(np.where(known, count, 0)[rows], order, axis=1).cumsum(axis=1)
+    middle = (2 * weight >= weight[:, -1:]).argmax(axis=1)
+    median = np.take_along_axis(common, order, axis=1)[np.arange(len(rows)), middle]
+    wrong = known[rows] & (count[rows] == 1) & (np.abs(common - median[:, None]) > GROSS_M)
+    for g, group in enumerate(ranges.groups):
+        found[rows, group] = wrong[:, g, None] & (ranges.weight[rows, group] > 0)
+    return found
