@@ -282,8 +282,12 @@ def test_names_of_tracks_do_not_lie_over_one_another_and_come_with_the_zoom(tmp_
         labels = "Number(document.querySelector('figure').dataset.labels)"
         some = int(shown.evaluate(labels))
         assert 0 < some < 39
-        middle = "{'xaxis.range': [180, 260], 'yaxis.range': [100, 120]}"
-        shown.evaluate(f"Plotly.relayout(document.querySelector('.plot'), {middle})")
+        shown.evaluate(
+            """() => { const plot = document.querySelector("figure").plot;
+            const names = plot.layers.find(layer => layer.kind === "marks");
+            const x = names.x[20], y = names.y[20];
+            Plotly.relayout(plot.div, { "xaxis.range": [x - 20, x + 20], "yaxis.range": [y - 10, y + 10] }); }"""
+        )
         # three or four tracks are in view: each has its name
         shown.wait_for_function(f"{labels} <= 4")
         assert int(shown.evaluate(labels)) >= 1
