@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from helpers.pipeline_cases import clean_navigation, clean_observations
 from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import read_positions
+from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.config import Config
+from railfix.pipeline.locate import locate
+from railfix.pipeline.received import known_from_start
+from railfix.run.locate import reasons_text, solution_text
 
 pytestmark = pytest.mark.requirement("A6")
 
@@ -43,6 +50,22 @@ def test_log_without_navigation_of_its_day_is_a_sentence(recordings: Path, tmp_p
     )
     assert result.exit_code != 0
     assert not (tmp_path / "x.pos").exists()
+
+
+def test_epochs_without_position_are_comments_with_their_reason(tmp_path: Path) -> None:
+    """The second of three epochs has two satellites."""
+    whole = clean_observations()["front"][:3]
+    few = np.zeros(whole.code_m.shape, dtype=np.bool_)
+    few[1, np.isin(whole.satellite, ["G10", "G15"], invert=True)] = True
+    observed = replace(whole, code_m=np.where(few, np.nan, whole.code_m))
+    config = Config()
+    found = locate(observed, known_from_start(config, navigation=clean_navigation()), config, ChannelBook(config))
+    assert reasons_text(found) == "1 too few usable satellites"
+    path = tmp_path / "made.pos"
+    path.write_text(solution_text(found))
+    (comment,) = [line for line in path.read_text().splitlines() if " no position" in line]
+    assert comment == "% 2024/03/05 03:10:00.100 no position: too few usable satellites"
+    assert np.array_equal(read_positions(path).time, whole.time[[0, 2]])
 
 
 def test_gpx_points_have_times_and_geoid_heights(tmp_path: Path) -> None:

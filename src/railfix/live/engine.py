@@ -25,7 +25,8 @@ from railfix.live.stream import FOREVER, Lag, Sensed
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import merge_navigation
-from railfix.pipeline.results import Result, State
+from railfix.pipeline.results import Result
+from railfix.pipeline.state import State
 from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].
