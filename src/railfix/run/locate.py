@@ -19,7 +19,7 @@ from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
-from railfix.io.nmea import read_any_positions
+from railfix.io.positions import read_positions
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
 from railfix.pipeline.channels import ChannelBook
@@ -237,7 +237,7 @@ def survey_files(
         try:
             if ending(path) in POSITION_ENDINGS:
                 of_file = columns if ending(path) == ".csv" else None
-                log = read_any_positions(path, broken_lines=broken_lines, date=date, columns=of_file)
+                log = read_positions(path, broken_lines=broken_lines, date=date, columns=of_file)
                 notes += log.notes
                 runs.append(run_of_log(log, limits))
                 continue
