@@ -19,7 +19,6 @@ from railfix.cli.console import (
     verdict_of_evaluation,
 )
 from railfix.cli.options import (
-    LenientOption,
     OutOption,
     OverwriteOption,
     Without,
@@ -41,6 +40,7 @@ from railfix.ranges.error_model import LARGEST_PRIOR, ErrorModel, FaultRate, wri
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, summary
 from railfix.reference import ReferenceInputs, ReferenceOptions, ReferenceSettings, ReferenceSummary, reference_files
 from railfix.run import read_record
+from railfix.run.inputs import LogReading
 from railfix.run.output import OutputFolder
 from railfix.run.processor import parse_position
 
@@ -298,6 +298,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
             )
 
 
+@from_models
 def cn0_curve(
     observations: Annotated[
         list[Path],
@@ -320,7 +321,7 @@ def cn0_curve(
         ),
     ] = None,
     bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,
-    lenient: LenientOption = False,
+    reading: LogReading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fit the mean C/N0 over elevation of one antenna and receiver.
@@ -337,7 +338,7 @@ def cn0_curve(
     place = None if position is None else parse_position(position, "--position")
     outputs = check_outputs((out, "any"), (plot, "png"), overwrite=overwrite, inputs=[*observations, *nav])
     fitted = cn0_curve_from_log(
-        observations, nav, position_ecef_m=place, fit=fit, broken_lines="count" if lenient else "stop"
+        observations, nav, position_ecef_m=place, fit=fit, **reading.of_observations
     )
     if plot is not None:
         from railfix.report.plots.screens import draw_cn0_curve

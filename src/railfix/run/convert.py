@@ -58,7 +58,7 @@ def convert_logs(
     lines: list[str] = []
     if out is not None:
         header, epochs, skipped = _scan(logs, reading)
-        pieces = (piece for piece in scan_observations(logs, **reading.arguments) if len(piece))
+        pieces = (piece for piece in scan_observations(logs, **reading.of_observations) if len(piece))
         observables = {
             system: [kind + signal for signal in signals for kind in "CLDS"]
             for system, signals in header.signals.items()
@@ -82,7 +82,7 @@ def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeade
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
     header, epochs, skipped = ObservationHeader(), 0, Counter[str]()
-    for piece in scan_observations(logs, **reading.arguments):
+    for piece in scan_observations(logs, **reading.of_observations):
         header = piece.header if not epochs else header
         channels |= piece.header.glonass_channel
         epochs += len(piece)

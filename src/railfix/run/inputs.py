@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import BrokenLines, fingerprint
+from railfix.core.files import BrokenLines, Reader, fingerprint
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.io.position_log import column_names
 from railfix.io.receiver.framing import is_receiver_log, read_head
@@ -312,10 +312,21 @@ class LogReading(Settings):
         name="--lenient",
     )
 
+    reader: Reader = option(
+        "What reads RINEX observation files: railfix, or georinex, an independent reader to compare with, which is "
+        "slower, reads whole files at once, and knows neither events nor broken lines.",
+        "railfix",
+    )
+
     @property
     def arguments(self) -> dict[str, Any]:
-        """Return the arguments of the readers."""
+        """Return the arguments of the readers of positions and navigation."""
         return {"date": self.instant, "broken_lines": self.broken_lines}
+
+    @property
+    def of_observations(self) -> dict[str, Any]:
+        """Return the arguments of the readers of observations."""
+        return {**self.arguments, "reader": self.reader}
 
     @property
     def instant(self) -> np.datetime64 | None:

@@ -235,7 +235,7 @@ class Log:
             start=None if self.start is None else np.datetime64(self.start, "ns"),
             end=None if self.end is None else np.datetime64(self.end, "ns"),
             progress=self._read_to,
-            **self.reading.arguments,
+            **self.reading.of_observations,
         )
         for piece in pieces:
             self.problems += piece.problems
