@@ -337,9 +337,7 @@ def cn0_curve(
     fit = validate(CurveFit, {"bin_deg": bin_deg}, source="--bin")
     place = None if position is None else parse_position(position, "--position")
     outputs = check_outputs((out, "any"), (plot, "png"), overwrite=overwrite, inputs=[*observations, *nav])
-    fitted = cn0_curve_from_log(
-        observations, nav, position_ecef_m=place, fit=fit, **reading.of_observations
-    )
+    fitted = cn0_curve_from_log(observations, nav, position_ecef_m=place, fit=fit, **reading.of_observations)
     if plot is not None:
         from railfix.report.plots.screens import draw_cn0_curve
 
