@@ -15,6 +15,7 @@ import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
+from railfix.core.errors import NoPositionError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
@@ -129,11 +130,14 @@ def run_files(
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
+        verdict = judge_run(record)
+        if not any(antenna.leading.positions for antenna in verdict.antennas):
+            raise NoPositionError(f"not one position is promised: {'; '.join(verdict.lines())}")
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
-    return RunSummary(tally=tally, record=record, verdict=judge_run(record), files=files, wall_s=wall)
+    return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
 
 
 def open_inputs(
