@@ -127,6 +127,7 @@ stations = [{{ name = "West", begin_m = -400, end_m = 300 }}, {{ name = "East", 
 trains = [{{ number = 1, station = "West", track = 1, direction = 1, front_m = 32, length_m = 23.2 }}]
 """)
     (tmp_path / "secret.txt").write_text("a password for the test")
+    (tmp_path / "secret.txt").chmod(0o600)
     files = demo_files()
     log = " ".join(f"--{name} {files[name]}" for name in ("front", "rear", "track", "vehicle", "nav"))
     pipe = pipe.replace("live ...", f"live {log}").replace("10.0.1.1:4433", ports[0]).replace("10.0.2.1:4433", ports[1])
