@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -37,9 +37,6 @@ from railfix.run.verdict import Verdict, judge_run
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
-
-if TYPE_CHECKING:
-    from railfix.run.batch_check import BatchCheck
 
 
 class Progress(Protocol):
@@ -101,7 +98,6 @@ def run_files(
         rows = ResultRows(
             folder=folder, line=line, observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
-            batches=_batches(logs, line) if options.check == "batch" else {},
             passings=balises is not None, replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )  # fmt: skip
         tally = _position(logs, (sensors, base), processor, rows, beside, progress)
@@ -116,7 +112,6 @@ def run_files(
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
             *shorten_notes(rows.balise_notes),
-            *rows.compare_batches(),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
@@ -222,13 +217,6 @@ def _position(
     if written is not None:
         written.result()
     return tally
-
-
-def _batches(logs: Iterable[Antenna], line: OpenedLine) -> dict[str, BatchCheck]:
-    """Return the checks of each antenna; loaded when asked for: 0.03 s."""
-    from railfix.run.batch_check import BatchCheck
-
-    return {name: BatchCheck(trajectory=line.trajectories[name]) for name in logs}
 
 
 def _screen_chunks(
