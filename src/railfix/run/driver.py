@@ -312,7 +312,7 @@ def collect_notes(
     notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [
-            f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
+            f"{name}: screen {screen.name} tested nothing; it needs {screen.needs}"
             for screen in SCREENS
             if antenna.judged.get(screen.name) is False
         ]
@@ -322,7 +322,7 @@ def collect_notes(
         for by, counts in (("single epochs", antenna.lasting), ("the filter", antenna.left_out)):
             notes += [
                 f"{name}: {by} left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
-                "over a minute they contradict all others"
+                "inconsistent with the others for over a minute"
                 for satellite, (count, first) in sorted(counts.items(), key=lambda item: -item[1][0])[:_NAMED]
             ]
         offset = antenna.map_offset
@@ -348,8 +348,8 @@ def _describe_detectable(detectable_m: Floats) -> str:
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
     return (
-        f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
-        f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
+        f"map errors smaller than {across:.0f} m laterally or {up:.0f} m in height cannot be detected; where the "
+        f"ranges are worst, smaller than {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
 
 
