@@ -8,8 +8,9 @@ from pyproj import CRS, Transformer
 
 from frame_cases import FRAMES, ITRF, MOTION, TIME, YEAR, moved
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.crs import HELD, REALISATIONS, SAME, frame_degrees, kind_of_frame, older_datum_note
+from railfix.track.crs import HELD, REALISATIONS, SAME, kind_of_frame
 from railfix.track.frames import points_at
+from railfix.track.georeference import georeference
 
 pytestmark = pytest.mark.requirement("A9")
 
@@ -81,8 +82,9 @@ def test_an_older_datum_goes_to_the_modern_frame_of_its_region(crs: str, frame: 
     y = np.array([(area.south + area.north) / 2.0])
     if CRS(crs).is_projected:
         x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(x, y)
-    assert frame_degrees(crs, x, y, path="map")[2] == frame
-    assert "transformed to" in older_datum_note(crs)[0]
+    place = georeference(crs, x, y, path="map")
+    assert place.frame == frame
+    assert "transformed to" in place.notes[0]
 
 
 @pytest.mark.slow

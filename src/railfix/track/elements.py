@@ -16,8 +16,9 @@ from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Floats, Masks, dataclass
 from railfix.core.errors import InputFileError
-from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, unit_of_grid
-from railfix.track.frames import heights_of_file
+from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, is_in_area, unit_of_grid
+from railfix.track.georeference import Georeference, georeference
+from railfix.track.heights import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 
 #: Share of the change of curvature or cant at a share t of the element, and its integral from 0 (IFC 4.3.2).
@@ -252,16 +253,16 @@ def segment_of_design(
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
     source, heights = f"{path} ({name})", None
-    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1], path=source)
-    _check_length(plan, frame, latitude, longitude, path=source)
+    place = georeference(crs, xy[:, 0], xy[:, 1], path=source)
+    _check_length(plan, place, path=source)
     if profile:
         joints += _check_profile(plan, profile, path=source)
-        heights = heights_of_file(points.height_m + up, latitude, longitude, reading, path=path)
-    radius = np.full(len(latitude), np.inf)
+        heights = heights_of_file(points.height_m + up, place, reading, path=path)
+    radius = np.full(len(xy), np.inf)
     bent = np.abs(curvature) > 1e-9
     radius[bent] = -1.0 / curvature[bent] * scale
     return make_segment(
-        (latitude, longitude, frame),
+        place,
         heights,
         source=source,
         file=path,
@@ -287,11 +288,11 @@ def _check_profile(plan: Sequence[PlanElement], profile: Sequence[ProfileElement
     return (f"{path}: {where}; its last gradients go on",) if left_out > 1.0 else ()
 
 
-def _check_length(plan: Sequence[PlanElement], frame: str, latitude: Floats, longitude: Floats, *, path: str) -> None:
+def _check_length(plan: Sequence[PlanElement], place: Georeference, *, path: str) -> None:
     """Reject an alignment whose length on the map is not that of its design: its grid is another one."""
     designed = sum(element.length_m for element in plan)
-    geod = CRS.from_user_input(frame).get_geod()
-    found = float(geod.line_length(longitude, latitude)) if geod is not None else designed
+    geod = CRS.from_user_input(place.frame).get_geod()
+    found = float(geod.line_length(place.longitude_deg, place.latitude_deg)) if geod is not None else designed
     if abs(found - designed) > LARGEST_SCALE * designed + 0.5:
         raise InputFileError(
             path,

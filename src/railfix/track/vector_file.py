@@ -22,8 +22,9 @@ import numpy as np
 from railfix.core.arrays import Floats, dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, open_stream
-from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights
-from railfix.track.frames import check_height_datum, heights_of_file
+from railfix.track.crs import choose_crs, unit_of_heights
+from railfix.track.georeference import georeference
+from railfix.track.heights import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 
 #: Standard deviation in plan of a track of OpenStreetMap, drawn from aerial pictures, if its file has none [m].
@@ -288,7 +289,7 @@ def plan_segment(
     if crs is None and (np.abs(values[:, :2]) > (360.0, 90.0)).any():
         raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give --crs")
     used = crs or "EPSG:4326"
-    latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1], path=source)
+    place = georeference(used, values[:, 0], values[:, 1], path=source)
     heights = None
     known = np.isfinite(values[:, 2]) if values.shape[1] == 3 else np.zeros(len(values), dtype=np.bool_)
     if known.any() and not known.all():
@@ -298,10 +299,10 @@ def plan_segment(
             "mend them, or write the line without heights",
         )
     if known.any() and values[:, 2].any():
-        heights = heights_of_file(values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source)
-    degrees = latitude, longitude, frame if crs else "EPSG:4979"
+        heights = heights_of_file(values[:, 2] * unit_of_heights(crs), place, reading, path=source)
+    place = place if crs else replace(place, frame="EPSG:4979")
     metadata = {**(stated or {}), "name": name}
-    return make_segment(degrees, heights, source=source, file=path, crs=crs, metadata=metadata)
+    return make_segment(place, heights, source=source, file=path, crs=crs, metadata=metadata)
 
 
 def get_name(row: Mapping[str, Any], *, fallback: str) -> str:
