@@ -70,7 +70,7 @@ def test_an_ensemble_and_a_frame_of_another_name_say_what_they_are_taken_for() -
         ("EPSG:4618", "EPSG:4989"),  # SAD69: South America
         ("EPSG:4272", "EPSG:4959"),  # NZGD49
         ("EPSG:4162", "EPSG:4927"),  # Korean 1985, not Japan
-        ("EPSG:4269", "EPSG:6319"),  # NAD83 as of 1986
+        ("EPSG:4269", "EPSG:4326"),  # NAD83 as of 1986: PROJ has none to NAD83(2011) without its grids
         ("EPSG:31370", "EPSG:4937"),  # Belgian Lambert 72
         ("EPSG:30169", "EPSG:4326"),  # Tokyo: PROJ has none to JGD2011 without its grid, and Korea's is not meant
     ],

@@ -273,7 +273,7 @@ def match_command(
         f"{len(on)} positions, {on.sum()} on a track ({on.mean():.1%}), {(np.abs(matched.offset_m) <= 5.0).mean():.1%} "
         f"within 5 m of it; {(matched.probability < 0.9).sum()} with a probability below 0.9"
     )
-    show_notes(console, [*net.notes, *notes])
+    show_notes(console, dict.fromkeys([*net.notes, *(note for track in net.tracks for note in track.notes), *notes]))
     if picture is not None:
         from railfix.report.plots.network import plot_network
 

@@ -163,6 +163,8 @@ LARGEST_SCALE: Final = 0.01
 MODERN_M: Final = 0.5  #: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
+#: Operations of a worse accuracy are not used [m]; 999 in the EPSG dataset is none.
+WORST_M: Final = 100.0
 #: Parts of the name of an operation of PROJ that change no datum.
 _NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
 Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
@@ -266,18 +268,22 @@ class Operations:
         """Return the most accurate operation that lacks a grid, and how to get that; empty without one."""
         if not self.lacking:
             return ""
-        best = min(self.lacking, key=lambda operation: known_accuracy_m(operation.accuracy))
+        best = min(self.lacking, key=lambda o: (not _is_served(o), known_accuracy_m(o.accuracy)))
         grids = [grid for grid in best.grids if not grid.available]
         names = " and ".join(grid.short_name for grid in grids)
-        of_proj = all("cdn.proj.org" in grid.url for grid in grids)
         get = (
             "; ".join(f"projsync --file {g.short_name}" for g in grids)
-            if of_proj
+            if _is_served(best)
             else f"put it in {get_user_data_dir()}"
         )
         accuracy = f" ({best.accuracy:g} m)" if best.accuracy >= 0.0 else ""
         name = name_operation(best.name, crs)
         return f"{name!r}{accuracy} needs the grid{'s' * (len(grids) > 1)} {names}, not installed ({get})"
+
+
+def _is_served(operation: Any) -> bool:
+    """Return whether PROJ's content delivery network has all grids of an operation."""
+    return all(grid.available or "cdn.proj.org" in grid.url for grid in operation.grids)
 
 
 def name_operation(description: str, crs: str | None = None) -> str:
@@ -293,7 +299,7 @@ def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operati
     """Find PROJ's operations between two systems, never a ballpark one; over a box those whose area of use contains it,
     best first.
     """
-    area = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
+    area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of grids that are not installed, which are named here
         try:
@@ -302,7 +308,7 @@ def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operati
             return Operations(usable=())
     if box is None:
         return Operations(usable=tuple(group.transformers), lacking=tuple(group.unavailable_operations))
-    usable = [t for t in group.transformers if contains(t.area_of_use, box)]
+    usable = [t for t in group.transformers if contains(t.area_of_use, box) and t.accuracy <= WORST_M]
     lacking = [o for o in group.unavailable_operations if contains(o.area_of_use, box) and o.grids]
     return Operations(usable=tuple(sorted(usable, key=rank_operation)), lacking=tuple(lacking))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import lru_cache
+from textwrap import shorten
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,7 @@ from railfix.track.crs import (
     MARGIN_DEG,
     REGIONAL,
     TRANSIT,
+    WORST_M,
     Box,
     Operations,
     contains,
@@ -175,15 +177,15 @@ def _choose_operation(crs: str, box: Box) -> _Chosen | str:
     datum = "a CRS without a datum" if datum == "unknown" else datum
     missing = next((m for operations in known.values() if (m := operations.describe_lacking(crs))), "")
     found = [(code, operations.usable[0]) for code, operations in known.items() if operations.usable]
-    if not found:
+    code, best = min(found, key=lambda item: rank_operation(item[1]), default=("", None))
+    accuracy = _accuracy(crs, known[code].usable, box) if best is not None else np.nan
+    if best is None or accuracy > WORST_M:
         where = f"latitude {(box[0] + box[1]) / 2.0:.2f}, longitude {(box[2] + box[3]) / 2.0:.2f}"
         why = f"; {missing}" if missing else ""
         return (
             f"PROJ has no installed operation from {datum} to a modern frame at {where}{why}"
             f"{'; or ' if missing else '; '}give a map in WGS 84 or a modern frame of the region"
         )
-    code, best = min(found, key=lambda item: rank_operation(item[1]))
-    accuracy = _accuracy(crs, known[code].usable, box)
     lacking = [
         o for operations in known.values() for o in operations.lacking
         if not known_accuracy_m(o.accuracy) >= _BETTER * accuracy
@@ -191,8 +193,8 @@ def _choose_operation(crs: str, box: Box) -> _Chosen | str:
     better = Operations(usable=(), lacking=tuple(lacking)).describe_lacking(crs)
     to, name = CRS.from_user_input(code).name, name_operation(best.description, crs)
     size = f"accuracy {accuracy:g} m" if np.isfinite(accuracy) else "accuracy unknown"
-    area = "" if best.area_of_use is None else f", of {best.area_of_use.name.rstrip('.')}"
-    note = f"map: {datum} is transformed to {to} by PROJ's {name!r} ({size}{area if len(area) < 60 else ''})"
+    area = "" if best.area_of_use is None else f", of {shorten(best.area_of_use.name, 60)}"
+    note = f"map: {datum} is transformed to {to} by PROJ's {name!r} ({size}{area})"
     return _Chosen(
         transformer=best,
         frame=code,

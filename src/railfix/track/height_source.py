@@ -125,7 +125,7 @@ def _from_raster(
     """Return the heights of a raster at the points of the track, linear between the middles of its cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
     with _open_raster(path) as (raster, crs):
-        height_datum, geoid = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
+        datum, model = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
         place = _place(track)
         x, y = to_map(crs.to_2d().to_wkt(), place, path=str(path))
         turn = ~raster.transform
@@ -138,7 +138,7 @@ def _from_raster(
             f"{len(missing)} of {len(track)} points of the map have no height, the first at chainage "
             f"{track.chainage_m[missing[0]]:.0f} m; give a raster of the whole line",
         )
-    above = ellipsoidal_heights(heights, place, datum=str(height_datum), geoid=geoid, path=str(path))
+    above = ellipsoidal_heights(heights, place, datum=str(datum), geoid=model, path=str(path))
     note = (
         f"heights of the raster {path}, sigma {sigma_m or 0.0:.2f} m: those of the ground, which on bridges and in "
         "tunnels are not the track's"

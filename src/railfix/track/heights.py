@@ -67,8 +67,9 @@ def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidM
         key = _EGM96_NAMES[0]
     if key in JAPAN_MODELS:
         name = JAPAN_MODELS[key]
-        heights = _LOADERS[name]().get_heights(np.array(place.longitude_deg), np.array(place.latitude_deg))
-        model = GeoidModel(height_m=np.asarray(heights, np.float64), name=name, accuracy_m=_JAPAN_M)
+        degrees = np.array(place.longitude_deg), np.array(place.latitude_deg)
+        heights = np.asarray(_LOADERS[name]().get_heights(*degrees), np.float64)
+        model = GeoidModel(height_m=heights, name=name, accuracy_m=_JAPAN_M)
     elif key in _EGM96_NAMES:
         heights = egm96_heights(place.latitude_deg, place.longitude_deg)
         model = GeoidModel(height_m=heights, name="EGM96, grid of 15'", accuracy_m=_EGM96_M)
@@ -131,7 +132,7 @@ def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
         why = operations.describe_lacking() or "there is no operation of PROJ"
         raise SettingsError(
             f"the heights are {vertical.name}, for which PROJ has no installed operation there: {why}; "
-            "or give the file of the grid (--geoid)"
+            "or give the grid file itself (--geoid)"
         )
     best = operations.usable[0]
     accuracy = known_accuracy_m(best.accuracy)

@@ -163,9 +163,8 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
     """Return a segment with an accuracy in plan that holds for all, the transformation from its datum included."""
-    notes = ()
-    if segment.datum_plan_m > given_m:
-        notes = (f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation",)
+    note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
+    notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)
 
 
