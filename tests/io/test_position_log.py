@@ -271,8 +271,10 @@ def test_bends_between_two_points_are_kept() -> None:
     enu = np.stack([6.0 * (1.0 - np.cos(angle)), 6.0 * np.sin(angle), 0 * angle], axis=1)
     ecef = ecef_from_geodetic(*ORIGIN) + enu @ enu_axes(*ORIGIN[:2])
     time = START + (np.arange(len(angle)) * 1e8).astype("timedelta64[ns]")
-    _, offset = Trajectory.from_track(from_positions(time, ecef)).nearest(ecef)
-    _, coarse = Trajectory.from_track(from_positions(time, ecef, limits=ThinningLimits(chord_m=9.0))).nearest(ecef)
+    _, offset = Trajectory.from_antenna_path(from_positions(time, ecef)).nearest(ecef)
+    _, coarse = Trajectory.from_antenna_path(from_positions(time, ecef, limits=ThinningLimits(chord_m=9.0))).nearest(
+        ecef
+    )
     assert offset.max() < 0.30 < coarse.max()
 
 
@@ -310,7 +312,7 @@ def test_maps_of_the_recordings(name: str, tmp_path: Path, recordings: Path) -> 
     np.testing.assert_allclose(log.ecef_m, ecef, atol=1e-4)
     track, thinned = from_position_log(log)
     assert ANTENNA_PATH in track.provenance.notes
-    _, offset = Trajectory.from_track(track).nearest(ecef)
+    _, offset = Trajectory.from_antenna_path(track).nearest(ecef)
     assert np.percentile(offset, 50) < 0.05
     assert np.percentile(offset, 99) < 1.1
     assert len(thinned.turns) == (name == "gsdc")  # that car backs out of a parking place once

@@ -331,7 +331,7 @@ def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) 
     data = gzip.decompress(log.read_bytes())[:700_000]
     part = tmp_path / "part.ubx"
     part.write_bytes(data)
-    trajectory = {"front": railfix.Trajectory.from_track(railfix.read_track([ubx_line(log, tmp_path)]))}
+    trajectory = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([ubx_line(log, tmp_path)]))}
 
     async def session(source: str | None) -> list[LiveOutput]:
         outputs: list[LiveOutput] = []
@@ -364,7 +364,7 @@ def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_pat
     """A cold start: no position until subframes of enough satellites have been received whole."""
     log = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
     data = gzip.decompress(log.read_bytes())
-    trajectory = {"front": railfix.Trajectory.from_track(railfix.read_track([ubx_line(log, tmp_path)]))}
+    trajectory = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([ubx_line(log, tmp_path)]))}
     engine = LiveEngine(
         railfix.EpochProcessor(railfix.Config(), trajectory), LiveSettings(period_s=1.0, no_input="skip")
     )

@@ -16,7 +16,7 @@ from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
 from railfix.live.message import create_message
 from railfix.live.settings import LiveSettings
-from railfix.pipeline.processor import Result
+from railfix.pipeline.results import Result
 from railfix.tracking import TrackStatus
 from railfix.tracking.result import is_bounded
 from signal_attacks import Scene

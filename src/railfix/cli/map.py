@@ -144,7 +144,7 @@ def features(
     tables = [folder / "train.parquet" for folder in run or ()]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[*tracks, *tables])
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    trajectory = Trajectory.from_track(track)
+    trajectory = Trajectory.from_antenna_path(track)
     series = line_series(trajectory)
     found = map_features(series)
     if run:

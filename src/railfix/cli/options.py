@@ -6,6 +6,7 @@ import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import date, datetime
 from functools import wraps
 from pathlib import Path
@@ -15,7 +16,6 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import typer
 from pydantic import ValidationError
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import SettingsError
 from railfix.core.settings import INPUTS, Settings, option, read_toml
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
@@ -30,6 +30,10 @@ Model = TypeVar("Model", bound=Settings)
 OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent.")]
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", rich_help_panel="Choices", help="Replace results that are already there.")
+]
+VerboseOption = Annotated[
+    bool,
+    typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables of statuses and reasons."),
 ]
 LenientOption = Annotated[
     bool,

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.timescale import seconds
@@ -343,7 +344,7 @@ def read_run_track(run: RunFolder) -> Track:
 
 def _trajectory(run: RunFolder, antenna: str, track: Track, vehicles: Sequence[Path]) -> Trajectory:
     if not vehicles:
-        return Trajectory.from_track(track)
+        return Trajectory.from_antenna_path(track)
     point = run.chainage_of.get(antenna, "antenna")
     name: Literal["front", "rear"] = "rear" if antenna == "rear" else "front"
     return antenna_trajectory(track, read_vehicle(vehicles[0]), name, reference=point)  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ Common errors are those that a nearby reference station has measured; of the err
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix import __version__
-from railfix.core.arrays import Datetimes, Floats, Strings, dataclass, join_rows
+from railfix.core.arrays import Datetimes, Floats, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import file_sha256
 from railfix.core.geodesy import range_with_rotation
@@ -28,8 +28,9 @@ from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.base_station import BaseStation
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.corrected_ranges import collect_conditions
-from railfix.pipeline.processor import EpochProcessor, State
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.state import State
 from railfix.positioning.noise_scale import RobustClock, robust_clock
 from railfix.positioning.normal_equations import clock_groups
 from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource, condition_differences

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
@@ -26,7 +25,8 @@ from railfix.live.stream import FOREVER, Lag, Sensed
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import merge_navigation
-from railfix.pipeline.results import Result, State
+from railfix.pipeline.results import Result
+from railfix.pipeline.state import State
 from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Reason
@@ -103,7 +103,7 @@ class BaseStation:
         if self._antenna is None or np.any(self._antenna[0] != ecef_m):
             latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
             ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
-            index = SearchIndex(Trajectory.from_track(Track.from_ecef(ends)))
+            index = SearchIndex(Trajectory.from_antenna_path(Track.from_ecef(ends)))
             self._antenna = ecef_m, AntennaRows.of(index)
         return self._antenna[1]
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds
 from railfix.motion.features import (
@@ -59,7 +59,7 @@ class LineFeatures:
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
         """Return the features of a track for the body that carries an antenna."""
-        line = Trajectory.from_track(track)
+        line = Trajectory.from_antenna_path(track)
         series = line_series(line)
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])

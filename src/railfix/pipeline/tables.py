@@ -6,18 +6,19 @@ Times are GPS time without a time zone, to the nanosecond. Absent values are nul
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Strings, dataclass
+from railfix.core.arrays import Floats, Strings
 from railfix.core.reasons import Reason, reason_text
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.balises import VERDICTS, Passing
-from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.result_columns import (
     CHANNEL_COLUMNS,
     EPOCH,
@@ -34,6 +35,7 @@ from railfix.pipeline.result_columns import (
 )
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
+from railfix.pipeline.smoothing import SmoothedTrack
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind, TrackStatus
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from functools import partial
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
@@ -19,7 +19,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from railfix import __version__
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_json_object, write_whole
 from railfix.core.tables import Table, number, plural, share
@@ -29,10 +29,6 @@ from railfix.report.plots.network import network_plan
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
 from railfix.track.network_read import NetworkQuality
-
-if TYPE_CHECKING:
-    from railfix.report.figures import Group
-
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 #: Unknown value of an unsigned 16-bit number.
@@ -264,6 +260,16 @@ def render(template: str, title: str, **content: Any) -> str:
 
 def _resource(name: str) -> Markup:
     return Markup(files("railfix.report").joinpath("templates", name).read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """Charts under one heading, and reasons for missing ones; `start` is the origin of `Points.epoch_s`."""
+
+    title: str
+    charts: tuple[Chart | SkyEpochs, ...]
+    start: np.datetime64
+    absent: tuple[str, ...] = ()
 
 
 def figure(

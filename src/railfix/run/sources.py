@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.reasons import Status
@@ -201,7 +200,7 @@ def _paths(
             raise SettingsError(
                 f"the chainage of {reading.reference} was asked for, which only a vehicle file can give; name one"
             )
-        return None, dict.fromkeys(antennas, Trajectory.from_track(track))
+        return None, dict.fromkeys(antennas, Trajectory.from_antenna_path(track))
     body = read_vehicle(vehicle)
     of_track = track_key(track)
     paths: dict[str, Trajectory] = {}

@@ -8,13 +8,13 @@ motion of the plate is used (Altamimi et al. 2023, doi:10.1029/2023GL106373), an
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, TypedDict, Unpack
 
 import numpy as np
 from pyproj import CRS, Transformer
 
-from railfix.core.arrays import Datetimes, Floats, dataclass
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef

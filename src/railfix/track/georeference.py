@@ -7,6 +7,7 @@ ballpark operation, which leaves the datum as it is, is never one of them.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import lru_cache
 from textwrap import shorten
 from typing import Final
@@ -14,7 +15,7 @@ from typing import Final
 import numpy as np
 from pyproj import CRS, Transformer
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.crs import (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -14,7 +15,7 @@ from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError, ProjError
 from scipy.ndimage import map_coordinates, spline_filter
 
-from railfix.core.arrays import Floats, dataclass, read_only
+from railfix.core.arrays import Floats, read_only
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.track.crs import find_operations, get_vertical_datum, known_accuracy_m
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
 from railfix.kernels.tracking import constants
 from railfix.tracking.epochs import Kind
 

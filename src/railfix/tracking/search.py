@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, dataclass
+from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import (

@@ -12,11 +12,11 @@ began, nothing of what comes later reaches the epochs before.
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, Strings, dataclass
+from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.search import SplitHypothesis
 from railfix.tracking.state import SATELLITES, StateIndex, TrackState

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, Strings, dataclass
+from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.epochs import Previous
 
 #: Letters of the receiver clocks of codes, in the order of their offsets in the state.
