@@ -27,6 +27,9 @@ from railfix.track.track import ANOTHER_PLACE_M
 SIGMA_M: Final = 4.0
 _LEAST_SIGMA_M: Final = 1.0
 _ALONE_M: Final = 15.0  #: Distance of the next track from a position by which sigmas are estimated [m].
+#: Positions farther from the track than this, and than their noise so many times, are beside it for another reason [m].
+_LARGEST_LEVEL_M: Final = 5.0
+_BESIDE: Final = 3.0
 _ENOUGH: Final = 30  #: Positions that an estimate needs.
 #: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map, antenna height.
 _COMMON_M: Final = 2.0
@@ -221,8 +224,11 @@ def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[floa
     alone = np.isfinite(first) & (second > first + _ALONE_M) if near.offset_m.shape[1] > 1 else np.isfinite(first)
     if alone.sum() < _ENOUGH:
         return SIGMA_M, ", for too few lie where one track alone is near"
-    estimate = float(np.median(first[alone])) / _NORMAL_MEDIAN
-    return max(estimate, _LEAST_SIGMA_M, network.sigma_plan_m), ", by their distances where one track alone is near"
+    own = near.offset_m[alone, 0]
+    level, noise = (float(np.median(np.abs(v))) / _NORMAL_MEDIAN for v in (own, np.diff(own) / np.sqrt(2.0)))
+    if level > max(_LARGEST_LEVEL_M, _BESIDE * noise):
+        return max(noise, SIGMA_M / 2.0), ", for they lie beside the tracks"
+    return max(level, _LEAST_SIGMA_M, network.sigma_plan_m), ", by their distances where one track alone is near"
 
 
 def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
