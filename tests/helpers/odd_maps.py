@@ -311,7 +311,7 @@ CASES: Final[tuple[Odd, ...]] = (
         "refused", "station equations do not rise from the start",
     ),
     Odd("gap.xml", _landxml("650100</End></Line>", "650090</End></Line>"), "refused", "mend the elements that do not"),
-    Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "curves turn to the other side than they say"),
+    Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "curves turn to the other side"),
     Odd("unknown_frame.xml", _landxml('"25832"', '"99999999"'), "refused", "'EPSG:99999999' is unknown"),
     Odd("frame_without_grid.xml", _landxml('"25832"', '"4258"'), "refused", "no grid; a design is in one"),
     Odd("another_grid.xml", _landxml('"25832"', '"2154"'), "refused", "is EPSG:2154 the right CRS"),

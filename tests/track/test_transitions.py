@@ -127,6 +127,10 @@ def point(name: str, xy: np.ndarray, *, easting_first: bool = False) -> str:
     return f"<{name}>{values[0]:.7f} {values[1]:.7f}</{name}>"
 
 
+def shifted(place: np.ndarray, east_m: float, north_m: float) -> np.ndarray:
+    return np.asarray(place + np.array([east_m, north_m]))
+
+
 def grid(path: Path) -> np.ndarray:
     """Easting and northing of the points that are read."""
     segment = read_segments(path, MapReading(height_datum="ellipsoidal"))[0]
@@ -161,10 +165,9 @@ def test_landxml_transitions_of_ordinates_lie_on_their_curve(kind: str, shape: s
 
 def test_a_transition_that_does_not_end_in_its_radius_is_refused(tmp_path: Path) -> None:
     origin = np.array([650_000.0, 5_320_000.0])
-    text = (
-        '<Spiral length="100" radiusStart="INF" radiusEnd="400" rot="ccw" spiType="cubic">'
-        + point("Start", origin) + point("PI", origin + (60.0, 0.0)) + point("End", origin + (100.0, 9.0)) + "</Spiral>"
-    )  # fmt: skip
+    places = {"Start": origin, "PI": shifted(origin, 60.0, 0.0), "End": shifted(origin, 100.0, 9.0)}
+    text = '<Spiral length="100" radiusStart="INF" radiusEnd="400" rot="ccw" spiType="cubic">'
+    text += "".join(point(name, place) for name, place in places.items()) + "</Spiral>"
     with pytest.raises(InputFileError, match=r"not that of its radius \(1\.9"):
         read_segments(landxml(tmp_path / "a.xml", text), MapReading())
 
@@ -172,7 +175,7 @@ def test_a_transition_that_does_not_end_in_its_radius_is_refused(tmp_path: Path)
 @pytest.mark.parametrize("easting_first", [False, True])
 def test_landxml_is_read_in_the_order_in_which_curves_turn_as_they_say(easting_first: bool, tmp_path: Path) -> None:
     origin = np.array([650_000.0, 5_320_000.0])
-    corner, centre = origin + (300.0, 0.0), origin + (300.0, 400.0)
+    corner, centre = shifted(origin, 300.0, 0.0), shifted(origin, 300.0, 400.0)
     end = centre + 400.0 * np.array([np.sin(0.8), -np.cos(0.8)])
 
     def element_of(kind: str, **places: np.ndarray) -> str:
@@ -191,7 +194,7 @@ def test_landxml_is_read_in_the_order_in_which_curves_turn_as_they_say(easting_f
 
 def test_stations_and_their_equations_are_the_kilometrage(tmp_path: Path) -> None:
     origin = np.array([650_000.0, 5_320_000.0])
-    text = "<Line>" + point("Start", origin) + point("End", origin + (900.0, 0.0)) + "</Line>"
+    text = "<Line>" + point("Start", origin) + point("End", shifted(origin, 900.0, 0.0)) + "</Line>"
     equations = '<StaEquation staAhead="5000" staBack="1300" staInternal="1300" staIncrement="increasing"/>'
     equations += '<StaEquation staAhead="2000" staBack="5200" staInternal="1500" staIncrement="decreasing"/>'
     profile = tmp_path / "profile.csv"

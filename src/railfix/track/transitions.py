@@ -3,8 +3,8 @@
 With x along the tangent from the straight end, X the length on the tangent and R the radius at the other end:
 
 - cubic parabola ``y = x^3 / (6 R X)``, of many railways; IFC has ``y = x^3 / (6 R L)`` with the length L of the curve
-- with the correction of Japan's railways ``y = x^3 (1 + (X / 2R)^2)^1.5 / (6 R X)``, whose curvature at the end is 1/R within
-  half a percent
+- with the correction of Japan's railways ``y = x^3 (1 + (X / 2R)^2)^1.5 / (6 R X)``, whose curvature at the
+  end is 1/R within half a percent
 - half-sine, of the Shinkansen, ``y = X^2 / R ((x/X)^2 / 4 - (1 - cos(pi x/X)) / (2 pi^2))``
 """
 
