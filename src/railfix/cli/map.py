@@ -139,12 +139,12 @@ def features(
 
     from railfix.motion.features import line_series, map_features
     from railfix.run.locate import centre_features, find_features, read_measured
-    from railfix.track.trajectory import Trajectory
+    from railfix.track.curves import curved_line
 
     tables = [folder / "train.parquet" for folder in run or ()]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[*tracks, *tables])
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    trajectory = Trajectory.from_antenna_path(track)
+    trajectory = curved_line(track)
     series = line_series(trajectory)
     found = map_features(series)
     if run:

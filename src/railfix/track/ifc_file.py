@@ -146,13 +146,13 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
             notes += (f"{graded} segments of constant gradient have two values, of which the first is taken",)
         xy, system = _map_conversion(step, scale)
         placement = _place(step, alignment, step.at(layouts["IFCALIGNMENTHORIZONTAL"], what="a layout"), scale)
-        plan, profile = _move(_with_cubics(plan, path=str(path), name=str(name)), profile, placement)
+        moved, profile = _move(_with_cubics(plan, path=str(path), name=str(name)), profile, placement)
         segments.append(
             segment_of_design(
                 path=str(path),
                 name=str(name),
                 design=Design(
-                    plan=[p for p in plan if p.length_m > 0.0],
+                    plan=[p for p in moved if p.length_m > 0.0],
                     profile=[p for p in profile if p.length_m > 0.0],
                     cant=[c for c in cant if c.length_m > 0.0],
                 ),
