@@ -85,8 +85,10 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
 
 
 def _is_no_line(feature: dict[str, Any]) -> bool:
-    """Return whether one of several features is a point or an area, such as a station."""
+    """Return whether one of several features is a point, an area such as a station, or has no geometry."""
     geometry = feature.get("geometry")
+    if geometry is None and "geometry" in feature:
+        return True
     return isinstance(geometry, dict) and geometry.get("type") in ("Point", "MultiPoint", "Polygon", "MultiPolygon")
 
 
@@ -193,7 +195,20 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     of_openstreetmap = any(is_of_openstreetmap(line.feature) for line in lines)
     reasons = [no_track(line.feature, of_openstreetmap=of_openstreetmap) for line in lines]
     segments = [_segment(line, used, reading) for line, why in zip(lines, reasons, strict=True) if not why]
-    return with_left_out(path, segments, Counter(why for why in reasons if why))
+    empty = [f"feature {k} without geometry" for k in _without_geometry(document)]
+    return with_left_out(path, segments, Counter([*empty, *(why for why in reasons if why)]))
+
+
+def _without_geometry(document: dict[str, Any]) -> list[int]:
+    """Return the numbers of features whose geometry is null (RFC 7946, 3.2) and that are no connections."""
+    features = document.get("features")
+    return [
+        number
+        for number, feature in enumerate(features if isinstance(features, list) else [], start=1)
+        if isinstance(feature, dict)
+        and feature.get("geometry", ...) is None
+        and RELATION not in (feature.get("properties") or {})
+    ]
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
@@ -201,7 +216,7 @@ def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> li
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
-        plan_segment(way.points_deg, of_file, path=path, name=own["name"], stated=own)
+        plan_segment(way.points_deg, of_file, path=path, name=own["name"], stated=own, nodes=way.nodes)
         for way, why in ways
         if not why and (own := get_metadata(way.row))
     ]
@@ -222,7 +237,8 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     of_way = get_metadata(line.feature)
     return make_segment(
         place,
-        _heights(line, crs, place, reading) if line.coordinates.shape[1] > 2 else None,
+        # heights that are all 0 are none, as in files of other formats
+        _heights(line, crs, place, reading) if line.coordinates[:, 2:].any() else None,
         source=f"{line.path} ({of_way['name']})" if "name" in of_way else line.source,
         file=line.path,
         crs=crs,

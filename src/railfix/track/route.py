@@ -74,13 +74,16 @@ class Segment:
     datum_plan_m: float = 0.0
     datum_height_m: float = 0.0
     notes: tuple[str, ...] = ()
+    nodes: tuple[str, ...] = ()  #: Ids of the points as nodes of OpenStreetMap; empty where the file has none.
 
     def reverse(self) -> Segment:
         """Return the segment in the opposite direction; the signs of radius and gradient change."""
         names = ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)
         turned = {name: getattr(self, name)[::-1] for name in names}
         turned |= {name: -turned[name] for name in ("radius_m", "gradient_permille")}
-        return replace(self, **turned, notes=(*self.notes, f"{self.source} {BACKWARDS}"))
+        return replace(
+            self, **turned, notes=(*self.notes, f"{self.source} {BACKWARDS}"), nodes=tuple(reversed(self.nodes))
+        )
 
 
 def make_segment(
