@@ -296,7 +296,7 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 def _features(
     path: FilePath,
 ) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]], list[tuple[str, ...]]]]:
-    """Yield CRS, columns, lines and ids of the nodes of the features of each layer; of OSM XML without GDAL, which needs
+    """Yield CRS, columns, lines and ids of nodes of the features of each layer; of OSM XML without GDAL, which needs
     sorted nodes.
     """
     if ending(path) == ".osm":
