@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -99,12 +99,13 @@ def make_segment(
 ) -> Segment:
     """Return a segment of points in plan and, where it has any, of heights."""
     absent = np.full(len(place.latitude_deg), np.nan)
+    of_points: dict[str, Any] = {**dict.fromkeys(ATTRIBUTES, absent), **attributes}
     above = heights or EllipsoidalHeights(height_m=absent, datum=NO_HEIGHTS)
     return Segment(
         source=source, file=file, latitude_deg=place.latitude_deg, longitude_deg=place.longitude_deg,
         height_m=above.height_m, crs=crs or UNNAMED, frame=place.frame, height_datum=above.datum, geoid=above.geoid,
         datum_plan_m=place.accuracy_m, datum_height_m=above.accuracy_m, metadata=metadata,
-        notes=(*notes, *place.notes, *above.notes), **{**dict.fromkeys(ATTRIBUTES, absent), **attributes},
+        notes=(*notes, *place.notes, *above.notes), **of_points,
     )  # fmt: skip
 
 
