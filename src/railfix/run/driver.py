@@ -37,6 +37,7 @@ from railfix.run.verdict import Verdict, judge_run
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
+from railfix.track.vehicle import read_vehicle
 
 if TYPE_CHECKING:
     from railfix.run.batch_check import BatchCheck
@@ -156,10 +157,11 @@ def open_inputs(
 
     from railfix.run.route import LogPositions
 
-    paths = next(iter(inputs.logs.values()))
+    antenna, paths = next(iter(inputs.logs.items()))
+    offset = None if inputs.vehicle is None else read_vehicle(inputs.vehicle).antennas.get(antenna)
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
-        reading=options.track,
+        reading=options.track, antenna_up_m=0.0 if offset is None else offset.up_m,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
