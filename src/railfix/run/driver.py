@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -38,9 +38,7 @@ from railfix.run.verdict import Verdict, judge_run
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
-
-if TYPE_CHECKING:
-    from railfix.run.batch_check import BatchCheck
+from railfix.track.vehicle import read_vehicle
 
 
 class Progress(Protocol):
@@ -102,7 +100,6 @@ def run_files(
         rows = ResultRows(
             folder=folder, line=line, observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
-            batches=_batches(logs, line) if options.check == "batch" else {},
             passings=balises is not None, replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )  # fmt: skip
         tally = _position(logs, (sensors, base), processor, rows, beside, progress)
@@ -117,7 +114,6 @@ def run_files(
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
             *shorten_notes(rows.balise_notes),
-            *rows.compare_batches(),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
@@ -160,10 +156,11 @@ def open_inputs(
 
     from railfix.run.route import LogPositions
 
-    paths = next(iter(inputs.logs.values()))
+    antenna, paths = next(iter(inputs.logs.items()))
+    offset = None if inputs.vehicle is None else read_vehicle(inputs.vehicle).antennas.get(antenna)
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
-        reading=options.track,
+        reading=options.track, antenna_up_m=0.0 if offset is None else offset.up_m,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
@@ -226,13 +223,6 @@ def _position(
     if written is not None:
         written.result()
     return tally
-
-
-def _batches(logs: Iterable[Antenna], line: OpenedLine) -> dict[str, BatchCheck]:
-    """Return the checks of each antenna; loaded when asked for: 0.03 s."""
-    from railfix.run.batch_check import BatchCheck
-
-    return {name: BatchCheck(trajectory=line.trajectories[name]) for name in logs}
 
 
 def _screen_chunks(
@@ -317,7 +307,7 @@ def collect_notes(
     notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [
-            f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
+            f"{name}: screen {screen.name} tested nothing; it needs {screen.needs}"
             for screen in SCREENS
             if antenna.judged.get(screen.name) is False
         ]
@@ -327,7 +317,7 @@ def collect_notes(
         for by, counts in (("single epochs", antenna.lasting), ("the filter", antenna.left_out)):
             notes += [
                 f"{name}: {by} left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
-                "over a minute they contradict all others"
+                "inconsistent with the others for over a minute"
                 for satellite, (count, first) in sorted(counts.items(), key=lambda item: -item[1][0])[:_NAMED]
             ]
         offset = antenna.map_offset
@@ -353,8 +343,8 @@ def _describe_detectable(detectable_m: Floats) -> str:
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
     return (
-        f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
-        f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
+        f"map errors smaller than {across:.0f} m laterally or {up:.0f} m in height cannot be detected; where the "
+        f"ranges are worst, smaller than {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
 
 
