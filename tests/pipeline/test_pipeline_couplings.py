@@ -20,11 +20,12 @@ from railfix.integrity.raim import Outcome
 from railfix.pipeline import level_stage, solution, solve
 from railfix.pipeline.along_track import gnss_epochs
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.corrected_ranges import CorrectedRanges, Models
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.range_stage import Models
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_scale import RobustFit
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
 
 BASE = {"screens": ["elevation", "raim"]}
@@ -110,13 +111,13 @@ def test_the_bias_of_the_error_model_is_in_the_level() -> None:
 @pytest.mark.requirement("C2")
 def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Left and right of the track by the directions to the satellites, up to the elevation of the setting."""
-    caught, original = [], level_stage.along_track_level
+    caught, original = [], level_stage.protection_level
 
     def spied(*arguments: Any, **options: Any) -> Any:
         caught.append(options["sides"])
         return original(*arguments, **options)
 
-    monkeypatch.setattr(level_stage, "along_track_level", spied)
+    monkeypatch.setattr(level_stage, "protection_level", spied)
     result = front_alone(front(), BASE)
     (sides,) = caught
     line, columns = clean_trajectories()["front"], result.columns
@@ -382,7 +383,7 @@ def test_far_from_the_line_the_anchor_is_the_position_and_its_place_the_nearest(
     far = replace(trajectory, ecef_m=middle + 3e5 * np.array([0.0, 0.6, 0.8]) + along)
     processor = EpochProcessor(parse_config(BASE), {"front": far}, navigation=clean_navigation())
     ranges = processor.screen({"front": front()})[0].corrected
-    nearest, _ = far.nearest(ranges.anchor_ecef_m)
-    assert (np.linalg.norm(ranges.anchor_ecef_m - far.at_arc(nearest), axis=1) > 2e5).all()
-    np.testing.assert_allclose(ranges.anchor_arc_m, nearest, atol=1e-6)
+    nearest, _ = far.nearest(ranges.near_ecef_m)
+    assert (np.linalg.norm(ranges.near_ecef_m - far.at_arc(nearest), axis=1) > 2e5).all()
+    np.testing.assert_allclose(ranges.near_arc_m, nearest, atol=1e-6)
     assert (nearest > 100.0).all()

@@ -10,6 +10,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+from railfix.pipeline.solve import line_model, place_on_line
 from typer.testing import CliRunner
 
 from railfix.cli import app
@@ -20,20 +21,20 @@ from railfix.core.reasons import Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
+from railfix.integrity.fault_exclusion import fault_free
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
+from railfix.pipeline.range_stage import correct_ranges
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.solve import fault_free, line_model, place_on_line
 from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffset
-from railfix.positioning.normal_equations import single_point
+from railfix.positioning.normal_equations import point_position
 from railfix.ranges.atmosphere import saastamoinen_delay_m
-from railfix.ranges.corrected import REASONS
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
+from railfix.ranges.sources import REASONS
 from railfix.run.processor import make_processor
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv
@@ -163,11 +164,11 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     processor = make_processor(config, recording.navigation, {"front": recording.line})
     obs = recording.observations[180:200]
     index = processor.indices["front"]
-    antennas, received = AntennaRows.of(index), processor.received
+    antennas, received = AntennaRows.on(index), processor.received
     corrected = correct_ranges(obs, ChannelBook(config).of(obs, received.navigation), config, received, antennas)
     one = processor._screen_antennas(("front",), antennas, corrected, received, State())[0]["front"]
     ranges = one.ranges()
-    point = single_point(ranges, one.anchor_ecef_m)
+    point = point_position(ranges, one.near_ecef_m)
     place = place_on_line(ranges, index, point, config)
     scale, model_on_line = np.ones(len(ranges)), line_model(ranges, antennas, place.constrained)
     ranges, place, raim = fault_free(

@@ -38,7 +38,7 @@ def trajectory(case: Ride) -> Trajectory:
 def epochs(case: Ride, trajectory: Trajectory) -> GnssEpochs:
     config = parse_config({"filter": "off", "protection": "off"})
     processor = make_processor(config, case.simulation.navigation, {"front": trajectory})
-    solved, _ = processor.single_epochs(*processor.screen({"front": case.observations}))
+    solved, _ = processor.position(*processor.screen({"front": case.observations}))
     result = solved.results["front"]
     found, _ = gnss_epochs(solved.ranges, result.noise_scale, config, None)
     return replace(found, near_ecef_m=result.conventional_ecef_m)

@@ -16,13 +16,15 @@ from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.pipeline.channels import ChannelBook, Channels
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
 from railfix.pipeline.received import Received
+from railfix.positioning.approximate import ANCHOR_SIGMA_M
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.noise_scale import robust_fit
-from railfix.positioning.normal_equations import Ranges, single_point
+from railfix.positioning.normal_equations import point_position
+from railfix.positioning.range_arrays import Ranges, usable_ranges, without
 from railfix.ranges.atmosphere import SeenFrom, model_delays
-from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m, first_available
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, first_available
+from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
@@ -69,7 +71,7 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
     clean = code + states.clock_m - states.group_delay_m
     reason = np.where(usable, 0, 1)
     raw = usable_ranges(states, clean, np.array(1.0 / ANCHOR_SIGMA_M**2), reason, channels.groups)
-    place = single_point(raw, _below(raw), limits=config.single_point).ecef_m
+    place = point_position(raw, _below(raw), limits=config.single_point).ecef_m
     seen = SeenFrom.of(np.where(np.isnan(place), _below(raw), place), states.position_ecef_m)
     delays = model_delays(
         obs.time,
@@ -106,7 +108,7 @@ def locate_ranges(time: Datetimes, seen: UncorrectedRanges, config: Config) -> L
     start = np.where(np.isnan(seen.place_ecef_m), _below(ranges), seen.place_ecef_m)
     fit = robust_fit(ranges, start, limits=config.robust_fit)
     ranges = without(ranges, (ranges.weight > 0) & ~fit.kept)
-    point = single_point(ranges, start, limits=config.single_point)
+    point = point_position(ranges, start, limits=config.single_point)
     freedom = ranges.n_used - ranges.n_clocks - 3
     scale = np.where(freedom >= _LEAST_REDUNDANCY, point.wsse / np.maximum(freedom, 1), 1.0)
     sigma = np.full((len(time), 3), np.nan)
