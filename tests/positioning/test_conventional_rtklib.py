@@ -28,7 +28,7 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.io import read_navigation, read_observations
-from railfix.io.position_log import read_positions
+from railfix.io.positions import read_positions
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import point_position

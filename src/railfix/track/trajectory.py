@@ -141,6 +141,10 @@ class Trajectory(FrozenArrays, NotebookTable):
     #: positions of two antennas of one vehicle. None without a vehicle; shape (V,).
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
+    antenna_ahead_m: float = 0.0  #: Antenna ahead of the middle between the bogies, toward the vehicle's front.
+    #: Front end of the vehicle ahead of the middle between its bogies, and its rear end behind it; None where unknown.
+    front_end_m: float | None = None
+    rear_end_m: float | None = None
     #: Distance of the contact points of the wheels of an axle, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
     sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map, included in the solution.
