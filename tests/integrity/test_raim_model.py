@@ -13,7 +13,7 @@ import raim_oracle as oracle
 import synthetic
 from railfix import kernels
 from railfix.integrity.raim import linear_model
-from railfix.integrity.raim.model import compact, model_on_line
+from railfix.integrity.raim.model import _model, compact
 from railfix.positioning.normal_equations import point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, ClockTies
 from raim_oracle import point_model
@@ -166,12 +166,12 @@ def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
     arc = np.array([731.0])
     ranges = oracle.made(arc, "GGGGGG", seed=3, sigma_m=np.full(6, 1e4))
     place, axes = oracle.LINE.at_arc(arc), oracle.LINE.get_axes(oracle.LINE.segment_at(arc)[0])
-    exact = model_on_line(ranges, place, axes, 1e-4, 1e-4)
+    exact = _model(ranges, place, axes, np.diag([0.0, 1e8, 1e8]), unknowns=1)
     assert exact.covariance_m2[0, 1, 1] == pytest.approx(1e-8, rel=1e-6)
     information = (exact.design[0, :, 0] ** 2).sum()
     assert exact.covariance_m2[0, 0, 0] == pytest.approx(1.0 / information, rel=1e-9)
     alike = np.repeat(axes[:, :1], 3, axis=1)
-    assert np.isnan(model_on_line(ranges, place, alike, 1e12, 1e12).covariance_m2).all()
+    assert np.isnan(_model(ranges, place, alike, np.diag([0.0, 1e-24, 1e-24]), unknowns=1).covariance_m2).all()
 
 
 def test_epochs_of_another_model_are_put_in_whole():

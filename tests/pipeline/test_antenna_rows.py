@@ -239,9 +239,9 @@ def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPat
     made: list[weakref.ref[Any]] = []
 
     def noted(*arguments: Any, **options: Any) -> Any:
-        ranges = correct_ranges(*arguments, **options)
+        ranges, near = correct_ranges(*arguments, **options)
         made.append(weakref.ref(ranges))
-        return ranges
+        return ranges, near
 
     monkeypatch.setattr(processing, "correct_ranges", noted)
     logs, navigation, paths = _inputs()

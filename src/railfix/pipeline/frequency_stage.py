@@ -66,7 +66,7 @@ def combine_frequencies(
         bound_sigma_m=np.hypot(local_m * magnified, nominal_m),
         bias_m=corrected.bias_m * magnified,
     )
-    screened = Screened(metric=found.difference_m, reject=found.suspected)
+    screened = Screened(metric=found.difference_m, reject=found.suspected)  # each satellite has its own limit
     verdict = Verdict(name=NAME, reason=Reason.USED, screened=screened, error_m=found.difference_m)
     return corrected, found, verdict, after
 

@@ -7,14 +7,14 @@ biases and single faults, noise scale, test of the map, protection level, carrie
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status
@@ -32,22 +32,20 @@ from railfix.pipeline.range_stage import fit_ranges, reject
 from railfix.pipeline.state import AntennaState
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions, Slips
+from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
     LastingErrorState,
     NoiseState,
-    OffsetState,
     RobustFit,
     epoch_sigma_m,
     epoch_variance,
     noise_scale,
-    robust_fit,
     robust_on_line,
-    tie_clocks,
 )
-from railfix.positioning.normal_equations import SinglePoint, misfit, point_position, position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges, without
+from railfix.positioning.normal_equations import SinglePoint, misfit, position_on_line
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
 from railfix.positioning.search_index import SearchIndex
 from railfix.positioning.windows import Windows
 from railfix.ranges.corrected import CorrectedRanges
@@ -86,19 +84,6 @@ class Solution:
     araim: AraimResult | None = None
 
 
-class PointPositions(NamedTuple):
-    """3-D positions of T epochs, and the ranges with what is known of the clocks."""
-
-    untied: Ranges  #: With a clock for each constellation.
-    ranges: Ranges  #: With the inter-system biases known so far.
-    point: SinglePoint  #: The conventional position, from the untied ranges.
-    tied: SinglePoint  #: From those with known biases.
-    #: Ranges that agree with each other in space, and the positions from these.
-    agreeing: Ranges
-    free: SinglePoint
-    ties: ClockTies
-
-
 def position_stage(
     corrected: CorrectedRanges,
     slips: Slips | None,
@@ -111,7 +96,11 @@ def position_stage(
     The ranges are those after the screens of the observations, the states by antenna.
     """
     time = corrected.time
-    points, offsets = solve_points(corrected, antennas, config, [state.offsets for state in states])
+    points, offsets = tie_constellations(
+        time, corrected.channels.clocks, fit_ranges(corrected), corrected.near_ecef_m,
+        [state.offsets for state in states], reference=CLOCK_GROUP[config.systems[0]], parts=antennas.parts,
+        limits=TieLimits(config.single_point, config.robust_fit, config.clock_offsets),
+    )  # fmt: skip
     fix = fix_on_line(points.ranges, antennas, points.tied, config.fix_limits)
     corrected = reject(corrected, _alone_on_clock(corrected, points.ties), Reason.ALONE_ON_ITS_CLOCK)
     checked, noise = check_ranges(corrected, points.ranges, antennas, fix, config, states)
@@ -155,48 +144,6 @@ def position_stage(
         for k, state in enumerate(states)
     ]  # fmt: skip
     return corrected, solution, after
-
-
-def solve_points(
-    corrected: CorrectedRanges, antennas: AntennaRows, config: Config, states: Sequence[OffsetState]
-) -> tuple[PointPositions, list[OffsetState]]:
-    """Return 3-D positions (P1 5) and inter-system biases known at each epoch, and the new states of the biases."""
-    ranges, near = fit_ranges(corrected), corrected.near_ecef_m
-    point = point_position(ranges, near, limits=config.single_point)
-    agreeing, free = _agreeing(ranges, point, near, config)
-    ties, offsets = tie_clocks(
-        corrected.time, corrected.channels.clocks, CLOCK_GROUP[config.systems[0]], agreeing, free, states,
-        parts=antennas.parts, limits=config.clock_offsets,
-    )  # fmt: skip
-    tied, tied_ranges = point, ranges
-    if len(ranges.groups) > 1:
-        tied_ranges = replace(ranges, ties=ties)
-        tied = _tie(tied_ranges, ties, point, near, config)
-    return PointPositions(ranges, tied_ranges, point, tied, agreeing, free, ties), offsets
-
-
-def _tie(ranges: Ranges, ties: ClockTies, point: SinglePoint, near_ecef_m: Floats, config: Config) -> SinglePoint:
-    """Return the 3-D positions with the clocks tied; those with free clocks where no bias is known yet."""
-    rows = ((ties.sigma_m < UNTIED_M).sum(axis=1) > 1).nonzero()[0]
-    if not len(rows):
-        return point
-    start = np.where(np.isnan(point.ecef_m), near_ecef_m, point.ecef_m)
-    if len(rows) == len(ranges):
-        return point_position(ranges, start, limits=config.single_point)
-    return patch_rows(point, rows, point_position(ranges.take(rows), start[rows], limits=config.single_point))
-
-
-def _agreeing(ranges: Ranges, point: SinglePoint, near_ecef_m: Floats, config: Config) -> tuple[Ranges, SinglePoint]:
-    """Return the ranges that agree with each other in space, and the 3-D positions from these."""
-    place = np.where(np.isnan(point.ecef_m), near_ecef_m, point.ecef_m)
-    fit = robust_fit(ranges, place, limits=config.robust_fit)
-    dropped = (ranges.weight > 0) & ~fit.kept
-    changed = np.flatnonzero(dropped.any(axis=1))
-    if not len(changed):
-        return ranges, point
-    agreeing = without(ranges, dropped)
-    again = point_position(agreeing.take(changed), place[changed], limits=config.single_point)
-    return agreeing, patch_rows(point, changed, again)
 
 
 def _alone_on_clock(corrected: CorrectedRanges, ties: ClockTies) -> Masks:

@@ -2,6 +2,7 @@
 
 from .antenna_rows import AntennaRows
 from .approximate import ApproximatePosition, approximate_position
+from .inter_system import PointPositions, TieLimits, tie_constellations
 from .line_fix import FixLimits, LineFix, fix_on_line
 from .noise_scale import (
     ClockOffsetLimits,
@@ -38,6 +39,7 @@ __all__ = [
     "LineFix",
     "NoiseScaleLimits",
     "OffsetState",
+    "PointPositions",
     "Ranges",
     "RobustFit",
     "RobustFitLimits",
@@ -46,6 +48,7 @@ __all__ = [
     "SectionLimits",
     "SinglePoint",
     "SinglePointLimits",
+    "TieLimits",
     "Windows",
     "approximate_position",
     "find_section",
@@ -56,6 +59,7 @@ __all__ = [
     "robust_fit",
     "robust_on_line",
     "tie_clocks",
+    "tie_constellations",
     "weighted_ranges",
     "without",
 ]

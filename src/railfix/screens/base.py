@@ -38,6 +38,8 @@ class Screened:
 
     metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot judge.
     reject: Masks  #: True = rejected. Where the metric is NaN the screen does not reject.
+    #: What the metric is compared with, in its unit; broadcasts to it; NaN where nothing is compared.
+    limit: Floats | float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,7 +262,11 @@ def on_pairs(screened: Screened, shape: tuple[int, ...], epochs: Indices, channe
     metric, reject = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     where = (epochs[:, None], channels) if len(shape) > 1 else epochs
     metric[where], reject[where] = screened.metric, screened.reject
-    return Screened(metric=metric, reject=reject)
+    limit = screened.limit
+    if isinstance(limit, np.ndarray):
+        limit = np.full(shape, np.nan)
+        limit[where] = screened.limit
+    return Screened(metric=metric, reject=reject, limit=limit)
 
 
 def pair_antennas(
