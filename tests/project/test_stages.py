@@ -117,11 +117,9 @@ def _recording(folder: Path, name: str) -> tuple[Observations, Navigation, Traje
         "m8t": (town / "20210517.light-urban.tste.ublox.m8t.GC.obs", town / "hksc137c.nav"),
         "japan": tuple(next(kinematic.glob("japan*")) / n for n in ("SEPT265G.21O", "SEPT2650.21P")),
     }
-    truth = recordings_truth.TRUTHS["japan" if name == "japan" else "urbannav"](
-        next(kinematic.glob("japan*" if name == "japan" else "urbannav*"))
-    )
-    known = np.isfinite(truth.ecef_m).all(axis=1)
-    track, _ = from_positions(truth.ecef_m[known])
+    time, place_ecef_m = recordings_truth.TRUTHS["japan" if name == "japan" else "urbannav"](folder)
+    known = np.isfinite(place_ecef_m).all(axis=1)
+    track = from_positions(time[known], place_ecef_m[known])
     return read_observations(files[name][0]), read_navigation(files[name][1]), Trajectory.from_antenna_path(track)
 
 
