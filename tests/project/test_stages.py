@@ -28,7 +28,7 @@ from railfix import (
 )
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.positioning.noise_scale import LastingErrorLimits
+from railfix.positioning.receiver_noise import LastingErrorLimits
 from railfix.track import Track, from_positions
 from test_site import cells
 

@@ -24,7 +24,9 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.noise_scale import (
+from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
+from railfix.positioning.range_arrays import Ranges, without
+from railfix.positioning.receiver_noise import (
     NoiseState,
     OffsetState,
     epoch_sigma_m,
@@ -33,8 +35,6 @@ from railfix.positioning.noise_scale import (
     robust_fit,
     tie_clocks,
 )
-from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
-from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.search_index import SearchIndex
 from railfix.positioning.section_search import find_section
 from railfix.positioning.windows import Windows

@@ -40,7 +40,7 @@ def epochs(case: Ride, trajectory: Trajectory) -> GnssEpochs:
     processor = make_processor(config, case.simulation.navigation, {"front": trajectory})
     solved, _ = processor.position(*processor.screen({"front": case.observations}))
     result = solved.results["front"]
-    found, _ = gnss_epochs(solved.ranges, result.noise_scale, config, None)
+    found, _ = gnss_epochs(solved.corrected, result.noise_scale, config, None)
     return replace(found, near_ecef_m=result.conventional_ecef_m)
 
 

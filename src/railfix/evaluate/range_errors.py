@@ -31,7 +31,7 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.range_stage import collect_conditions
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.state import State
-from railfix.positioning.noise_scale import RobustClock, robust_clock
+from railfix.positioning.receiver_noise import RobustClock, robust_clock
 from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource, condition_differences
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, faulty_stretches, fit_bins

@@ -22,9 +22,9 @@ from railfix.integrity.raim import (
 )
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.line_fix import FixLimits, LineFix, fix_on_line, refit_epochs
-from railfix.positioning.noise_scale import robust_on_line
 from railfix.positioning.normal_equations import point_position
 from railfix.positioning.range_arrays import Ranges, without
+from railfix.positioning.receiver_noise import robust_on_line
 from railfix.positioning.search_index import SearchIndex
 
 

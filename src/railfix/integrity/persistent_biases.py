@@ -12,8 +12,8 @@ from railfix.integrity.raim import LinearModel, linear_model
 from railfix.integrity.raim.model import update_model
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
-from railfix.positioning.noise_scale import LastingErrorLimits, LastingErrorState
 from railfix.positioning.range_arrays import Ranges, without
+from railfix.positioning.receiver_noise import LastingErrorLimits, LastingErrorState
 from railfix.positioning.windows import Windows
 
 #: Below this share of its own error in its residual a range shows nothing of it.

@@ -72,7 +72,7 @@ def along_track(
     Samples are those of the sensors on board since the chunk before; they meet features of the line, ground units and
     balises of `references`.
     """
-    epochs, after_slips = gnss_epochs(ranges, slips, single.noise_scale, config, state.slips)
+    epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
     epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
     line = Line.of(trajectory) if state.line is None else state.line
     tracked, sensed, replays, after = _run_filter(
@@ -305,10 +305,11 @@ def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Float
 
 def gnss_epochs(
     ranges: CorrectedRanges,
-    slips: Slips | None,
     noise_scale: Floats,
     config: Config,
     state: CycleSlipState | None,
+    *,
+    slips: Slips | None = None,
 ) -> tuple[GnssEpochs, CycleSlipState | None]:
     """Return the measurements of the filter, and the state of the slip detection.
 

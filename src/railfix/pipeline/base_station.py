@@ -20,7 +20,7 @@ from railfix.pipeline.range_stage import correct_ranges
 from railfix.pipeline.received import Received, correction_source
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import corrected_phase_m, number_arcs
-from railfix.positioning.noise_scale import robust_clock
+from railfix.positioning.receiver_noise import robust_clock
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.base_station import LONGEST_AGE_S, BaseErrors
 from railfix.track import Track

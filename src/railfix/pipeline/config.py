@@ -34,8 +34,8 @@ from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
 from railfix.positioning.line_fix import FixLimits
 from railfix.positioning.map_offset import MapOffsetLimits
-from railfix.positioning.noise_scale import ClockOffsetLimits, LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.normal_equations import ConstrainedLimits, SinglePointLimits
+from railfix.positioning.receiver_noise import ClockOffsetLimits, LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.base_station import BaseLimits

@@ -21,9 +21,9 @@ from railfix.pipeline.received import Received
 from railfix.positioning.approximate import ANCHOR_SIGMA_M
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
-from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import SinglePoint, point_position
 from railfix.positioning.range_arrays import Ranges, usable_ranges, without
+from railfix.positioning.receiver_noise import robust_fit
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, first_available
 from railfix.ranges.range_sigma import code_sigma_m

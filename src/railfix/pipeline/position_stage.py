@@ -35,7 +35,9 @@ from railfix.positioning.carrier import PhasePositions, Slips
 from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
-from railfix.positioning.noise_scale import (
+from railfix.positioning.normal_equations import SinglePoint, misfit, position_on_line
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.receiver_noise import (
     LastingErrorState,
     NoiseState,
     RobustFit,
@@ -44,8 +46,6 @@ from railfix.positioning.noise_scale import (
     noise_scale,
     robust_on_line,
 )
-from railfix.positioning.normal_equations import SinglePoint, misfit, position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
 from railfix.positioning.search_index import SearchIndex
 from railfix.positioning.windows import Windows
 from railfix.ranges.corrected import CorrectedRanges

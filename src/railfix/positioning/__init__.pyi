@@ -4,7 +4,16 @@ from .antenna_rows import AntennaRows
 from .approximate import ApproximatePosition, approximate_position
 from .inter_system import PointPositions, TieLimits, tie_constellations
 from .line_fix import FixLimits, LineFix, fix_on_line
-from .noise_scale import (
+from .normal_equations import (
+    Constrained,
+    ConstrainedLimits,
+    SinglePoint,
+    SinglePointLimits,
+    point_position,
+    position_on_line,
+)
+from .range_arrays import ClockTies, Ranges, weighted_ranges, without
+from .receiver_noise import (
     ClockOffsetLimits,
     NoiseScaleLimits,
     OffsetState,
@@ -15,15 +24,6 @@ from .noise_scale import (
     robust_on_line,
     tie_clocks,
 )
-from .normal_equations import (
-    Constrained,
-    ConstrainedLimits,
-    SinglePoint,
-    SinglePointLimits,
-    point_position,
-    position_on_line,
-)
-from .range_arrays import ClockTies, Ranges, weighted_ranges, without
 from .search_index import SearchIndex
 from .section_search import Section, SectionLimits, find_section
 from .windows import Windows

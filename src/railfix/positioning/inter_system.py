@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Datetimes, Floats, patch_rows
 from railfix.core.epoch_rows import EVERY
-from railfix.positioning.noise_scale import ClockOffsetLimits, OffsetState, RobustFitLimits, robust_fit, tie_clocks
 from railfix.positioning.normal_equations import SinglePoint, SinglePointLimits, point_position
 from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges, without
+from railfix.positioning.receiver_noise import ClockOffsetLimits, OffsetState, RobustFitLimits, robust_fit, tie_clocks
 
 
 class PointPositions(NamedTuple):

@@ -106,7 +106,7 @@ class Recursion:
         self._take_back_traced(state, epoch, handed, parents, trace)
         return epoch + 1, False
 
-    def find_section(self, state: TrackState, epoch: int, trace: list[Step] | None) -> None:
+    def search(self, state: TrackState, epoch: int, trace: list[Step] | None) -> None:
         """Do an epoch before which places have to be sought."""
         chunk, every = self.chunk, trace is not None
         if state.hypotheses:
