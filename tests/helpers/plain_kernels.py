@@ -8,13 +8,11 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, cast
 
-import numba
 import numpy as np
 import pytest
 
 from railfix import kernels
-from railfix.kernels import compiling
-from railfix.kernels.tracking import layout
+from railfix.kernels.tracking import layout, references
 from railfix.tracking import TrackingLimits
 from railfix.tracking.bank import OTHERS, SENSORS, SourceKind, budget, classify_source
 from railfix.tracking.filter import _parameters
@@ -23,7 +21,7 @@ from railfix.tracking.handover import _work_space
 
 def _compiled_modules() -> list[str]:
     """Modules with compiled functions: compiled or not, they are imported together."""
-    kept = (".layout", ".constants", ".compiling")
+    kept = (".layout", ".constants", ".compiling", ".references")
     return [name for name in sys.modules if name.startswith("railfix.kernels.") and not name.endswith(kept)]
 
 
@@ -31,8 +29,8 @@ def _compiled_modules() -> list[str]:
 def plain(name: str) -> ModuleType:
     """A module of `railfix.kernels` that the compiler has left alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numba.config, "DISABLE_JIT", True)
-        patch.setattr(compiling, "by_reference", compiling._as_it_is)
+        patch.setenv("NUMBA_DISABLE_JIT", "1")
+        patch.setattr(references, "by_reference", references._as_it_is)
         for attribute, value in list(vars(kernels).items()):
             if isinstance(value, ModuleType):
                 patch.setattr(kernels, attribute, value)  # an import sets it

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status
@@ -35,8 +35,8 @@ from railfix.positioning.carrier import PhasePositions, Slips
 from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
-from railfix.positioning.normal_equations import SinglePoint, misfit, position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.normal_equations import SinglePoint, misfit, point_position, position_on_line
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges, without
 from railfix.positioning.receiver_noise import (
     LastingErrorState,
     NoiseState,
@@ -64,6 +64,8 @@ class Solution:
     """Positions of one antenna, T epochs, before coordinates are dropped where the status says so."""
 
     point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
+    #: 3-D positions of the ranges that agree, without excluded ones; NaN where they contradict each other; (T, 3).
+    consistent_ecef_m: Floats
     point_status: Codes  #: `railfix.integrity.PointStatus`, shape (T,).
     fix: LineFix  #: Positions from the codes, after exclusions.
     ties: ClockTies  #: Inter-system biases known before each epoch.
@@ -101,6 +103,7 @@ def position_stage(
         [state.offsets for state in states], reference=CLOCK_GROUP[config.systems[0]], parts=antennas.parts,
         limits=TieLimits(config.single_point, config.robust_fit, config.clock_offsets),
     )  # fmt: skip
+    corrected = reject(corrected, points.gross, Reason.GROSS_ERROR)
     fix = fix_on_line(points.ranges, antennas, points.tied, config.fix_limits)
     corrected = reject(corrected, _alone_on_clock(corrected, points.ties), Reason.ALONE_ON_ITS_CLOCK)
     checked, noise = check_ranges(corrected, points.ranges, antennas, fix, config, states)
@@ -112,8 +115,10 @@ def position_stage(
         return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
 
     away, off_map_states = antennas.each_with_state(own_absence, states)
+    excluded = checked.lasting | checked.raim.excluded
+    agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
     offset, map_states = map_offset(
-        time, points.agreeing, points.free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
+        time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
     )  # fmt: skip
     raim = checked.raim
@@ -125,7 +130,8 @@ def position_stage(
     level, open_elsewhere = level_stage(corrected, positions, antennas, offset, config)
     sigma, carriers = _published(checked, slips, antennas, config, [state.carrier for state in states])
     solution = Solution(
-        point=points.point, point_status=validate_point(points.point, points.untied, scale, limits=config.single_point),
+        point=points.point, consistent_ecef_m=free.ecef_m,
+        point_status=validate_point(points.point, points.untied, scale, limits=config.single_point),
         fix=fix, ties=points.ties, raim=raim, status=np.zeros(len(time), dtype=np.int8), noise_scale=scale,
         own_sigma_m=sigma.own_m, arc_m=sigma.arc_m, along_sigma_m=sigma.along_m, phase=sigma.phase, protection=level,
         map_offset=offset, off_map=away,
@@ -166,6 +172,7 @@ class CheckedRanges(NamedTuple):
     raim: RaimResult
     scale: Floats  #: Noise scale of the receiver, shape (T,).
     off_map: Masks  #: Epochs whose ranges contradict the map, shape (T,).
+    lasting: Masks  #: Satellites that are wrong for long, shape (T, K).
 
 
 class NoiseStates(NamedTuple):
@@ -205,7 +212,8 @@ def check_ranges(
     def fit_on_line() -> tuple[RobustFit, Masks]:
         found = robust_on_line(ranges, antennas, fix.constrained, near_ecef_m=near, limits=config.robust_fit)
         arc = fix.constrained.arc_m
-        return found, np.isfinite(arc) & ~_off_map(ranges, antennas, fix, arc, config)
+        usable = np.isfinite(arc) & ~corrected.unsure & ~(found.variance > _LARGEST_VARIANCE)
+        return found, usable & ~_off_map(ranges, antennas, fix, arc, config)
 
     on_line, usable = fit_on_line()
     raised, raised_sums = robust_scale(on_line, usable, [state.lasting.noise for state in states])
@@ -227,7 +235,8 @@ def check_ranges(
     else:
         raim = compute_statistic(ranges, fix, robust, limits=config.raim)
     off_map = _off_map(ranges, antennas, fix, fix.constrained.arc_m, config)
-    usable = ~off_map & ~raim.faulty if on else np.zeros(len(time), dtype=np.bool_)
+    noisy = fix.constrained.wsse > _LARGEST_VARIANCE * np.maximum(ranges.redundancy, 1)
+    usable = ~(off_map | raim.faulty | corrected.unsure | noisy) & on
     scale, stated_sums = noise_scale(
         windows, fix.constrained.wsse, ranges.redundancy, usable, robust,
         np.array([noise.remaining for noise in noises]), limits=learning, least=least,
@@ -237,7 +246,37 @@ def check_ranges(
         for k, (when, age) in enumerate(windows.last)
     ]
     lasting_states = [copy_with(state, noise=raised_sums[k]) for k, state in enumerate(lasting_states)]
-    return CheckedRanges(corrected, ranges, fix, model, raim, scale, off_map), NoiseStates(stated, lasting_states)
+    return CheckedRanges(corrected, ranges, fix, model, raim, scale, off_map, lasting), NoiseStates(
+        stated, lasting_states
+    )
+
+
+#: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.
+_LARGEST_VARIANCE: Final = 1e4
+#: Probability that the residuals of consistent ranges fail the test below.
+_CONSISTENT: Final = 1e-3
+
+
+def _consistent(
+    agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
+) -> tuple[Ranges, SinglePoint]:
+    """Return ranges and 3-D positions that judge the map: without the `excluded` satellites where all ranges together
+    contradict each other, NaN where they still do or nothing tells which one is wrong.
+    """
+
+    def contradict(point: SinglePoint, ranges: Ranges) -> Masks:
+        freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
+        return np.asarray(point.wsse > chdtri(freedom, _CONSISTENT) * np.maximum(scale, 1.0) ** 2)
+
+    wrong = excluded & (agreeing.weight > 0) & contradict(free, agreeing)[:, None]
+    changed = np.flatnonzero(wrong.any(axis=1))
+    if len(changed):
+        agreeing = without(agreeing, wrong)
+        start = np.where(np.isnan(free.ecef_m), corrected.near_ecef_m, free.ecef_m)[changed]
+        solved = point_position(agreeing.take(changed), start, limits=config.single_point)
+        free = patch_rows(free, changed, solved)
+    unusable = corrected.unsure | contradict(free, agreeing)
+    return agreeing, copy_with(free, ecef_m=np.where(unusable[:, None], np.nan, free.ecef_m))
 
 
 class PublishedPositions(NamedTuple):

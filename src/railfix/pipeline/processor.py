@@ -298,7 +298,7 @@ class EpochProcessor:
         corrected, solution, own_states = position_stage(
             chunk.corrected, chunk.slips, antennas, self.config, own_states
         )
-        single = PositionEpochs(solution.point.ecef_m, solution.noise_scale, solution.ties)
+        single = PositionEpochs(solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties)
         interference, signs = judge_interference(
             corrected, single, antennas, [own.interference for own in own_states], self.config.interference
         )

@@ -50,7 +50,8 @@ def correct_ranges(
     sigma = np.broadcast_to(ANCHOR_SIGMA_M, raw.shape)
     ranges = weighted_ranges(satellites.states.position_ecef_m, raw, sigma, channels.clock)
     near = approximate_position(ranges, antennas, limits=config.single_point, section=config.section)
-    corrected = corrected_ranges(obs, channels, satellites, near.ecef_m, source, noise=config.noise)
+    corrected = corrected_ranges(obs, channels, satellites, near.ecef_m, source, gross=near.gross, noise=config.noise)
+    corrected = copy_with(corrected, unsure=near.unsure)
     if error_model is not None:
         corrected = _apply_error_model(error_model, corrected, antennas, near.arc_m, config)
     return corrected, near

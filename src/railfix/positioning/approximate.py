@@ -7,10 +7,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, Masks, patch_rows
 from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.gross_errors import gross_errors
 from railfix.positioning.normal_equations import SinglePointLimits, point_position
-from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.section_search import SectionLimits, find_section
 
 #: Standard deviation given to raw ranges for the approximate place of the antenna [m].
@@ -22,16 +23,18 @@ MAX_FROM_LINE_M: Final = 1e5
 
 
 class ApproximatePosition(NamedTuple):
-    """Positions of an antenna good to some hundred metres, T epochs."""
+    """Positions of an antenna good to some hundred metres, and raw codes that are wrong, T epochs by K channels."""
 
     ecef_m: Floats  #: Shape (T, 3).
     arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).
+    gross: Masks  #: Codes that are grossly wrong, shape (T, K).
+    unsure: Masks  #: Epochs in which a code is grossly wrong, and nothing tells which one; shape (T,).
 
 
 def approximate_position(
     ranges: Ranges, line: Line, *, limits: SinglePointLimits | None = None, section: SectionLimits | None = None
 ) -> ApproximatePosition:
-    """Return approximate positions of the antenna, good to some hundred metres (P1 2.2(2): delays are predicted there).
+    """Return approximate positions by the raw codes that are not grossly wrong (P1 2.2(2): delays are predicted there).
 
     The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
     the middle of the line at every epoch so that no epoch depends on another; the 3-D position
@@ -48,6 +51,12 @@ def approximate_position(
     antennas = AntennaRows.on(line)
     middle = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(ranges.code_m[rows]), axis=0))
     point = point_position(ranges, middle, limits=_rough(limits or SinglePointLimits()))
+    wrong = gross_errors(ranges, antennas, point)
+    again = np.flatnonzero(wrong.gross.any(axis=1))
+    if len(again):
+        ranges = without(ranges, wrong.gross)
+        retried = point_position(ranges.take(again), middle[again], limits=_rough(limits or SinglePointLimits()))
+        point = patch_rows(point, again, retried)
     near = point.ecef_m.copy()
     arc, solved = np.full(len(near), np.nan), np.isfinite(near[:, 0])
     for index, found in antennas.split(solved.nonzero()[0]):
@@ -60,7 +69,10 @@ def approximate_position(
         near[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
     for index, off in antennas.split(np.isnan(arc).nonzero()[0]):
         arc[off], _ = index.trajectory.nearest(near[off])
-    return ApproximatePosition(near, arc)
+    unsure = np.isfinite(wrong.unsure_arc_m)
+    arc = np.where(unsure, wrong.unsure_arc_m, arc)
+    near = np.where(unsure[:, None], antennas.at_arc(arc), near)
+    return ApproximatePosition(near, arc, wrong.gross, unsure)
 
 
 @lru_cache

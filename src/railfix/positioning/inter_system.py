@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Datetimes, Floats, patch_rows
+from railfix.core.arrays import Datetimes, Floats, Masks, patch_rows
 from railfix.core.epoch_rows import EVERY
+from railfix.positioning.gross_errors import gross_alone
 from railfix.positioning.normal_equations import SinglePoint, SinglePointLimits, point_position
 from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges, without
 from railfix.positioning.receiver_noise import ClockOffsetLimits, OffsetState, RobustFitLimits, robust_fit, tie_clocks
@@ -27,6 +28,7 @@ class PointPositions(NamedTuple):
     agreeing: Ranges
     free: SinglePoint
     ties: ClockTies
+    gross: Masks  #: Ranges that are alone on their clock and contradict the known biases grossly, shape (T, K).
 
 
 class TieLimits(NamedTuple):
@@ -80,11 +82,14 @@ def tie_constellations(
     ties, after = tie_clocks(
         time, clocks, reference, agreeing, free, states, parts=parts, limits=limits.clock_offsets
     )  # fmt: skip
+    alone = gross_alone(ranges, point.clock_m, ties)
+    if alone.any():
+        ranges = without(ranges, alone)
     tied, tied_ranges = point, ranges
     if len(ranges.groups) > 1:
         tied_ranges = replace(ranges, ties=ties)
         tied = _tie(tied_ranges, ties, point, start, limits.single_point)
-    return PointPositions(ranges, tied_ranges, point, tied, agreeing, free, ties), after
+    return PointPositions(ranges, tied_ranges, point, tied, agreeing, free, ties, alone), after
 
 
 def _tie(

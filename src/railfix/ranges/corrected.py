@@ -66,6 +66,8 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     #: Overbounding sigma and largest nominal bias of each range by an error model; 0 without one; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
+    #: A code is grossly wrong, but not clearly which one: such epochs are no evidence on noise and map; shape (T,).
+    unsure: Masks
     second: SecondCodes | None = None  #: Second codes of the satellites, where two frequencies are used.
     base: BaseDifferences | None = None  #: What a base station has subtracted.
 
@@ -137,6 +139,7 @@ def corrected_ranges(
     near_ecef_m: ArrayLike,
     source: CorrectionSource,
     *,
+    gross: Masks | None = None,
     noise: CodeNoise | None = None,
 ) -> CorrectedRanges:
     """Return corrected pseudoranges and their standard deviations (P1 2.2(2), 2.4).
@@ -152,6 +155,8 @@ def corrected_ranges(
         Of `find_satellites`.
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
         Approximate positions of the antenna, good to some hundred metres (`positioning.approximate_position`).
+    gross : ndarray of bool, shape (T, K), optional
+        Codes that are grossly wrong (`ApproximatePosition.gross`): rejected.
     noise : CodeNoise, optional
         Receiver noise and multipath by C/N0 and elevation.
 
@@ -169,6 +174,8 @@ def corrected_ranges(
     near = _check_near(near_ecef_m, len(time))
     code, cn0 = observations.code_m[:, channels.columns], observations.cn0_dbhz[:, channels.columns]
     states, reason = satellites.states, satellites.reason
+    if gross is not None:
+        reason = np.where(gross, reason | int(Reason.GROSS_ERROR), reason)
     observed = (reason & int(Reason.NOT_OBSERVED)) == 0
     seen = SeenFrom.of(near, states.position_ecef_m)
     given = source.delays(time, channels, satellites.source, seen)
@@ -195,7 +202,8 @@ def corrected_ranges(
         doppler_hz=observations.doppler_hz[:, channels.columns], cn0_dbhz=cn0, satellites=states, near_ecef_m=near,
         elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg, ionosphere_m=delays.ionosphere_m,
         troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma, nominal_m=given.nominal_m,
-        unmodelled_m=given.unmodelled_m, bound_sigma_m=none, bias_m=none, second=second, base=given.base,
+        unmodelled_m=given.unmodelled_m, bound_sigma_m=none, bias_m=none,
+        unsure=np.zeros(len(time), dtype=np.bool_), second=second, base=given.base,
         reason=np.where(lacking, int(Reason.NO_CORRECTION), reason),
     )  # fmt: skip
 

@@ -6,13 +6,12 @@ import functools
 import math
 from typing import Any, Final
 
-import numba
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import borrowing
+from railfix.kernels.compiling import borrowing, is_plain
 from railfix.kernels.tracking.layout import LANES
 
 _SHORT: Final = ir.IntType(32)
@@ -105,7 +104,7 @@ def _add_rows(_: Any, target: Any, origin: Any, by: Any, left: Any, source: Any,
 #: Write ``origin[start + c] + sum over k of by[scale + k] left[first + step k] source[begin + stride k + c]`` into
 #: ``target[at + c]`` for rows from `low` to below `high` and the columns below `width`, a number of whole vectors. All
 #: places are those in the flat arrays.
-add_rows: Final[Any] = _add_rows_plain if numba.config.DISABLE_JIT else _add_rows  # type: ignore[attr-defined]
+add_rows: Final[Any] = _add_rows_plain if is_plain() else _add_rows
 
 
 @borrowing

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import borrowing, borrowing_kernel, by_reference
+from railfix.kernels.compiling import borrowing, borrowing_kernel
 from railfix.kernels.tracking.algebra import invert, log_determinant, restart
 from railfix.kernels.tracking.branches import keep_hypotheses, leading, reweigh
 from railfix.kernels.tracking.constants import (
@@ -85,6 +85,7 @@ from railfix.kernels.tracking.measurements import (
 )
 from railfix.kernels.tracking.monitors import contradiction, watch
 from railfix.kernels.tracking.prediction import add_bend, possible, predict
+from railfix.kernels.tracking.references import by_reference
 from railfix.kernels.tracking.update import apply_update, first_weights, mean_weights, reweight, second_start
 
 
