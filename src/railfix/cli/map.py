@@ -11,14 +11,13 @@ import typer
 
 from railfix.cli.command import Command, command_group
 from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_table
-from railfix.cli.map_network import RUN_ALONE, Columns, MapReading, match_command, network, route
+from railfix.cli.map_network import RUN_ALONE, MapReading, match_command, network, route
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.core.tables import plain_table, plural
-from railfix.io.position_log import column_names
 from railfix.io.positions import read_positions
-from railfix.run.inputs import TrackReading
+from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import (
     MapLimits,
     Thinned,
@@ -184,6 +183,7 @@ def features(
 
 
 @app.command("from-positions", cls=Command)
+@from_models
 def from_positions_command(
     positions: Annotated[
         Path,
@@ -204,7 +204,7 @@ def from_positions_command(
     max_sigma: Annotated[
         float | None, typer.Option(metavar="M", help="Largest standard deviation of a position, any axis.")
     ] = None,
-    column: Columns = None,
+    columns: ColumnNames,
     name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -221,7 +221,7 @@ def from_positions_command(
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[positions])
-    log = read_positions(positions, columns=column_names(column or ()))
+    log = read_positions(positions, **columns.arguments)
     track, thinned = from_position_log(
         log, spacing_m=spacing, quality=_qualities(quality), max_sigma_m=max_sigma, name=name or positions.stem
     )

@@ -13,10 +13,9 @@ import typer
 from railfix.cli.console import TableConsole, show_files, show_notes, show_table, show_verdict
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, resolve_settings
 from railfix.core.errors import SettingsError
-from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import Column, count, listing, number, percent, plain_table, plural
-from railfix.run.inputs import BROKEN_LINES, ColumnNames, LogReading
+from railfix.run.inputs import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
 #: Share of the epochs of a stretch within the alarm limit from which satellites serve there.
@@ -93,7 +92,6 @@ class SurveyFiles(Settings):
     )
     picture: Path | None = option("Picture of map, runs and standard deviations (.png or .svg).", None, metavar="FILE")
     name: str | None = option("Name of the track; else that of the file.", None, metavar="NAME")
-    broken_lines: BrokenLines = BROKEN_LINES
 
 
 @from_models
@@ -134,7 +132,6 @@ def survey(
     surveyed = survey_files(
         runs, files.nav, settings,
         limits=limits, name=files.name or out.stem, reading=reading, columns=columns.names,
-        broken_lines=files.broken_lines,
     )  # fmt: skip
     result = surveyed.survey
     track = result.track

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, copy_with
+from railfix.core.channel_state import join_channels
 from railfix.integrity.raim import LinearModel, linear_model
 from railfix.integrity.raim.model import update_model
 from railfix.positioning.antenna_rows import AntennaRows, Line
@@ -18,6 +19,8 @@ from railfix.positioning.windows import Windows
 
 #: Below this share of its own error in its residual a range shows nothing of it.
 _LEAST_REDUNDANCY: Final = 0.1
+#: A mean that is smaller is forgotten.
+_FORGOTTEN: Final = 1e-12
 #: Degrees of freedom that are left, so that the rest is still checked.
 _LEAST_FREEDOM: Final = 2
 
@@ -77,11 +80,14 @@ def reject_persistent_biases(
         window_s=lasting.memory_s, least_epochs=lasting.memory_s,
     )  # fmt: skip
     share = np.minimum(windows.step_s, 1.0)[:, None] / lasting.memory_s
-    sums = np.stack([_arrange(state, channel, lasting.most_satellites) for state in states], axis=1)
+    joined = join_channels(channel, [state.channel for state in states], [_is_remembered(state) for state in states])
+    sums = np.zeros((lasting.most_satellites, len(states), len(joined.channel)))
+    for k, state in enumerate(states):
+        sums[: state.sums.shape[1], k] = joined.arrange(state.sums.T, 0.0, k)
     error = _own_errors(model, noise, lasting.clipped)
     for turn in range(lasting.most_satellites):
-        mean, sums[turn] = windows.sums(share * error, sums[turn])
-        found = _find_worst(mean, ranges, lasting.share)
+        mean, sums[turn] = windows.sums(joined.widen(share * error, 0.0), sums[turn])
+        found = _find_worst(mean[:, : joined.present], ranges, lasting.share)
         if not found.any():
             continue
         found &= (without(ranges, found).redundancy >= _LEAST_FREEDOM)[:, None]
@@ -93,7 +99,7 @@ def reject_persistent_biases(
             model = update_model(model, ranges, antennas, fix.constrained, solved)
             error = _own_errors(model, noise, lasting.clipped)
     after_states = [
-        copy_with(state, time=when, age=age, channel=channel, sums=sums[:, k].T) if len(time[rows]) else state
+        copy_with(state, time=when, age=age, channel=joined.channel, sums=sums[:, k].T) if len(time[rows]) else state
         for k, (rows, state, (when, age)) in enumerate(zip(antennas.parts, states, windows.last, strict=True))
     ]
     return PersistentBiases(ranges, fix, model, left_out), after_states
@@ -109,19 +115,14 @@ def _find_worst(mean: Floats, ranges: Ranges, share: float) -> Masks:
     return found & used
 
 
+def _is_remembered(state: LastingErrorState) -> Masks:
+    """Return the channels whose means are not forgotten, shape (S,)."""
+    return np.asarray((np.abs(state.sums) > _FORGOTTEN).any(axis=1))
+
+
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
     """Return the residuals over their standard deviations, clipped, over `clipped`; 0 where nothing checks a range."""
     checked = model.redundancy > _LEAST_REDUNDANCY
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
     own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]
     return np.asarray(np.minimum(np.maximum(own, -clipped), clipped) / clipped)
-
-
-def _arrange(state: LastingErrorState, channel: Strings, turns: int) -> Floats:
-    """Return the sums by turn for some channels, shape (P, K): 0 for new ones; those that are gone are forgotten."""
-    if state.channel is channel:
-        return state.sums.T
-    start = np.zeros((turns, len(channel)))
-    _, here, there = np.intersect1d(channel, state.channel, return_indices=True)
-    start[: state.sums.shape[1], here] = state.sums[there].T
-    return start

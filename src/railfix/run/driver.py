@@ -141,17 +141,18 @@ def open_inputs(
     inputs: RunInputs, options: RunOptions, config: Config
 ) -> tuple[Navigation, OpenedLine, dict[Antenna, Log]]:
     """Read navigation and line, and open the logs, by antenna; find the route in a network of tracks."""
-    navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=options.logs.instant)
+    navigation = read_navigation(inputs.nav, **options.logs.arguments)
     if inputs.sp3:
         from railfix.io.sp3 import read_sp3
 
-        navigation = replace(navigation, precise=read_sp3(inputs.sp3))
+        precise = read_sp3(inputs.sp3)
+        navigation = replace(navigation, precise=precise, notes=(*navigation.notes, *precise.notes))
     at = find_record_time(navigation)
 
     def open_log(paths: tuple[Path, ...]) -> Log:
         return Log(
-            paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, start=options.start,
-            end=options.end, date=options.logs.instant, reader=options.logs.reader,
+            paths=paths, chunk_epochs=options.chunk_epochs, start=options.start, end=options.end,
+            reading=options.logs,
         )  # fmt: skip
 
     from railfix.run.route import LogPositions

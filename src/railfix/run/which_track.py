@@ -265,7 +265,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front one")
     if (inputs.last is None) != (options.moved is None):
         raise SettingsError("the last place needs --last and --moved, the distance moved since (0: none)")
-    navigation = read_navigation(inputs.nav, date=options.logs.instant)
+    navigation = read_navigation(inputs.nav, **options.logs.arguments)
     base = None
     if options.base_place is not None:
         base = _observations(inputs.base, options), parse_position(options.base_place, "--base-place")
@@ -308,15 +308,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
 
 
 def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observations:
-    logs = options.logs
-    log = Log(
-        paths=paths,
-        chunk_epochs=3000,
-        start=options.start,
-        end=options.end,
-        date=logs.instant,
-        reader=logs.reader,
-    )
+    log = Log(paths=paths, chunk_epochs=3000, start=options.start, end=options.end, reading=options.logs)
     parts = list(log.parts())
     if not parts:
         raise InputFileError(paths[0], "there is no epoch in the time asked for")

@@ -113,10 +113,14 @@ class Matched:
 
 
 def read_plan_positions(
-    path: FilePath, *, columns: Mapping[str, str] | None = None, broken_lines: BrokenLines = "stop"
+    path: FilePath,
+    *,
+    columns: Mapping[str, str] | None = None,
+    broken_lines: BrokenLines = "stop",
+    date: np.datetime64 | None = None,
 ) -> PlanLog:
     """Read positions in plan from any log of positions (`railfix.io.read_positions`), with its heights and sigmas."""
-    log = read_positions(path, broken_lines=broken_lines, columns=columns, heights="optional")
+    log = read_positions(path, broken_lines=broken_lines, date=date, columns=columns, heights="optional")
     latitude, longitude, height = log.geodetic
     return PlanLog(
         path=str(path),
