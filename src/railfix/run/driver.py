@@ -38,6 +38,7 @@ from railfix.run.verdict import Verdict, judge_run
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
+from railfix.track.vehicle import read_vehicle
 
 if TYPE_CHECKING:
     from railfix.run.batch_check import BatchCheck
@@ -157,10 +158,11 @@ def open_inputs(
 
     from railfix.run.route import LogPositions
 
-    paths = next(iter(inputs.logs.values()))
+    antenna, paths = next(iter(inputs.logs.items()))
+    offset = None if inputs.vehicle is None else read_vehicle(inputs.vehicle).antennas.get(antenna)
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
-        reading=options.track,
+        reading=options.track, antenna_up_m=0.0 if offset is None else offset.up_m,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
@@ -314,7 +316,7 @@ def collect_notes(
     notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [
-            f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
+            f"{name}: screen {screen.name} tested nothing; it needs {screen.needs}"
             for screen in SCREENS
             if antenna.judged.get(screen.name) is False
         ]
@@ -324,7 +326,7 @@ def collect_notes(
         for by, counts in (("single epochs", antenna.lasting), ("the filter", antenna.left_out)):
             notes += [
                 f"{name}: {by} left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
-                "over a minute they contradict all others"
+                "inconsistent with the others for over a minute"
                 for satellite, (count, first) in sorted(counts.items(), key=lambda item: -item[1][0])[:_NAMED]
             ]
         offset = antenna.map_offset
@@ -350,8 +352,8 @@ def _describe_detectable(detectable_m: Floats) -> str:
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
     return (
-        f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
-        f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
+        f"map errors smaller than {across:.0f} m laterally or {up:.0f} m in height cannot be detected; where the "
+        f"ranges are worst, smaller than {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
 
 
