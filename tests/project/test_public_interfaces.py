@@ -149,6 +149,7 @@ def sources() -> dict[str, str]:
     return {str(path.relative_to(SRC)): path.read_text(encoding="utf-8") for path in sorted(SRC.rglob("*.py"))}
 
 
+@pytest.mark.requirement("S2")
 def test_only_documented_interfaces_of_other_packages_are_used(sources: dict[str, str]) -> None:
     own = own_names([ast.parse(text) for text in sources.values()])
     found = {name: faults for name, text in sources.items() if (faults := find_faults(text, own))}

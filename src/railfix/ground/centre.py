@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from railfix.core.arrays import Floats, freeze_arrays
 from railfix.core.settings import Settings
-from railfix.io.train_message import MessageStatus, TrainMessage
+from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Acceleration of the reference run curve [m/s^2]; a train this near to a station is at it [m].
 _RUN_MPS2, _AT_STATION_M = 0.5, 25.0
@@ -154,6 +154,8 @@ class Rejection(Enum):
     EARLIER_START = "of an earlier start on board"
     FAR_AHEAD = "number further ahead than a train can have counted; start its unit again"
     NO_PLACE = "without a place"
+    NO_FACING = "the direction in which the front end looks is unknown"
+    NO_FRONT_END = "where the front end is is unknown"
     TOO_OLD = "place too old when it was sent, or later than the train's clock; set that clock"
 
 
@@ -185,8 +187,12 @@ def report_received(
             return replace(record, rejected=Rejection.FAR_AHEAD.value), Rejection.FAR_AHEAD
     record, age_ns = replace(record, sequence=message.sequence, counted_s=now_s), message.sent_ns - message.time_ns
     reason = None
-    if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING) or message.facing == 0:
+    if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING):
         reason = Rejection.NO_PLACE
+    elif message.facing == 0:
+        reason = Rejection.NO_FACING
+    elif Unknown.FRONT_END in message.unknown:
+        reason = Rejection.NO_FRONT_END
     elif not -limits.clock_s * 1e9 <= age_ns <= limits.age_s * 1e9:
         reason = Rejection.TOO_OLD
     record = replace(record, rejected=None if reason is None else reason.value)

@@ -13,6 +13,7 @@ from railfix.core.settings import option
 from railfix.ground.authority import Authority, BrakeOrder
 from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, supervise
 from railfix.ground.links import LinkMode
+from railfix.ground.positions import Clock
 
 #: Way back of the safe front end that is no error of two places [m].
 ROLLED_M: Final = 50.0
@@ -30,6 +31,9 @@ class OnBoardLimits(BrakeLimits):
     )
     #: A train without a place runs on from the last one for this time, at that one's highest speed; then it brakes.
     placeless_s: float = Field(default=5.0, ge=0)
+    clock: Clock = option(
+        "Positions are of a recording: report each as of now, at the recording's own pace.", "live", name="--replay"
+    )
     mode: LinkMode = option("Send reports over bearer A alone, and over B while A fails.", "both", name="--spare")
 
 

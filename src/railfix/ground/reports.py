@@ -17,7 +17,7 @@ from typing import Final
 
 from railfix.ground.layout import Layout
 from railfix.ground.state import Interlocking, InterlockingLimits, TrainInterval, with_train
-from railfix.io.train_message import MessageStatus, TrainMessage
+from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Difference of a reported length from the configured one that is rounding [m].
 LENGTH_ROUNDING_M: Final = 0.02
@@ -35,7 +35,8 @@ HOLDS_MORE: Final = "the train holds an authority beyond its interval,"
 def is_placed(message: TrainMessage) -> bool:
     """Return whether a report has a place with both bounds, of a train whose front end is known."""
     known = None not in (message.chainage_cm, message.over_cm, message.under_cm)
-    return known and message.status in (MessageStatus.POSITION, MessageStatus.COASTING) and message.facing != 0
+    placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
+    return known and placed and message.facing != 0 and Unknown.FRONT_END not in message.unknown
 
 
 def is_newer(known: TrainInterval, message: TrainMessage) -> bool:

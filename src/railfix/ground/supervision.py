@@ -88,7 +88,7 @@ class Supervision:
             self.state = answer_received(self.state, message)
             self.heard.add(number)
             self.awaited.discard(number)
-        if reason in (None, Rejection.NO_PLACE, Rejection.TOO_OLD):
+        if reason not in (Rejection.REPEATED, Rejection.EARLIER_START, Rejection.FAR_AHEAD):
             self._take_answer(message)
         return reason
 

@@ -38,6 +38,9 @@ from railfix.kernels.tracking.layout import (
 )
 from railfix.kernels.tracking.learning import is_faulty
 
+#: Times since that differ by less are equal: their rounding depends on where a chunk begins [s].
+TIE_S = 1e-6
+
 
 @borrowing
 def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, state: KernelState, outputs: Outputs) -> float:
@@ -50,7 +53,7 @@ def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, state: Kerne
         coded = coded or epochs.has[0, t, k]
     if not coded:
         return float(dt)
-    recent = epochs.motion_measured[t] and since < parameters.code_period_s - 0.5 * dt
+    recent = epochs.motion_measured[t] and since < parameters.code_period_s - 0.5 * dt - TIE_S
     code_s = 0.0 if recent else min(max(since, dt), max(parameters.code_period_s, dt))
     for k in range(epochs.has.shape[2]):
         if recent:
