@@ -256,8 +256,9 @@ class ControlCentre:
 
     def _order(self, order: BrakeOrder, now: float) -> None:
         """Send an order to brake."""
-        if (known := self.stops.get(order.train)) is None or known.number != order.number:
-            self.stops[order.train] = StopOrder(number=order.number, sent_s=now)
+        first = self.supervision.ordered[order.train][1]
+        if (known := self.stops.get(order.train)) is None or known.number != first:
+            self.stops[order.train] = StopOrder(number=first, sent_s=now)
         self.send(order.train, order.encode())
 
     def _send(self, authority: Authority) -> None:
