@@ -9,12 +9,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
+from railfix.core.errors import NoPositionError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
@@ -39,9 +40,6 @@ from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
 from railfix.track.vehicle import read_vehicle
-
-if TYPE_CHECKING:
-    from railfix.run.batch_check import BatchCheck
 
 
 class Progress(Protocol):
@@ -103,7 +101,6 @@ def run_files(
         rows = ResultRows(
             folder=folder, line=line, observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
-            batches=_batches(logs, line) if options.check == "batch" else {},
             passings=balises is not None, replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )  # fmt: skip
         tally = _position(logs, (sensors, base), processor, rows, beside, progress)
@@ -118,7 +115,6 @@ def run_files(
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
             *shorten_notes(rows.balise_notes),
-            *rows.compare_batches(),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
@@ -131,11 +127,14 @@ def run_files(
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
+        verdict = judge_run(record)
+        if not any(antenna.leading.positions for antenna in verdict.antennas):
+            raise NoPositionError(f"not one position is promised: {'; '.join(verdict.lines())}")
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
-    return RunSummary(tally=tally, record=record, verdict=judge_run(record), files=files, wall_s=wall)
+    return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
 
 
 def open_inputs(
@@ -225,13 +224,6 @@ def _position(
     if written is not None:
         written.result()
     return tally
-
-
-def _batches(logs: Iterable[Antenna], line: OpenedLine) -> dict[str, BatchCheck]:
-    """Return the checks of each antenna; loaded when asked for: 0.03 s."""
-    from railfix.run.batch_check import BatchCheck
-
-    return {name: BatchCheck(trajectory=line.trajectories[name]) for name in logs}
 
 
 def _screen_chunks(
