@@ -15,13 +15,15 @@ import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
+from railfix.core.errors import NoPositionError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
-from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.state import State
 from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
@@ -125,11 +127,14 @@ def run_files(
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
+        verdict = judge_run(record)
+        if not any(antenna.leading.positions for antenna in verdict.antennas):
+            raise NoPositionError(f"not one position is promised: {'; '.join(verdict.lines())}")
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
-    return RunSummary(tally=tally, record=record, verdict=judge_run(record), files=files, wall_s=wall)
+    return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
 
 
 def open_inputs(
@@ -225,7 +230,7 @@ def _screen_chunks(
     chunks: Iterator[dict[str, Observations]],
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
-) -> Iterator[ScreenedChunk]:
+) -> Iterator[Chunk]:
     """Yield the screened ranges of chunks, each with what sensors and base station measured up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
@@ -237,11 +242,11 @@ def _screen_chunks(
         yield screened
 
 
-def _single_epochs(screened: Iterator[ScreenedChunk], processor: EpochProcessor) -> Iterator[SolvedChunk]:
+def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iterator[Chunk]:
     """Yield the single epochs of chunks."""
     state = State()
     for chunk in screened:
-        solved, state = processor.single_epochs(chunk, state)
+        solved, state = processor.position(chunk, state)
         yield solved
 
 
