@@ -1,17 +1,17 @@
 """Sources of faults that the level of the filtered position has a sub-filter for, and its budget of risk.
 
-`railfix.kernels.tracking.level` has the sub-filters and the level.
+`railfix.kernels.tracking.subfilters` has the sub-filters, `railfix.kernels.tracking.level` the level.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
 from typing import Final
 
 from scipy.special import ndtri
 
-from railfix.core.arrays import dataclass
 from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits

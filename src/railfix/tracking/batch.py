@@ -13,14 +13,14 @@ Errors of codes last a minute: with 2 tau / dt epochs to one independent error e
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from railfix.core.arrays import Datetimes, Floats, Indices, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory

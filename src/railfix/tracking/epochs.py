@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 
 
 class Kind(IntEnum):

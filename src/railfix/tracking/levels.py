@@ -11,12 +11,12 @@ with the risk of L and that of V, which is a hundredth of it.
 
 from __future__ import annotations
 
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, copy_with, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, copy_with
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import SCALE_BOUND
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs
