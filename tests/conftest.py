@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 from collections import Counter
-from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -27,21 +25,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     options = session.config.option
     if getattr(options, "numprocesses", None) and not options.collectonly:
         prepare_kernels()
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Generator[None, object, object]:
-    """Tests and modules stay until the end: the collector of garbage need not look at them again and again.
-
-    It would after the first live session, which collects garbage as it begins and unfreezes as it ends.
-    """
-    gc.disable()
-    try:
-        return (yield)
-    finally:
-        gc.freeze()
-        gc.unfreeze = lambda: None
-        gc.enable()
 
 
 @pytest.fixture(scope="session")

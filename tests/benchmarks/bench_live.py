@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import cProfile
-import gc
 import pstats
 import time
 from collections.abc import Mapping
@@ -99,7 +98,6 @@ def main() -> None:
     gap = round(options.gap / PERIOD_S)
     loaded = kernels.load()
     processor, observations = prepared(options.run, options.epochs + WARM_UP + gap, config)
-    gc.freeze()  # as `railfix live` does where a session begins
     if gap and min(map(len, observations.values())) < GAP_AT + gap + 20:
         raise SystemExit(f"the run is too short for a gap of {options.gap:g} s; give a longer one with --run")
     channels = {name: len(whole.satellite) for name, whole in observations.items()}

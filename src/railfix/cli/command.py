@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import errno
-import gc
 import os
 import re
 import select
@@ -14,7 +13,6 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib import import_module
-from importlib.util import LazyLoader, find_spec, module_from_spec
 from itertools import pairwise
 from typing import Any, ClassVar, Final, NoReturn
 
@@ -151,28 +149,10 @@ class LazyCommands(Commands):
         return name, load_command(str(name), self.modules.get(str(name))) if name in self.summaries else command, rest
 
 
-def _put_off(package: str, *modules: str) -> None:
-    """Load modules of a package when something of them is used, not when they are imported."""
-    for module in modules:
-        name = f"{package}.{module}"
-        if name in sys.modules or (spec := find_spec(name)) is None or spec.loader is None:
-            continue
-        spec.loader = LazyLoader(spec.loader)
-        sys.modules[name] = module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-        setattr(sys.modules[package], module, sys.modules[name])
-
-
 def load_command(name: str, module_name: str | None = None) -> Any:
     """Return a command, imported from its module in `railfix.cli`: by default that of its name."""
     word = name.replace("-", "_")
-    gc.disable()  # nothing of what an import makes is garbage: looking for it takes a tenth of the start
-    _put_off("numpy", "f2py", "testing")  # scipy imports all of numpy, and uses neither: 0.07 s
-    try:
-        module = import_module(f"railfix.cli.{module_name or word}")
-    finally:
-        gc.freeze()
-        gc.enable()
+    module = import_module(f"railfix.cli.{module_name or word}")
     app = getattr(module, "app", None)
     if app is None:
         app = typer.Typer(**_TYPER)
@@ -187,7 +167,6 @@ def run_program(app: typer.Typer) -> NoReturn:
     for name, handler in (("SIGTERM", _raise_exit), ("SIGHUP", _raise_exit), ("SIGPIPE", _end_at_closed_pipe)):
         if number := getattr(signal, name, None):
             signal.signal(number, handler)
-    sys.unraisablehook = _raise_again
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         try:
@@ -202,28 +181,12 @@ def run_program(app: typer.Typer) -> NoReturn:
         typer.echo(f"railfix: error: the standard output cannot be written ({error.strerror})", err=True)
         code = OutputError.exit_code
     _discard_output()
-    gc.freeze()  # the end of the interpreter looks through everything loaded for garbage: 0.5 s with numba
     sys.exit(code)
 
 
 def _raise_exit(number: int, _frame: object) -> None:
     """End by way of an exception, so that staging folders are removed."""
-    signal.signal(number, signal.SIG_IGN)
     raise SystemExit(SIGNALLED + number)
-
-
-def _raise_again(unraisable: Any) -> None:
-    """Raise an exit once more that was raised, and lost, in a callback of the compiler or in a destructor."""
-    end = unraisable.exc_value
-    if not isinstance(end, SystemExit) or not hasattr(signal, "setitimer"):
-        sys.__unraisablehook__(unraisable)
-        return
-
-    def raise_end(*_: object) -> None:
-        raise SystemExit(end.code)
-
-    signal.signal(signal.SIGALRM, raise_end)
-    signal.setitimer(signal.ITIMER_REAL, 0.05)
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:

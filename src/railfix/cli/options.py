@@ -6,6 +6,7 @@ import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import date, datetime
 from functools import wraps
 from pathlib import Path
@@ -15,7 +16,6 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import typer
 from pydantic import ValidationError
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import SettingsError
 from railfix.core.settings import INPUTS, Settings, option, read_toml
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from html import escape
 from os import PathLike
@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 from polars.exceptions import PanicException, PolarsError
 
-from railfix.core.arrays import Datetimes, Floats, dataclass
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
 
 

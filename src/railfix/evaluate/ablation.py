@@ -5,13 +5,14 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.core.reasons import Status
 from railfix.evaluate.figures import Score, score

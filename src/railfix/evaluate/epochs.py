@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass, places_in_groups
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, places_in_groups
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import EvaluationOptions, RunFolder, Sections, floats

@@ -7,6 +7,7 @@ of a minute nearly are.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from math import nan
 from typing import Final
@@ -14,7 +15,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.reasons import Status
 from railfix.evaluate.inputs import EvaluationOptions, floats
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -13,7 +14,7 @@ import polars.selectors as cs
 from polars.exceptions import PolarsError
 from pydantic import AfterValidator, Field
 
-from railfix.core.arrays import Floats, Strings, dataclass
+from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
 from railfix.core.settings import INPUTS, Settings, option

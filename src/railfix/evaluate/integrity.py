@@ -7,12 +7,13 @@ other position counts as having an infinite level. `all`: every level counts, wh
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Masks, Strings, dataclass
+from railfix.core.arrays import Floats, Masks, Strings
 from railfix.evaluate.figures import ALL, KEYS, PASSED
 from railfix.evaluate.inputs import WINDOWS_S, EvaluationOptions, floats, words
 from railfix.integrity.stanford import Region, Stanford, stanford

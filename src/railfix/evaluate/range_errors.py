@@ -6,7 +6,7 @@ Common errors are those that a nearby reference station has measured; of the err
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix import __version__
-from railfix.core.arrays import Datetimes, Floats, Strings, dataclass, join_rows
+from railfix.core.arrays import Datetimes, Floats, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import file_sha256
 from railfix.core.geodesy import range_with_rotation

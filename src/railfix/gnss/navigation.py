@@ -7,21 +7,12 @@ Units are those of the interface documents (SI, radians). Absent is NaN (NaT for
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 
-from railfix.core.arrays import (
-    Datetimes,
-    Floats,
-    FrozenArrays,
-    Integers,
-    Strings,
-    dataclass,
-    freeze_arrays,
-    freeze_rows,
-)
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Strings, freeze_arrays, freeze_rows
 from railfix.core.tables import NotebookTable, plural, time_span_text
 
 

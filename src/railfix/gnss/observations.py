@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import chain, groupby, islice, pairwise
 from operator import itemgetter
@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, copy_with, dataclass, freeze_arrays
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, copy_with, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
 from railfix.core.tables import NotebookTable, plural, time_span_text
 from railfix.core.timescale import gps_time

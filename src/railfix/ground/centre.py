@@ -9,14 +9,14 @@ Reference run curve: place over running time of one direction, for simulated run
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from railfix.core.arrays import Floats, dataclass, freeze_arrays
+from railfix.core.arrays import Floats, freeze_arrays
 from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from typing import Final, NamedTuple
 
 from pydantic import Field
 
-from railfix.core.arrays import dataclass
 from railfix.core.settings import Settings
 
 _HEAD: Final = struct.Struct("!BIQq")

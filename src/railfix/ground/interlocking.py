@@ -15,14 +15,13 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, along, overlap

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation

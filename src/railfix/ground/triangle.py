@@ -11,7 +11,7 @@ The monitor is a pure state machine, suspension of satellite positioning with a 
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 from pathlib import Path
 from typing import Final, Self
@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from pydantic import Field, model_validator
 
-from railfix.core.arrays import Codes, Floats, FrozenArrays, Integers, Masks, dataclass
+from railfix.core.arrays import Codes, Floats, FrozenArrays, Integers, Masks
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option
 from railfix.ground.station_fixes import StationFixes

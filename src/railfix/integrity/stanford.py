@@ -14,13 +14,14 @@ Every epoch is in one region. With an alarm limit AL, the level PL and the absol
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
 _BINS: Final = 100  #: Bins of an axis, up to twice the alarm limit.
 _GAP: Final = 1.5  #: Epochs whose distance is over this many usual intervals stand across a gap.

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Integers, Strings, dataclass
+from railfix.core.arrays import Floats, Integers, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, dataclass
+from railfix.core.arrays import Datetimes
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, ending, read_text, read_text_lines
 from railfix.core.geodesy import ecef_from_geodetic

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending, read_text
 from railfix.core.geodesy import ecef_from_geodetic

@@ -8,6 +8,7 @@ coordinates), ``speed_mps``, ``sigma_m`` along the track, ``source`` (``rtk``, `
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +16,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings, dataclass, freeze_rows
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending
 from railfix.core.tables import reading_table

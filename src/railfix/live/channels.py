@@ -6,7 +6,6 @@ messages with digests of its stages. At the first difference the output stops an
 
 from __future__ import annotations
 
-import gc
 import hashlib
 import multiprocessing
 from collections.abc import Callable, Sequence
@@ -69,7 +68,6 @@ def _second_channel(
     """The second process: carries out calls, in lists, until the connection closes."""
     engine = LiveEngine(processor, settings, sensors)
     kernels.load()
-    gc.freeze()  # as the first channel's
     connection.send(_READY)
     while True:
         try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -154,7 +153,6 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
             engine.add_samples(table)
             if hooks.sensed is not None:
                 hooks.sensed(table)
-        gc.freeze()  # what is loaded stays: looking through it for garbage would hold an epoch up for 0.1 s
         session = asyncio.create_task(
             run_session(
                 engine,

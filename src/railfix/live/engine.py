@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
@@ -35,8 +33,6 @@ from railfix.ranges.sbas import from_receiver
 
 #: Items that may wait for the processor before a source is held back.
 _LONGEST_QUEUE: Final = 64
-#: Messages between two collections of garbage, in idle time.
-_BETWEEN_COLLECTIONS: Final = 100
 #: How often the status is shown [s].
 _STATUS_S: Final = 0.5
 
@@ -102,9 +98,6 @@ async def run_session(
     replay = speed is None and not sensors and all(is_file(source) for source in sources.values())
     session.streams = {name: (streams or {}).get(name) or fresh_state(source, date) for name, source in sources.items()}
     queue: _Queue = asyncio.Queue(_LONGEST_QUEUE)
-    gc.collect()
-    gc.freeze()
-    gc.disable()  # collections come in idle time
     if not replay:
         engine.start(now_ns=time.monotonic_ns())
     if any(is_file(source) for source in sources.values()):
@@ -126,8 +119,6 @@ async def run_session(
             for pump in pending:
                 pump.cancel()
             await asyncio.wait(pending, timeout=1.0)
-        gc.enable()
-        gc.unfreeze()
     return session.metrics
 
 
@@ -148,7 +139,6 @@ class _Session:
     place: bytes = b""
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
-    since_collection: int = 0
     reserved_from: int = 0
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
@@ -278,7 +268,7 @@ class _Session:
         return outputs
 
     def in_idle_time(self, outputs: Sequence[LiveOutput]) -> None:
-        """Status, state and garbage, while no data wait."""
+        """Status and state, while no data wait."""
         now = time.monotonic()
         if self.hooks.show is not None and outputs and now - self.shown >= _STATUS_S:
             self.shown = now
@@ -287,10 +277,6 @@ class _Session:
         if outputs and (now - self.saved >= self.engine.settings.state_every_s or 2 * used > self.reserved):
             self.saved, self.reserved_from = now, outputs[-1].message.sequence
             self.save(reserved=self.reserved)
-        self.since_collection += len(outputs)
-        if self.since_collection >= _BETWEEN_COLLECTIONS:
-            self.since_collection = 0
-            gc.collect()
 
     @property
     def reserved(self) -> int:

@@ -10,11 +10,11 @@ import sys
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings

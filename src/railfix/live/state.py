@@ -14,13 +14,13 @@ import os
 import pickle
 import platform
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 import railfix
-from railfix.core.arrays import dataclass
 from railfix.core.errors import OutputError
 from railfix.core.files import file_sha256, source_commit
 from railfix.core.settings import Settings

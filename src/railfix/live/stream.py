@@ -11,12 +11,12 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Indices, dataclass
+from railfix.core.arrays import Bytes, Indices
 from railfix.core.errors import InputFileError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations

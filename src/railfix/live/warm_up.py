@@ -6,7 +6,6 @@ live session it would delay epochs by seconds, in a run nobody would know why no
 
 from __future__ import annotations
 
-import gc
 import os
 import subprocess
 import sys
@@ -83,18 +82,11 @@ def _say(text: str) -> None:
 
 
 def _run(settings: _Settings) -> None:
-    """Process epochs of the demonstration at once and one by one: kernels are compiled for the arrays of both.
-
-    Nearly all that the compiler makes stays: looking for what does not took an eighth of the time.
-    """
-    gc.disable()
-    try:
-        with keep_resolutions():
-            _process(settings)
-            if settings is _STAGES:
-                _look_beyond()
-    finally:
-        gc.enable()
+    """Process epochs of the demonstration at once and one by one: kernels are compiled for the arrays of both."""
+    with keep_resolutions():
+        _process(settings)
+        if settings is _STAGES:
+            _look_beyond()
 
 
 def _process(settings: _Settings) -> None:

@@ -7,12 +7,12 @@ doi:10.1137/0714050; the result is that of H. E. Rauch, F. Tung, C. T. Striebel 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, dataclass
+from railfix.core.arrays import Floats, Indices
 
 
 @dataclass(frozen=True, kw_only=True)

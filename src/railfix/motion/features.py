@@ -7,11 +7,12 @@ the features before agrees, the other quantity fits, and no other place explains
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.track.trajectory import Trajectory
 
 #: Quantities of a feature.

@@ -7,23 +7,12 @@ at the angle alpha is wrong by ``tan(alpha)`` times the error of the angle.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import (
-    Datetimes,
-    Floats,
-    Indices,
-    Integers,
-    Masks,
-    RowArrays,
-    Strings,
-    dataclass,
-    freeze_rows,
-    join_rows,
-)
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, RowArrays, Strings, freeze_rows, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import nearest_rows
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import copy
 from collections import deque
+from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
 from typing import Final, Literal, NamedTuple
@@ -25,7 +26,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Codes, Floats, dataclass
+from railfix.core.arrays import Codes, Floats
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.settings import Settings
 

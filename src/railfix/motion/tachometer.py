@@ -6,12 +6,13 @@ at the middle of the interval, and that instant is returned with it.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import MismatchError
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta

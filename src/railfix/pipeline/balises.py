@@ -8,13 +8,13 @@ other, also where it backs.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, dataclass, join_rows
+from railfix.core.arrays import Datetimes, Floats, Integers, join_rows
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import BaliseReadings, ListedBalises

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Reason

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks, dataclass
+from railfix.core.arrays import Floats, Masks
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges

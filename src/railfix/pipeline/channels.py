@@ -6,12 +6,13 @@ Computed once for each set of channels: a log of a day has few, and most live ep
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, copy_with, dataclass, read_only
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings, copy_with, read_only
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation, glonass_channels

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, copy_with, dataclass, kernel_array
+from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, copy_with, kernel_array
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Masks, dataclass, join_rows
+from railfix.core.arrays import Codes, Datetimes, Floats, Masks, join_rows
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState

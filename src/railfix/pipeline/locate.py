@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, dataclass, join_rows
+from railfix.core.arrays import Datetimes, Floats, Integers, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Masks, copy_with, dataclass
+from railfix.core.arrays import Masks, copy_with
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Strings, dataclass, join_rows, take_rows
+from railfix.core.arrays import Floats, Strings, join_rows, take_rows
 from railfix.core.errors import SettingsError
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation

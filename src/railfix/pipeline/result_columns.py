@@ -7,7 +7,7 @@ reference document are made from the same `Column` objects.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, Generic, TypeVar
 
@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.reasons import Status
 from railfix.integrity.interference import Suspicion, cause_text
 from railfix.integrity.protection import Cause, LevelStatus

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings, copy_with, dataclass
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings, copy_with
 from railfix.core.reasons import Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.gnss.orbits import SatelliteStates

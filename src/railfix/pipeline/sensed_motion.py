@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import seconds
 from railfix.motion.features import (

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, dataclass
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.protection.araim import AraimResult

@@ -8,7 +8,7 @@ clipped residuals over it: RAIM looks at single epochs, which an error of twice 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import lru_cache
 from typing import Final
@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, copy_with, dataclass, kernel_array
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, copy_with, kernel_array
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,

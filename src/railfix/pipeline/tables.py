@@ -6,13 +6,14 @@ Times are GPS time without a time zone, to the nanosecond. Absent values are nul
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Strings, dataclass
+from railfix.core.arrays import Floats, Strings
 from railfix.core.reasons import Reason, reason_text
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m

@@ -7,14 +7,14 @@ each antenna, and what they return is joined.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property, lru_cache
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, dataclass
+from railfix.core.arrays import Floats, Indices
 from railfix.gnss.observations import Observations, stack_parts
 from railfix.positioning.section_search import SearchIndex
 from railfix.track.trajectory import between_points

@@ -13,12 +13,13 @@ number of constellations. The ionosphere's change (millimetres a second) is left
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks, Strings
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.settings import Settings

@@ -7,7 +7,7 @@ which the window averages; errors of satellites and atmosphere, which it does no
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -16,7 +16,7 @@ from pydantic import Field
 from scipy.special import chdtri, chndtrinc
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Masks, dataclass, kernel_array
+from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import RangeArrays, Ranges, SinglePoint

@@ -16,7 +16,7 @@ so that results do not depend on chunks.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -24,7 +24,7 @@ from pydantic import Field
 from scipy.special import ndtri, stdtrit
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, kernel_array
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint

@@ -12,6 +12,7 @@ The single point is the reference method of P1 section 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -20,7 +21,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, Strings, dataclass, kernel_array
+from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.settings import Settings
 from railfix.track.trajectory import Trajectory

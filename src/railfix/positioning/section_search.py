@@ -10,6 +10,7 @@ of the summed weights times the distance moved. Both are exact.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -19,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, dataclass
+from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.constants import FAN_OUT, ROTATION_GRADIENT
 from railfix.core.settings import Settings
 from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations

@@ -9,13 +9,14 @@ doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import logsumexp
 
-from railfix.core.arrays import Floats, Integers, dataclass
+from railfix.core.arrays import Floats, Integers
 
 _WITHIN: Final = 40.0  #: Vectors whose square exceeds the least by more are not looked for: exp(-20) of its likelihood.
 _ROUNDING: Final = 1e-9  #: Exchange of two unknowns must shrink the conditional variance by more than rounding.

@@ -13,13 +13,13 @@ form, in which only what the means do not show yet sets the codes apart.
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.windows import correlated_sums

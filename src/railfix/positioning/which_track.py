@@ -10,14 +10,14 @@ error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 from scipy.special import chdtrc, logsumexp
 
-from railfix.core.arrays import Floats, Masks, Strings, dataclass
+from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.settings import Settings, option
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Bits, Datetimes, Floats, dataclass
+from railfix.core.arrays import Bits, Datetimes, Floats
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import compute_angles, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator
 
-from railfix.core.arrays import Floats, Integers, Masks, Strings, dataclass, read_only
+from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, read_model_file, write_toml

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from railfix import __version__
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import BrokenLines, file_sha256
 from railfix.core.geodesy import elevation_azimuth

@@ -7,13 +7,13 @@ sigma_UIRE^2 + sigma_tropo^2``. Multipath and receiver noise on a railway are ad
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, dataclass
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings

@@ -7,14 +7,14 @@ one array of numbers a column, in the order of elevation, then sector, then C/N0
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 
-from railfix.core.arrays import Floats, Integers, dataclass
+from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, option, read_model_file, write_toml

@@ -9,13 +9,14 @@ doi:10.1109/TAES.2018.2876583). Neither can be proven from samples.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 from scipy.special import betaincinv, ndtri
 
-from railfix.core.arrays import Floats, Integers, Masks, dataclass
+from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings, option
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 

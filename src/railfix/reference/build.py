@@ -10,12 +10,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import nearest_rows, seconds

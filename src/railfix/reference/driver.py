@@ -8,6 +8,7 @@ import sys
 import time as clock
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,6 @@ import polars as pl
 from pydantic import Field
 
 from railfix import __version__
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import BrokenLines
 from railfix.core.settings import Settings, option

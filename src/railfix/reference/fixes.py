@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from itertools import pairwise
 from typing import Any, Final, Literal
@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, cheapest_path, dataclass
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks, cheapest_path
 from railfix.core.geodesy import sigma_along
 from railfix.core.settings import Settings, option
 from railfix.core.timescale import nearest_rows, seconds

@@ -8,11 +8,12 @@ the closing error of a gap in proportion to what each part may have contributed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, dataclass, places_in_groups
+from railfix.core.arrays import Datetimes, Floats, Indices, places_in_groups
 from railfix.core.timescale import nearest_rows, seconds, timedelta
 from railfix.io.reference_log import AntennaReference
 from railfix.motion.chain import Chain, singer_steps

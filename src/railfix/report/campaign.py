@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +12,6 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import RailfixError
 from railfix.core.files import write_whole
 from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed

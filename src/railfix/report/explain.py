@@ -8,13 +8,14 @@ one free clock a constellation, linear around the position (P1 2.2(3)).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Strings, dataclass
+from railfix.core.arrays import Floats, Strings
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import write_whole

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, dataclass
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
 from railfix.core.tables import Table, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions

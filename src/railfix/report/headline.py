@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import polars as pl
 import polars.selectors as cs
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.tables import reading_table
 from railfix.evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_runs

@@ -10,12 +10,12 @@ import re
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 import polars as pl
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, MismatchError, OutputError, RailfixError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.settings import Settings, load_settings

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, dataclass, join_rows, take_rows
+from railfix.core.arrays import Floats, join_rows, take_rows
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, ending, write_whole
 from railfix.core.geodesy import geodetic_from_ecef

@@ -14,13 +14,13 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Full, Queue
 from threading import Thread
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import OutputError
 
 if TYPE_CHECKING:

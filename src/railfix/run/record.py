@@ -6,6 +6,7 @@ import platform
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,7 +16,6 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix import __version__
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_json_object, source_commit
 from railfix.core.reasons import Status

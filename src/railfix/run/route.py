@@ -7,13 +7,14 @@ sequence of tracks is the route on which positions are computed, and every other
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass, join_rows, take_rows
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, join_rows, take_rows
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import nearest_rows

@@ -6,14 +6,14 @@ These do not depend on the sensors, as the speeds of the filter do: a sensor mou
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, dataclass
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta
 from railfix.motion.samples import GroundUnits, InertialSamples, RadarSpeeds, RadarWatch, SensorSamples, StationRanges

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import axes_at, range_with_rotation

@@ -6,12 +6,12 @@ import pickle
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Final, Literal
@@ -17,7 +17,7 @@ import networkx as nx
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import read_json_object, write_whole
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from typing import Final, Literal, NamedTuple
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Strings, copy_with, dataclass, medians
+from railfix.core.arrays import Floats, Strings, copy_with, medians
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol, TypeVar
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix import kernels
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, dataclass, kernel_array
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings

@@ -6,13 +6,14 @@ rejects what lies 10 dB-Hz below it; and, for all satellites alike, what lies be
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from railfix.core.arrays import Strings, dataclass
+from railfix.core.arrays import Strings
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve

@@ -13,7 +13,7 @@ recordings at 1 Hz: a quarter of the bad codes found at the same loss); neither 
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Strings, copy_with, dataclass, freeze_arrays, medians, read_only
+from railfix.core.arrays import Datetimes, Floats, Strings, copy_with, freeze_arrays, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings

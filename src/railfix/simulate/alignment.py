@@ -7,7 +7,7 @@ gradient linearly in vertical curves. The curve is laid on the ellipsoid.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline
 
-from railfix.core.arrays import Floats, dataclass, read_only
+from railfix.core.arrays import Floats, read_only
 from railfix.core.geodesy import axes_at, ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.simulate.errors import RandomFunction
 from railfix.simulate.line_file import (

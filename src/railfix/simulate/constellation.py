@@ -10,12 +10,12 @@ signals follow the newest record transmitted, as receivers use it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, dataclass, take_rows
+from railfix.core.arrays import Datetimes, Floats, Indices, take_rows
 from railfix.core.constants import BDT_MINUS_GPST_S, EARTH_ROTATION_RATE, GM_GPS, SPEED_OF_LIGHT
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta, to_week

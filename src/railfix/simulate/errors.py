@@ -7,6 +7,7 @@ variance (less than 1 %) is put back on the average.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Self
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords

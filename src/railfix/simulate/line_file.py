@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Final, Literal
 
@@ -16,7 +17,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from railfix.core.arrays import Floats, dataclass, places_in_groups, take_rows
+from railfix.core.arrays import Floats, places_in_groups, take_rows
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import axes_at

@@ -7,6 +7,7 @@ independently of `railfix.track.vehicle`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.geodesy import axes_at
 from railfix.simulate.alignment import Alignment

@@ -7,6 +7,7 @@ humidity: a receiver that applies them corrects the simulated delays exactly, un
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, dataclass
+from railfix.core.arrays import Bytes, Datetimes, Floats, Masks
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.gnss.navigation import KeplerRecords
 from railfix.gnss.observations import ObservationHeader

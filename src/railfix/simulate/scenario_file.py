@@ -26,10 +26,10 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
 from railfix.core.settings import read_toml, validate

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds, timedelta

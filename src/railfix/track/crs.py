@@ -6,6 +6,7 @@ Definitions are those of the EPSG dataset (https://epsg.org). Motions against a 
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal
 
@@ -15,7 +16,7 @@ from pyproj.aoi import AreaOfInterest
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
-from railfix.core.arrays import Floats, Masks, dataclass
+from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
 

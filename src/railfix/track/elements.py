@@ -8,13 +8,14 @@ the left, as in IFC 4.3 and LandXML.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from pyproj import CRS, Transformer
 
-from railfix.core.arrays import Floats, Masks, dataclass
+from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
 from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, unit_of_grid
 from railfix.track.frames import heights_of_file

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
@@ -22,7 +22,7 @@ from pyproj.crs import CompoundCRS
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import CRSError, ProjError
 
-from railfix.core.arrays import Datetimes, Floats, dataclass
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Final
@@ -10,7 +11,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import axes_at
 from railfix.core.settings import Settings

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, read_text
 from railfix.track.crs import LARGEST_SCALE, choose_crs

@@ -8,23 +8,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import (
-    Floats,
-    Indices,
-    Integers,
-    RowArrays,
-    dataclass,
-    join_rows,
-    places_in_groups,
-    read_only,
-)
+from railfix.core.arrays import Floats, Indices, Integers, RowArrays, join_rows, places_in_groups, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files

@@ -9,12 +9,13 @@ and lasts for `correlation_s`, of which each position has its share.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, dataclass, read_only
+from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
 from railfix.track.network import Candidates, Network
 
 #: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Unpack
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, RowArrays, dataclass, take_rows
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, RowArrays, take_rows
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef

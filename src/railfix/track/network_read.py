@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -11,7 +11,7 @@ import networkx as nx
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, read_text
 from railfix.track.network import Link, Network, end_points

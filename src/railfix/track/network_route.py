@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from math import fsum
@@ -11,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, dataclass
+from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog

@@ -6,12 +6,13 @@ A map error affects all satellites alike, so no screen of the observations detec
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Masks, dataclass
+from railfix.core.arrays import Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.tables import plural
 from railfix.track.track import HEIGHTS_M, Geometry, Track, compute_geometry, kilometrage_breaks, mean_gradients

@@ -6,14 +6,14 @@ height of the outer rail above the inner one. The height of a point is that of t
 
 from __future__ import annotations
 
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass, freeze_arrays, read_only
+from railfix.core.arrays import Floats, Indices, Integers, Masks, freeze_arrays, read_only
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.tables import NotebookTable, plural
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from typing import Final, Literal, NamedTuple
@@ -10,16 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import (
-    Floats,
-    FrozenArrays,
-    Indices,
-    Masks,
-    dataclass,
-    freeze_arrays,
-    places_in_groups,
-    read_only,
-)
+from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, places_in_groups, read_only
 from railfix.core.geodesy import axes_at
 from railfix.core.tables import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage

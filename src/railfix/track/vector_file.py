@@ -12,14 +12,14 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Final
 from xml.etree.ElementTree import ParseError, iterparse
 
 import numpy as np
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, open_stream
 from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights

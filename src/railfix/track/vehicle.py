@@ -6,12 +6,13 @@ Axes: origin midway between the bogie centres at the height of the rail tops; ``
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from railfix.core.arrays import Floats, dataclass
+from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import FilePath
 from railfix.core.geodesy import axes_at, enu_axes

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import dataclass
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending, file_sha256, open_stream, read_bytes
 from railfix.track.crs import choose_crs

@@ -6,11 +6,12 @@ Precise positions are interpolated by a polynomial, clocks linearly.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, RowArrays, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, RowArrays
 from railfix.core.constants import (
     EARTH_ROTATION_RATE,
     EARTH_ROTATION_RATE_BEIDOU,

@@ -12,13 +12,14 @@ healthy record does not override it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords, Navigation

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation, PreciseEphemeris

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from typing import Final, Literal
 
@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, dataclass, kernel_array
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, kernel_array
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, dataclass, kernel_array
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.integrity.interference.limits import InterferenceLimits

@@ -6,12 +6,12 @@ before the window. A pull from the beginning, or as slow as the diameter is unce
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, dataclass, join_rows
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, join_rows
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 

@@ -14,6 +14,7 @@ that a wrong map makes faulty together; the position along the track is then the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from itertools import combinations
 from typing import Annotated, Final, Literal, NamedTuple, Self
@@ -22,7 +23,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.special import ndtr
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, dataclass, join_rows
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, read_toml, validate

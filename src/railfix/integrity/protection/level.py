@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -22,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import comb
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, dataclass, over_blocks
+from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.model import constrained_model

@@ -9,7 +9,7 @@ number of satellites are a class.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import combinations, groupby
 from math import prod
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 from scipy.special import comb, ndtri
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel

@@ -7,6 +7,7 @@ solving again.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from typing import Final, Literal, Self
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 from scipy.special import chdtri
 
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.core.settings import Settings
 from railfix.integrity.raim.model import Compact, LinearModel, compact, constrained_model

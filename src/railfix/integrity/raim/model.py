@@ -9,14 +9,14 @@ with `LinearModel.freedom` degrees of freedom.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, dataclass, kernel_array
+from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, kernel_array
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri, chndtrinc, ndtri
 
-from railfix.core.arrays import Floats, Indices, Masks, dataclass
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.model import LinearModel, compact

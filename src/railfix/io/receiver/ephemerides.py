@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, dataclass
+from railfix.core.arrays import Datetimes
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.io.receiver import nav_messages

@@ -8,24 +8,13 @@ from __future__ import annotations
 
 import binascii
 from collections.abc import Iterable, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import (
-    Bytes,
-    Datetimes,
-    Floats,
-    Indices,
-    Integers,
-    Masks,
-    RowArrays,
-    Strings,
-    dataclass,
-    join_rows,
-)
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, RowArrays, Strings, join_rows
 from railfix.core.files import FilePath, open_stream
 
 #: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.

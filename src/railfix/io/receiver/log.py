@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, dataclass
+from railfix.core.arrays import Bytes, Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, open_stream
 from railfix.gnss.navigation import Navigation

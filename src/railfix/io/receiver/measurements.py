@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, join_rows
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings, join_rows
 from railfix.core.timescale import from_week, gpst_to_utc, nearest_day, nearest_week, to_week
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.receiver import nav_messages

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Integers, Strings, dataclass
+from railfix.core.arrays import Floats, Integers, Strings
 from railfix.core.timescale import bdt_to_gpst, nearest_day, nearest_week, seconds, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, get_args
 
 import numpy as np
 
-from railfix.core.arrays import Integers, Masks, dataclass
+from railfix.core.arrays import Integers, Masks
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, ByteStream, FilePath, Paths, open_stream, path_names
 from railfix.core.timescale import bdt_to_gpst, gps_time, utc_to_gpst

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railfix import kernels
-from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, dataclass, places_in_groups, take_rows
+from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, places_in_groups, take_rows
 from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog

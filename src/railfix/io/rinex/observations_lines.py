@@ -9,12 +9,13 @@ P2's where P2 is declared, else to C2's; where no code of the band is declared, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Bytes, Integers, Masks, dataclass, take_rows
+from railfix.core.arrays import Bytes, Integers, Masks, take_rows
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")

@@ -9,13 +9,14 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import IO, Final, Literal, cast, get_args
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import OutputError
 from railfix.core.files import FilePath, hatanaka_program, stage_file
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system

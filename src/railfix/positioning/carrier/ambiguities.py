@@ -8,13 +8,13 @@ prior probability `PhaseLimits.no_integer_prior` and uniform density.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.observation_model import IntegerChannels, Linearised, OwnUnknowns, PhaseClocks, Phases

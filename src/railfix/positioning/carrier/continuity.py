@@ -8,13 +8,13 @@ others agree. The number of an arc, unique in a run, is the channel's five lette
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, dataclass, read_only
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, read_only
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds

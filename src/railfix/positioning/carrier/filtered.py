@@ -7,12 +7,12 @@ small as there are channels.
 
 from __future__ import annotations
 
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.ambiguities import (
     FORGET_S,

@@ -14,12 +14,12 @@ misses is taken up by N at the arc's begin and drifts by twice its change.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, dataclass
+from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
 from railfix.positioning.normal_equations import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory

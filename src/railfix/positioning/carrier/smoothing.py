@@ -11,14 +11,14 @@ it drift by twice the change of its delay, which the window limits: at 1 mm/s on
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import IntFlag
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass, medians, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, medians, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.ranges.sbas.dfmc import MASK_S, DfmcService

@@ -23,12 +23,13 @@ out.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import seconds

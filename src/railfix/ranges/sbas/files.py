@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Integers, dataclass
+from railfix.core.arrays import Bytes, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK

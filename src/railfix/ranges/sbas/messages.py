@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, dataclass, freeze_rows, join_rows
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, freeze_rows, join_rows
 from railfix.io.receiver.framing import crc24q
 
 Band = Literal["L1", "L5"]  #: Frequency that messages are sent on, and corrections made for.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.prepared_records import issue_records

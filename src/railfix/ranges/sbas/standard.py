@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, FrozenArrays, Integers, Masks, dataclass
+from railfix.core.arrays import Floats, FrozenArrays, Integers, Masks
 from railfix.core.settings import Settings
 
 #: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Integers, Masks, dataclass
+from railfix.core.arrays import Datetimes, Integers, Masks
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.ranges.sbas.decode import (
     BLOCK,

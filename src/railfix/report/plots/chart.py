@@ -7,13 +7,13 @@ a page, so a notebook and the report show the same numbers.
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import ClassVar, Final, Literal
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Indices, Integers, Strings, dataclass
+from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.timescale import seconds
 from railfix.evaluate.inputs import floats, words
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Masks, dataclass
+from railfix.core.arrays import Floats, Masks
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Status
 from railfix.report.plots.chart import (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -12,7 +12,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks, dataclass
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.errors import InputFileError, OutputError
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds

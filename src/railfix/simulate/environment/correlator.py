@@ -7,13 +7,14 @@ unlimited bandwidth. Where the triangle is straight that zero is a quotient, so 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fresnel
 
-from railfix.core.arrays import Complexes, Floats, Indices, dataclass
+from railfix.core.arrays import Complexes, Floats, Indices
 from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSettings
 
 Singles = NDArray[np.float32]

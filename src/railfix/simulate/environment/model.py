@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings, dataclass
+from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import carrier_frequency_hz

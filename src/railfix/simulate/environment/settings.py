@@ -16,13 +16,14 @@ or, instead of the sections, ``[environment.shares]`` of each kind from which th
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from railfix.core.arrays import Datetimes, Floats, Strings, dataclass
+from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.simulate.settings import (
     AngleBetween,
     Between,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Strings, dataclass
+from railfix.core.arrays import Floats, Indices, Strings
 from railfix.simulate.environment.settings import Kind, RoofSettings, RowSettings, SectionSettings, TreeSettings
 from railfix.simulate.settings import Between
 

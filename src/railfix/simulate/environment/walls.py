@@ -5,12 +5,12 @@ Frame of the antenna: x along the line (rising chainage), y to the right, z up; 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, RowArrays, dataclass
+from railfix.core.arrays import Floats, Indices, RowArrays
 from railfix.simulate.environment.correlator import (
     circular_reflection,
     cross_polar_gain,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import scipy.sparse as sp
 
-from railfix.core.arrays import Floats, Indices, dataclass
+from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun

@@ -6,14 +6,14 @@ Errors follow Student's t distribution: iteratively reweighted least squares (La
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from railfix.core.arrays import Floats, Indices, Integers, dataclass
+from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.geodesy import axes_at
 from railfix.core.tables import plural
 from railfix.track.from_positions import ANTENNA_PATH

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from railfix.core.arrays import Floats, Indices, Integers, dataclass
+from railfix.core.arrays import Floats, Indices, Integers
 from railfix.track.survey.runs import SurveyLimits
 
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one line.

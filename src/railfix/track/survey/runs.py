@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Masks, dataclass, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Masks, freeze_arrays
 from railfix.core.settings import Settings, option
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog

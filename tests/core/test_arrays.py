@@ -1,0 +1,38 @@
+"""Copies and rows of frozen dataclasses."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from railfix.core.arrays import RowArrays, copy_with, join_rows
+
+
+def test_copies_are_equal() -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Place:
+        value: int
+        more: tuple[int, ...] = ()
+
+    place = Place(value=1, more=(2, 3))
+    assert dataclasses.replace(place, value=2) == copy_with(place, value=2) == Place(value=2, more=(2, 3))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        place.value = 3  # type: ignore[misc]
+
+
+def test_rows_with_other_arrays_are_not_joined() -> None:
+    """A column that one part lacks would be lost without a word."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Points(RowArrays):
+        x_m: np.ndarray
+        y_m: np.ndarray | None = None
+
+    both, bare = Points(x_m=np.arange(2.0), y_m=np.ones(2)), Points(x_m=np.arange(3.0))
+    assert join_rows([both, both.take(np.array([True, False]))]).x_m.tolist() == [0.0, 1.0, 0.0]
+    for parts in ([both, bare], [bare, both]):
+        with pytest.raises(ValueError, match="rows with other arrays than x_m"):
+            join_rows(parts)
