@@ -96,9 +96,7 @@ class Recursion:
             state.bank = None
         self._run(state, epoch, epoch + 1, layout.REST_LOST if found.lost else layout.REST, found, trace)
 
-    def _run(
-        self, state: TrackState, first: int, last: int, part: int, found: Sought, trace: list[Step] | None
-    ) -> int:
+    def _run(self, state: TrackState, first: int, last: int, part: int, found: Sought, trace: list[Step] | None) -> int:
         """Run the recursion over epochs, change the state, and return the first epoch that is not done."""
         count, width = state.mean.shape
         rows = 3 * len(self.chunk.satellite) + self.given.sensor.shape[1]

@@ -118,8 +118,8 @@ def unpack_state(state: TrackState, packed: layout.State, origin: np.datetime64)
     for name in HYPOTHESIS.names or ():
         setattr(state, name, packed.hypothesis[name][:count].copy())
     state.monitors = Monitors(**{name: float(monitors[name]) for name in vars(state.monitors)})
-    state.measured = origin + timedelta(float(monitors["measured_s"]))
-    state.coded = origin + timedelta(float(monitors["coded_s"]))
+    state.measured = origin + timedelta(monitors["measured_s"].item())
+    state.coded = origin + timedelta(monitors["coded_s"].item())
     state.code_bias, state.offset_known = packed.code_bias, packed.offset_known
     if len(packed.source):
         running, names = packed.source["running"].nonzero()[0], list_sources(state)

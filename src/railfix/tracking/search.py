@@ -17,7 +17,7 @@ from railfix.kernels.tracking.constants import (
     BESIDE_AFTER_S,
     CODE_CLOCK_SIGMA_M,
     MOTION_FIT,
-    STEP_HELD_S,
+    STEP_HOLD_S,
 )
 from railfix.kernels.tracking.layout import CODE
 from railfix.tracking.chunk import Chunk
@@ -274,7 +274,7 @@ def _reset_monitors(state: TrackState, limits: TrackingLimits, *, lost: bool, we
     hold = state.monitors.level_hold_s
     if lost and state.monitors.weak_code_s >= limits.lost_code_s:
         # Codes have contradicted the place that motion carried: the next place is theirs alone.
-        hold = max(hold, STEP_HELD_S)
+        hold = max(hold, STEP_HOLD_S)
     if weak:
         hold = max(hold, limits.level_start_s)
     state.monitors = replace(

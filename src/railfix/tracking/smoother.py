@@ -92,7 +92,7 @@ class Step:
 
 def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
     """Return the transition of all unknowns over an interval from a state, shape (N, N); `mean` has shape (N,)."""
-    from railfix.kernels.tracking.model import transition_matrix
+    from railfix.kernels.tracking.backward import transition_matrix
 
     epoch = np.zeros(1, dtype=EPOCH)
     epoch["interval_s"], epoch["step"] = dt, singer(dt, limits.acceleration_mps2, limits.acceleration_s)[0]

@@ -75,9 +75,7 @@ def update_doubt(parameters: Record, monitors: Record, rows: Rows, found: Fit, d
 
 
 @inner
-def adapt(
-    given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float
-) -> bool:
+def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float) -> bool:
     """Adapt the state to an epoch's fit; return whether another satellite's codes are left out from here on.
 
     `shift` is that of `compute_code_shift` of the hypothesis reported.

@@ -1,4 +1,4 @@
-"""Information of later epochs carried backward through the measurements of an epoch."""
+"""Information of later epochs carried backward through an epoch, for the smoother."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import kernel
+from railfix.kernels.tracking.layout import Record
+from railfix.kernels.tracking.model import compute_transition
 from railfix.kernels.tracking.update import correct
 
 
@@ -49,3 +51,13 @@ def before_measurements(
                 matrix[a] -= (h[a] * across + across[a] * h) / s
                 matrix[a] += h[a] * h * (1.0 + g @ across / s) / s
     return vector, matrix
+
+
+@kernel
+def transition_matrix(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Floats:
+    """Return F as a matrix, shape (N, N)."""
+    F, matrix = compute_transition(speed, epoch, parameters, unknowns), np.zeros((unknowns, unknowns))
+    for i in range(unknowns):
+        for k in range(3):
+            matrix[i, F.unknown[i, k]] += F.coefficient[i, k]
+    return matrix

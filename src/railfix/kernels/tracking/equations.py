@@ -83,7 +83,7 @@ def new_equations(rows: Rows) -> Equations:
 @inner
 def _set(equations: Equations, q: int, term: int, unknown: int, coefficient: float) -> None:
     """Set one term of a quantity."""
-    equations.index[q, term], equations.coefficient[q, term] = unknown, coefficient
+    equations.unknown[q, term], equations.coefficient[q, term] = unknown, coefficient
 
 
 @inner
@@ -101,9 +101,9 @@ def linearise(
     seen = _compute_sights(given, t, point, axes)
     _write_motion_quantities(rows.code.stop, equations)
     _write_codes(given, t, rows, x, seen, x[ARC] - at[0], equations)
-    chord = _compute_chord(point, before, axes, at)
+    cx, cy, cz = _compute_chord(point, before, axes, at)
     moved = x[ARC] - at[0] - (x[PREVIOUS_ARC] - at[1])
-    _write_phases(given, t, rows, x, seen, before, chord, moved, equations)
+    _write_phases(given, t, rows, x, seen, before, (moved, cx, cy, cz), equations)
     _write_dopplers(given, t, rows, x, seen, point, axes, equations)
     _write_sensors(given, t, rows, x, direction, equations)
 
@@ -150,9 +150,7 @@ def _write_motion_quantities(first: int, equations: Equations) -> None:
 
 
 @inner
-def _write_codes(
-    given: Given, t: int, rows: Rows, x: Floats, seen: Floats, moved: float, equations: Equations
-) -> None:
+def _write_codes(given: Given, t: int, rows: Rows, x: Floats, seen: Floats, moved: float, equations: Equations) -> None:
     """Write the codes; `moved` is the mean's arc length less that of the point [m]."""
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
@@ -179,20 +177,23 @@ def _write_phases(
     x: Floats,
     seen: Floats,
     before: Floats,
-    chord: tuple[float, float, float],
-    moved: float,
+    moved: tuple[float, float, float, float],
     equations: Equations,
 ) -> None:
-    """Write the changes of the phases; `moved` is the mean's displacement less that of the points [m]."""
+    """Write the changes of the phases.
+
+    `moved`: the mean's displacement less that of the points [m], and the direction of the chord between these.
+    """
+    displacement, cx, cy, cz = moved
     for j in range(rows.phase.start, rows.phase.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
         sat = channel.before_ecef_m
         distance = sight(sat[0], sat[1], sat[2], before[0], before[1], before[2])[0]
-        gradient = -(seen[k, 1] * chord[0] + seen[k, 2] * chord[1] + seen[k, 3] * chord[2])
+        gradient = -(seen[k, 1] * cx + seen[k, 2] * cy + seen[k, 3] * cz)
         equations.design[j, M_DISTANCE], equations.design[j, M_CLOCK] = gradient, 1.0
         equations.design[j, M_RIGHT], equations.design[j, M_UP] = -seen[k, 5], -seen[k, 6]
-        predicted = seen[k, 0] - distance + gradient * moved
+        predicted = seen[k, 0] - distance + gradient * displacement
         equations.value[j] = channel.measured[PHASE] - predicted - x[PHASE_CLOCK]
 
 
@@ -279,8 +280,8 @@ def shift_sensors(rows: Rows, x: Floats, other_x: Floats, other: Equations, equa
         q = rows.code.stop + MOTION + j - rows.sensor.start
         value = other.value[j]
         for k in range(TERMS):
-            unknown, coefficient = other.index[q, k], other.coefficient[q, k]
-            equations.index[q, k], equations.coefficient[q, k] = unknown, coefficient
+            unknown, coefficient = other.unknown[q, k], other.coefficient[q, k]
+            equations.unknown[q, k], equations.coefficient[q, k] = unknown, coefficient
             if unknown != MAP_LENGTH_ERROR:
                 value -= coefficient * (x[unknown] - other_x[unknown])
         equations.value[j] = value

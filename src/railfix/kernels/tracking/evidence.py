@@ -42,7 +42,7 @@ def _find_coefficient(equations: Equations, q: int, unknown: int) -> float:
     """Return the coefficient of an unknown in a quantity."""
     total = 0.0
     for k in range(TERMS):
-        if equations.index[q, k] == unknown:
+        if equations.unknown[q, k] == unknown:
             total += equations.coefficient[q, k]
     return total
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking.constants import (
     ALIKE,
@@ -23,7 +23,9 @@ from railfix.kernels.tracking.layout import ARC, Record, Records, State
 @inner
 def log_sum(values: Floats) -> float:
     """Return the logarithm of the sum of exponentials."""
-    largest, total = values.max(), 0.0
+    largest, total = values[0], 0.0
+    for value in values:
+        largest = max(largest, value)
     for value in values:
         total += math.exp(value - largest)
     return float(largest + math.log(total))
@@ -113,40 +115,53 @@ def find_leading(hypothesis: Records, count: int) -> int:
 
 
 @inner
-def prune(parameters: Record, state: State) -> Floats:
+def prune(parameters: Record, state: State) -> Indices:
     """Order the hypotheses, merge twins, drop the improbable; return the earlier indices of those left.
 
     Improbable ones are dropped once the first has travelled far enough for motion to have distinguished them.
     """
-    count = state.monitors[0].hypotheses
-    ranked = _rank(state.hypothesis, count)
-    kept, log_probability = _merge_twins(state, ranked)
+    kept, log_probability = _merge_twins(state, _rank(state.hypothesis, state.monitors[0].hypotheses))
     size = min(len(kept), parameters.most_hypotheses)
     kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
     if abs(state.x[kept[0], ARC] - state.hypothesis[kept[0]].origin_m) >= parameters.decided_travel_m:
-        alive = log_probability > math.log(parameters.least_probability)
-        kept, log_probability = kept[alive], log_probability[alive]
-        log_probability -= log_sum(log_probability)
-    x, P, hypothesis = state.x[kept], state.P[kept], state.hypothesis[kept]
-    for j in range(len(kept)):
-        state.x[j], state.P[j], state.hypothesis[j] = x[j], P[j], hypothesis[j]
+        size = 0
+        for j in range(len(kept)):
+            if log_probability[j] > math.log(parameters.least_probability):
+                kept[size], log_probability[size] = kept[j], log_probability[j]
+                size += 1
+        kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
+    x, P, hypothesis = (
+        state.x[: len(state.hypothesis)].copy(),
+        state.P[: len(state.hypothesis)].copy(),
+        state.hypothesis.copy(),
+    )
+    for j in range(size):
+        state.x[j], state.P[j], state.hypothesis[j] = x[kept[j]], P[kept[j]], hypothesis[kept[j]]
         state.hypothesis[j].log_probability = log_probability[j]
-    state.monitors[0].hypotheses = len(kept)
+    state.monitors[0].hypotheses = size
     return kept
 
 
 @inner
-def _rank(hypothesis: Records, count: int) -> Floats:
+def _rank(hypothesis: Records, count: int) -> Indices:
     """Return the hypotheses in falling order of their probability, the leading one first."""
     first = find_leading(hypothesis, count)
-    key = np.empty(count)
+    ranked = np.empty(count, dtype=np.intp)
+    ranked[0], size = first, 1
     for h in range(count):
-        key[h] = -math.inf if h == first else -hypothesis[h].log_probability
-    return np.argsort(key, kind="mergesort")
+        if h == first:
+            continue
+        j = size
+        while j > 1 and hypothesis[ranked[j - 1]].log_probability < hypothesis[h].log_probability:
+            ranked[j] = ranked[j - 1]
+            j -= 1
+        ranked[j] = h
+        size += 1
+    return ranked
 
 
 @inner
-def _merge_twins(state: State, ranked: Floats) -> tuple[Floats, Floats]:
+def _merge_twins(state: State, ranked: Indices) -> tuple[Indices, Floats]:
     """Return the hypotheses without those within the standard deviations of a more probable one, and probabilities."""
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     for k in ranked:

@@ -1,8 +1,8 @@
 """Arrays of the recursion: the state's unknowns, records with their shapes and units, and what is handed on together.
 
-Records of numpy name the fields of an epoch, a channel, a sensor and a vertex. Those of settings, of the state's
-scalars and of the results have the fields of `railfix.tracking.limits.TrackingLimits`, `railfix.tracking.state.Monitors`
-and `railfix.tracking.result.Tracked` (`record_of`), which define them.
+Records of numpy name the fields of an epoch, a channel, a sensor and a vertex. Those of the settings, of the state's
+scalars and of the results have the fields of `railfix.tracking.limits.TrackingLimits`,
+`railfix.tracking.state.Monitors` and `railfix.tracking.result.Tracked`, which define them.
 """
 
 from __future__ import annotations

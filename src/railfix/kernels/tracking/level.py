@@ -168,10 +168,13 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
 @inner
 def join(one: Alternatives, other: Alternatives) -> Alternatives:
     """Return the alternatives of both."""
-    return Alternatives(
-        np.concatenate((one.along_m, other.along_m)), np.concatenate((one.straight_m, other.straight_m)),
-        np.concatenate((one.sigma_m, other.sigma_m)), np.concatenate((one.probability, other.probability)),
-    )  # fmt: skip
+    first, size = len(one.sigma_m), len(one.sigma_m) + len(other.sigma_m)
+    both = Alternatives(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
+    for part, start in ((one, 0), (other, first)):
+        for a in range(len(part.sigma_m)):
+            both.along_m[start + a], both.straight_m[start + a] = part.along_m[a], part.straight_m[a]
+            both.sigma_m[start + a], both.probability[start + a] = part.sigma_m[a], part.probability[a]
+    return both
 
 
 @inner
@@ -218,4 +221,4 @@ def bound_speed(parameters: Record, state: State, sigma: float) -> float:
         if state.source[b].running:
             away = abs(state.x[first + b, SPEED] - state.x[0, SPEED])
             bound = max(bound, away + state.source[b].k_speed * math.sqrt(state.P[first + b, SPEED, SPEED]))
-    return bound
+    return float(bound)

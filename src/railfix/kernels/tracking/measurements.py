@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking.adaptation import is_faulty
 from railfix.kernels.tracking.constants import (
@@ -136,28 +136,38 @@ def _start_code_clocks(
     At the first epoch the first constellation is that of the clock. Returns whether it is the first epoch.
     """
     codes, value = rows.code.stop, equations.value
-    clock_of = np.empty(codes, dtype=np.intp)
+    clock_of, some = np.empty(codes, dtype=np.intp), False
     for j in range(codes):
         clock_of[j] = given.channel[t, rows.channel[j]].clock
-    first, begins = clock_of[0], not known.any()
+        some = some or known[clock_of[j]]
+    first, begins = clock_of[0], True
+    for g in range(CLOCK_COUNT):
+        begins = begins and not known[g]
     if begins:
         P[OFFSETS + first, OFFSETS + first] = FIRST_OFFSET_M2
-    settled = np.empty(codes, dtype=np.bool_)
-    for j in range(codes):
-        settled[j] = known[clock_of[j]]
-    if not settled.any():
-        settled[:] = clock_of == first
-    clock = median(value[:codes][settled])
+    settled = np.empty(CLOCK_COUNT, dtype=np.bool_)
+    for g in range(CLOCK_COUNT):
+        settled[g] = known[g] if some else g == first
+    clock = _median_of_clocks(value, clock_of, settled)
     x[CODE_CLOCK] += clock
     for g in range(CLOCK_COUNT):
-        own = clock_of == g
-        if not own.any():
-            continue
-        away = clock
-        if not settled[own].any():
-            away = median(value[:codes][own])
-            x[OFFSETS + g] += away - clock
+        own, away = np.zeros(CLOCK_COUNT, dtype=np.bool_), clock
+        own[g] = True
+        if not settled[g]:
+            away = _median_of_clocks(value, clock_of, own)
+            x[OFFSETS + g] += 0.0 if math.isnan(away) else away - clock
         for j in range(codes):
-            if own[j]:
+            if clock_of[j] == g:
                 value[j] -= away
     return bool(begins)
+
+
+@inner
+def _median_of_clocks(value: Floats, clock_of: Indices, chosen: Masks) -> float:
+    """Return the median innovation of the codes of some clocks; NaN without any."""
+    some, size = np.empty(len(clock_of)), 0
+    for j in range(len(clock_of)):
+        if chosen[clock_of[j]]:
+            some[size] = value[j]
+            size += 1
+    return median(some[:size])

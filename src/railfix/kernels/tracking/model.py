@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
-from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.compiling import inner
 from railfix.kernels.tracking.constants import (
     CODE_CLOCK_SIGMA_M,
     FORCE_WALK_MPS2,
@@ -70,9 +70,9 @@ _LEAST_CLOCK_M2 = 1e-6
 
 
 class Transition(NamedTuple):
-    """Transition F by its terms: ``F[i, index[i, k]] = coefficient[i, k]``; shapes (N, 3)."""
+    """Transition F by its terms: ``F[i, unknown[i, k]] = coefficient[i, k]``; shapes (N, 3)."""
 
-    index: Indices
+    unknown: Indices
     coefficient: Floats
 
 
@@ -80,14 +80,14 @@ class Transition(NamedTuple):
 def compute_transition(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Transition:
     """Return the transition to an epoch from a state of some speed [m/s]."""
     dt, travel = epoch.interval_s, abs(speed) * epoch.interval_s
-    index, coefficient = np.zeros((unknowns, 3), dtype=np.intp), np.zeros((unknowns, 3))
+    unknown, coefficient = np.zeros((unknowns, 3), dtype=np.intp), np.zeros((unknowns, 3))
     for i in range(unknowns):
-        index[i, 0], coefficient[i, 0] = i, 1.0
+        unknown[i, 0], coefficient[i, 0] = i, 1.0
     for i in range(3):
         for k in range(3):
-            index[i, k], coefficient[i, k] = k, epoch.step[i, k]
-    index[PREVIOUS_ARC, 0], index[PREVIOUS_SPEED, 0] = ARC, SPEED
-    index[PHASE_CLOCK, 0], coefficient[PHASE_CLOCK, 0] = DRIFT, dt
+            unknown[i, k], coefficient[i, k] = k, epoch.step[i, k]
+    unknown[PREVIOUS_ARC, 0], unknown[PREVIOUS_SPEED, 0] = ARC, SPEED
+    unknown[PHASE_CLOCK, 0], coefficient[PHASE_CLOCK, 0] = DRIFT, dt
     for i in PER_EPOCH:
         coefficient[i, 0] = 0.0
     coefficient[MAP_RIGHT, 0] = coefficient[MAP_UP, 0] = math.exp(-travel / parameters.map_absolute_m)
@@ -96,17 +96,7 @@ def compute_transition(speed: float, epoch: Record, parameters: Record, unknowns
     kept = math.exp(-dt / parameters.code_correlation_s - travel / parameters.code_correlation_m)
     for i in range(SATELLITES, unknowns):
         coefficient[i, 0] = kept
-    return Transition(index, coefficient)
-
-
-@kernel
-def transition_matrix(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Floats:
-    """Return F as a matrix, shape (N, N)."""
-    F, matrix = compute_transition(speed, epoch, parameters, unknowns), np.zeros((unknowns, unknowns))
-    for i in range(unknowns):
-        for k in range(3):
-            matrix[i, F.index[i, k]] += F.coefficient[i, k]
-    return matrix
+    return Transition(unknown, coefficient)
 
 
 @inner
@@ -117,7 +107,7 @@ def _multiply(F: Transition, matrix: Floats, product: Floats) -> None:
         row[:] = 0.0
         for k in range(3):
             if F.coefficient[i, k] != 0.0:
-                add_scaled(row, F.coefficient[i, k], matrix[F.index[i, k]])
+                add_scaled(row, F.coefficient[i, k], matrix[F.unknown[i, k]])
         for j in range(len(row)):
             product[j, i] = row[j]
 
@@ -137,7 +127,7 @@ def predict(
     for i in range(len(x)):
         x[i] = 0.0
         for k in range(3):
-            x[i] += F.coefficient[i, k] * before[F.index[i, k]]
+            x[i] += F.coefficient[i, k] * before[F.unknown[i, k]]
     _multiply(F, P, scratch)  # (F P)' = P F'
     _multiply(F, scratch, P)  # (F P F')' = F P F'
     _add_noise(epoch, given.line[0], parameters, speed, (map_log_variance, wrong_map_m), F, P)
@@ -195,11 +185,14 @@ def _add_noise(
 
 
 @inner
-def add_bend(given: Given, x: Floats, P: Floats) -> None:
-    """Add to the displacements across what the line bends by where the place is uncertain."""
+def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
+    """Add to the displacements across what the line bends by where the place is uncertain.
+
+    `at`: arc lengths now and at the epoch before [m].
+    """
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    write_point(given.vertex, given.line[0], x[ARC], point, axes)
-    write_point(given.vertex, given.line[0], x[PREVIOUS_ARC], point, before)
+    write_point(given.vertex, given.line[0], at[0], point, axes)
+    write_point(given.vertex, given.line[0], at[1], point, before)
     length = P[MAP_LENGTH_ERROR, MAP_LENGTH_ERROR] - _LEAST_M2
     position_variance = min(P[ARC, ARC] - length, given.parameters[0].start_sigma_m ** 2)
     right = up = 0.0
@@ -220,9 +213,7 @@ def restart(P: Floats, unknown: int, variance: float) -> None:
 
 
 @inner
-def narrow_speed_range(
-    parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float
-) -> bool:
+def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float) -> bool:
     """Return whether a measured speed is possible after those before, and narrow the range of speeds to it.
 
     There are no bounds on several branches. Enough satellites, or a sensor on board too, are believed whatever the

@@ -24,12 +24,12 @@ from railfix.kernels.tracking.constants import (
     MOTION_FIT,
     REACH_M,
     REACH_SIGMAS,
-    STEP_HELD_S,
+    STEP_HOLD_S,
     STEP_S,
     STEP_SIGMAS,
     VELOCITY_FLOOR_MPS,
     YOUNG,
-    YOUNG_HELD_S,
+    YOUNG_HOLD_S,
 )
 from railfix.kernels.tracking.layout import ACCELERATION, ARC, MAP_RIGHT, SPEED, WRONG_MAP, Given, Record, State
 from railfix.kernels.tracking.line import write_point
@@ -96,12 +96,12 @@ def update_monitors(
         for h in range(monitors.hypotheses):
             largest = max(largest, state.hypothesis[h].log_probability)
         if largest < math.log(YOUNG):
-            hold = YOUNG_HELD_S
+            hold = YOUNG_HOLD_S
     drift = monitors.code_shift**2 > DRIFT_SIGMAS**2 * monitors.code_shift_variance
     if drift or monitors.map_log_variance > DRIFT_LOG or _is_contradicted_by_subfilter(parameters, state):
         hold = parameters.level_hold_s
     if monitors.step_s >= STEP_S:
-        hold = STEP_HELD_S
+        hold = STEP_HOLD_S
     monitors.level_hold_s = max(monitors.level_hold_s - dt, hold)
 
 
@@ -127,4 +127,4 @@ def _is_contradicted_by_subfilter(parameters: Record, state: State) -> bool:
         return False
     row = len(state.hypothesis) + wrong
     reach = BESIDE_SIGMAS * math.sqrt(state.P[row, MAP_RIGHT, MAP_RIGHT])
-    return abs(state.x[row, MAP_RIGHT]) > max(BESIDE_M, reach)
+    return bool(abs(state.x[row, MAP_RIGHT]) > max(BESIDE_M, reach))

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
 from railfix.kernels.tracking.constants import (
@@ -23,12 +22,11 @@ from railfix.kernels.tracking.constants import (
     DIRECTION_MPS,
     DOUBTFUL,
     EXPIRED,
-    FREED_M,
-    FREED_SIGMAS,
+    INFLATED_M,
+    INFLATED_SIGMAS,
     LEAST_RISE,
     LOST,
     MOTION_FIT,
-    MOTION_SATELLITES,
     MOVED_M,
     RELINEARISED,
     SCALE_BOUND,
@@ -141,7 +139,7 @@ def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) ->
     """Return the correction of a predicted hypothesis up to its innovations."""
     x, P, equations, restarted = state.x[h].copy(), state.P[h].copy(), new_equations(rows), np.zeros(3, dtype=np.bool_)
     linearise(given, t, rows, x, (x[ARC], x[PREVIOUS_ARC]), state.monitors[0].direction, equations)
-    add_bend(given, x, P)
+    add_bend(given, (x[ARC], x[PREVIOUS_ARC]), P)
     start_clocks(given, t, rows, state.offset_known, x, P, equations, restarted)
     covariance, without_clock = predict_quantities(P, equations)
     return Correction(
@@ -194,7 +192,7 @@ def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction
     reweight(rows, one.equations, covariance, rows.variance, degrees, parameters.passes, one.fit)
     one.x[:], one.P[:] = one.x_prior, one.P_prior
     correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
-    return abs(one.x[ARC] - arc)
+    return float(abs(one.x[ARC] - arc))
 
 
 @inner
@@ -212,9 +210,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
 
 
 @inner
-def _commit_update(
-    given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float
-) -> int:
+def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float) -> int:
     """Take over corrected hypotheses, adapt and monitor, and correct the sub-filters; return the leading hypothesis."""
     monitors, parameters = state.monitors[0], given.parameters[0]
     for h, one in enumerate(corrections):
@@ -230,8 +226,8 @@ def _commit_update(
     excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leads)
-    if excluded and abs(shift) < FREED_SIGMAS:  # its codes have led the place so far
-        state.P[:, ARC, ARC] += FREED_M**2
+    if excluded and abs(shift) < INFLATED_SIGMAS:  # its codes have led the place so far
+        state.P[:, ARC, ARC] += INFLATED_M**2
     square = compute_contradiction(given, t, state, leads)
     beyond_m = excess_beyond_end(given.line[0], best.x[ARC], math.sqrt(best.P[ARC, ARC]))
     update_monitors(parameters, state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
@@ -264,18 +260,18 @@ def _write_trace(given: Given, t: int, rows: Rows, corrections: list[Correction]
     """Write what the smoother needs of the corrections."""
     for h, one in enumerate(corrections):
         trace.prior[h] = one.P_prior
-        index, coefficient, codes = one.equations.index, one.equations.coefficient, rows.code.stop
+        unknown, coefficient, codes = one.equations.unknown, one.equations.coefficient, rows.code.stop
         for j in range(rows.sensor.stop):
             trace.value[h, j] = one.equations.value[j]
             trace.variance[h, j] = rows.variance[j] / one.fit.weight[j]
-            for q in range(len(index)):
+            for q in range(len(unknown)):
                 if codes <= j < rows.sensor.start:
                     factor = one.equations.design[j, q - codes] if codes <= q < codes + MOTION else 0.0
                 else:
                     factor = 1.0 if q == (j if j < codes else j - rows.sensor.start + codes + MOTION) else 0.0
                 if factor != 0.0:
                     for k in range(TERMS):
-                        trace.row[h, j, index[q, k]] += factor * coefficient[q, k]
+                        trace.row[h, j, unknown[q, k]] += factor * coefficient[q, k]
         trace.restarted[h, PHASE_CLOCK], trace.restarted[h, DRIFT] = one.restarted[0], one.restarted[1]
         if codes:
             trace.restarted[h, OFFSETS + given.channel[t, rows.channel[0]].clock] = one.restarted[2]

@@ -8,6 +8,7 @@ has lasted and whatever it has left in the state, is not in it.
 from __future__ import annotations
 
 import math
+
 import numpy as np
 
 from railfix.core.arrays import Floats, Masks
@@ -32,7 +33,6 @@ from railfix.kernels.tracking.layout import (
     PHASE_CLOCK,
     PREVIOUS_ARC,
     RANGE_COLUMN,
-    SENSORS,
     WRONG_MAP,
     Given,
     Rows,
@@ -93,7 +93,9 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
     all_in_view = find_others(state) + ALL_IN_VIEW
-    before = leads == 0 and source["running"].any()
+    before = False
+    for b in range(len(source)):
+        before = before or (source[b].running and leads == 0)
     needed = _find_needed(given, t, rows, state)
     needed[all_in_view] = not before
     absorbed = np.zeros(len(source), dtype=np.bool_)
@@ -115,9 +117,10 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
             x[:], P[:] = state.x[first + all_in_view], state.P[first + all_in_view]
             one.running, one.contradicted_s = True, 0.0
         if one.running:
+            at = x[ARC], x[PREVIOUS_ARC]
             if b == all_in_view - ALL_IN_VIEW + WRONG_MAP:
                 rotate_map_error(given, x, P)
-            add_bend(given, x, P)
+            add_bend(given, at, P)
             if (satellite or b == all_in_view) and not needed[b] and _has_joined(x, P, best):
                 one.running = False
                 continue
@@ -241,9 +244,7 @@ def _correct(
 
 
 @inner
-def _update_contradiction(
-    given: Given, t: int, rows: Rows, state: State, b: int, variance: Floats, found: Fit
-) -> None:
+def _update_contradiction(given: Given, t: int, rows: Rows, state: State, b: int, variance: Floats, found: Fit) -> None:
     """Count how long the measurements of a sub-filter have contradicted it by low weights."""
     one, parameters = state.source[b], given.parameters[0]
     code, motion = mean_weights(rows, variance, found.weight)

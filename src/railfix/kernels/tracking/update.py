@@ -31,8 +31,8 @@ from railfix.kernels.tracking.layout import CLOCK_TERM, M_CLOCK, M_DRIFT, MOTION
 class Equations(NamedTuple):
     """Measurement equations of one Gaussian with N unknowns: Q quantities and M measurements."""
 
-    #: Quantity q is the sum of ``coefficient[q, k] x[index[q, k]]``, its clock last; shapes (Q, TERMS).
-    index: Indices
+    #: Quantity q is the sum of ``coefficient[q, k] x[unknown[q, k]]``, its clock last; shapes (Q, TERMS).
+    unknown: Indices
     coefficient: Floats
     #: Coefficients of phases and Dopplers over the six quantities of the motion; 0 for others; shape (M, MOTION).
     design: Floats
@@ -107,24 +107,24 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
 @inner
 def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]:
     """Return the covariance H P H' of the quantities, and its diagonal without their clocks; shapes (Q, Q), (Q,)."""
-    index, coefficient = equations.index, equations.coefficient
-    size = len(index)
+    unknown, coefficient = equations.unknown, equations.coefficient
+    size = len(unknown)
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))
     for j in range(size):
         g[:] = 0.0
         for k in range(CLOCK_TERM):
             if coefficient[j, k] != 0.0:
-                add_scaled(g, coefficient[j, k], P[index[j, k]])
+                add_scaled(g, coefficient[j, k], P[unknown[j, k]])
         total = 0.0
         for k in range(CLOCK_TERM):
-            total += coefficient[j, k] * g[index[j, k]]
+            total += coefficient[j, k] * g[unknown[j, k]]
         without_clock[j] = total
         if coefficient[j, CLOCK_TERM] != 0.0:
-            add_scaled(g, coefficient[j, CLOCK_TERM], P[index[j, CLOCK_TERM]])
+            add_scaled(g, coefficient[j, CLOCK_TERM], P[unknown[j, CLOCK_TERM]])
         for i in range(j + 1):
             total = 0.0
             for k in range(TERMS):
-                total += coefficient[i, k] * g[index[i, k]]
+                total += coefficient[i, k] * g[unknown[i, k]]
             covariance[i, j] = covariance[j, i] = total
     return covariance, without_clock
 
@@ -173,7 +173,16 @@ def compute_weight(square: float, late: bool, degrees: tuple[float, float]) -> f
 @inner
 def median(values: Floats) -> float:
     """Return the median of values; NaN of none."""
-    return float(np.median(values)) if len(values) else math.nan
+    ordered, size = np.empty(len(values)), len(values)
+    for i in range(size):
+        j = i
+        while j > 0 and ordered[j - 1] > values[i]:
+            ordered[j] = ordered[j - 1]
+            j -= 1
+        ordered[j] = values[i]
+    if size == 0:
+        return math.nan
+    return float(0.5 * (ordered[(size - 1) // 2] + ordered[size // 2]))
 
 
 @inner
@@ -250,9 +259,7 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
 
 
 @inner
-def _write_residuals(
-    rows: Rows, equations: Equations, y: Floats, C: Floats, variance: Floats, found: Fit
-) -> float:
+def _write_residuals(rows: Rows, equations: Equations, y: Floats, C: Floats, variance: Floats, found: Fit) -> float:
     """Write residuals and variances of the fitted quantities; return the weighted square sum of codes and sensors."""
     design, value, codes, square = equations.design, equations.value, rows.code.stop, 0.0
     for j in range(rows.sensor.stop):
@@ -300,7 +307,7 @@ def reweight(
 @inner
 def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Floats, x: Floats, P: Floats) -> None:
     """Correct the state by all measurements of finite variance at their weights, one after the other."""
-    codes, size, value = rows.code.stop, len(equations.index), equations.value
+    codes, size, value = rows.code.stop, len(equations.unknown), equations.value
     change, g, gain = np.zeros(len(x)), np.empty(len(x)), np.empty(len(x))
     T, z = np.empty((MOTION, MOTION)), np.empty(MOTION)
     compress(rows, equations, variance, weight, T, z)
@@ -331,7 +338,7 @@ def _project(equations: Equations, q: int, vector: Floats) -> float:
     """Return ``h' vector`` of a quantity h."""
     total = 0.0
     for k in range(TERMS):
-        total += equations.coefficient[q, k] * vector[equations.index[q, k]]
+        total += equations.coefficient[q, k] * vector[equations.unknown[q, k]]
     return total
 
 
@@ -342,8 +349,8 @@ def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, change
     for k in range(TERMS):
         f = factor * equations.coefficient[q, k]
         if f != 0.0:
-            total += f * change[equations.index[q, k]]
-            add_scaled(g, f, P[equations.index[q, k]])
+            total += f * change[equations.unknown[q, k]]
+            add_scaled(g, f, P[equations.unknown[q, k]])
     return total
 
 

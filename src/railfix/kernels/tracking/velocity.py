@@ -6,6 +6,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Masks
 from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.tracking.update import median
 
 #: Standard deviation of the vertical velocity [m/s].
 CLIMB_MPS = 0.3
@@ -72,7 +73,7 @@ def fitted_velocities(
                 count += 1
         if count - 3 < REDUNDANT:
             continue
-        clock = np.median(rest[:count])
+        clock = median(rest[:count])
         for a in range(4):
             for b in range(4):
                 vertical = up[t, a] * up[t, b] / CLIMB_MPS**2 if a < 3 and b < 3 else 0.0
