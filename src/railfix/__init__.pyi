@@ -24,6 +24,7 @@ from .core import (
     NoPositionError,
     OutputError,
     RailfixError,
+    RailfixWarning,
     Reason,
     SettingsError,
     Status,
@@ -59,7 +60,7 @@ from .pipeline import (
 from .ranges.sbas import SbasMessages, read_sbas
 from .report import write_report
 from .run import RunInputs, RunOptions, RunSummary, run_files
-from .simulate import Scenario, demo_files, load_scenario, write_run
+from .simulate import Scenario, demo, demo_files, load_scenario, write_run
 from .track import (
     Track,
     TrackQuality,
@@ -89,6 +90,7 @@ __all__ = [
     "OutputError",
     "PreciseEphemeris",
     "RailfixError",
+    "RailfixWarning",
     "Reason",
     "Result",
     "RunAndReference",
@@ -108,6 +110,7 @@ __all__ = [
     "check_track",
     "concatenate",
     "core",
+    "demo",
     "demo_files",
     "evaluate",
     "evaluate_run",

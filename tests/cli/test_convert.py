@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import railfix
 from railfix.cli import app
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.io import read_any_positions, rinex
+from railfix.io import read_positions, rinex
 
 pytestmark = pytest.mark.requirement("A8")
 RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
@@ -58,7 +58,7 @@ def test_a_run_on_a_receiver_log(recordings: Path, tmp_path: Path) -> None:
     place = railfix.read_observations(log)
     assert len(place) == 562
     line = tmp_path / "line.csv"
-    fixes = read_any_positions(log)
+    fixes = read_positions(log)
     assert (len(fixes), fixes.quality.tolist()) == (552, [5] * 552)  # from the first fix on
     latitude, longitude, height = (np.median(v) for v in geodetic_from_ecef(fixes.ecef_m))
     rows = [f"{latitude + 2e-5 * k:.9f},{longitude + 3e-5 * k:.9f},{height:.3f}" for k in range(-100, 101)]

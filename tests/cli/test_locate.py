@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from helpers.pipeline_cases import clean_navigation, clean_observations
 from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
-from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import read_positions
+from railfix.io.positions import read_positions
+from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.config import Config
+from railfix.pipeline.locate import locate
+from railfix.pipeline.received import known_from_start
+from railfix.run.locate import reasons_text, solution_text
 
 pytestmark = pytest.mark.requirement("A6")
 
@@ -45,6 +51,22 @@ def test_log_without_navigation_of_its_day_is_a_sentence(recordings: Path, tmp_p
     assert not (tmp_path / "x.pos").exists()
 
 
+def test_epochs_without_position_are_comments_with_their_reason(tmp_path: Path) -> None:
+    """The second of three epochs has two satellites."""
+    whole = clean_observations()["front"][:3]
+    few = np.zeros(whole.code_m.shape, dtype=np.bool_)
+    few[1, np.isin(whole.satellite, ["G10", "G15"], invert=True)] = True
+    observed = replace(whole, code_m=np.where(few, np.nan, whole.code_m))
+    config = Config()
+    found = locate(observed, known_from_start(config, navigation=clean_navigation()), config, ChannelBook(config))
+    assert reasons_text(found) == "1 too few usable satellites"
+    path = tmp_path / "made.pos"
+    path.write_text(solution_text(found))
+    (comment,) = [line for line in path.read_text().splitlines() if " no position" in line]
+    assert comment == "% 2024/03/05 03:10:00.100 no position: too few usable satellites"
+    assert np.array_equal(read_positions(path).time, whole.time[[0, 2]])
+
+
 def test_gpx_points_have_times_and_geoid_heights(tmp_path: Path) -> None:
     path = tmp_path / "run.gpx"
     path.write_text(
@@ -54,7 +76,7 @@ def test_gpx_points_have_times_and_geoid_heights(tmp_path: Path) -> None:
         '<trkpt lat="48.1" lon="11.0"><ele>501.5</ele><time>2024-01-01T10:00:01Z</time><geoidheight>46</geoidheight>'
         "</trkpt></trkseg></trk></gpx>"
     )
-    log = read_any_positions(path)
+    log = read_positions(path)
     latitude, _, height = geodetic_from_ecef(log.ecef_m)
     assert latitude == pytest.approx([48.0, 48.1])
     assert height == pytest.approx([546.0, 547.5])
@@ -62,7 +84,7 @@ def test_gpx_points_have_times_and_geoid_heights(tmp_path: Path) -> None:
     assert log.notes == ()
     path.write_text("<gpx></gpx>")
     with pytest.raises(InputFileError, match="no track point"):
-        read_any_positions(path)
+        read_positions(path)
 
 
 def test_novatel_logs_are_those_of_their_manual(tmp_path: Path) -> None:
@@ -75,12 +97,12 @@ def test_novatel_logs_are_those_of_their_manual(tmp_path: Path) -> None:
         "#BESTPOSA,COM1,0,90.5,FINESTEERING,1949,403744.000,02000000,b1f6,32768;INSUFFICIENT_OBS,NONE,0,0,0,0,WGS84,0,0,0"
         ',"",0,0,0,0,0,0,00,00,00,00*42\n'
     )
-    log = read_any_positions(path)
+    log = read_positions(path)
     assert len(log) == 2
     _, _, height = geodetic_from_ecef(log.ecef_m)
     assert height[0] == pytest.approx(1097.2099 - 17.0)
     assert log.quality.tolist() == [1, -1]
     assert log.sigma_m[0] == pytest.approx([0.009, 0.008, 0.017])
     path.write_text("nothing\n")
-    with pytest.raises(InputFileError, match="no BESTPOSA"):
-        read_any_positions(path)
+    with pytest.raises(InputFileError, match="no log of positions"):
+        read_positions(path)

@@ -1,8 +1,10 @@
-"""The first lines of `run` and `evaluate`: at most five, with the figures of the tables, the worst first."""
+"""The verdict of `run` and `evaluate`: few lines, the figures of the tables and of the report, the worst first."""
 
 from __future__ import annotations
 
+import json
 import re
+from pathlib import Path
 
 import polars as pl
 import pytest
@@ -10,8 +12,10 @@ from typer.testing import CliRunner
 
 from bad_inputs import Desk, desk_in
 from railfix.cli import app
-from railfix.cli.console import verdict_of_evaluation
+from railfix.cli.console import join_antennas, verdict_of_evaluation
 from railfix.evaluate import RunAndReference, evaluate_runs
+from railfix.run.record import read_record
+from railfix.run.verdict import judge_run
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
 pytestmark = pytest.mark.requirement("G4")
@@ -22,29 +26,84 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Desk:
     return desk_in(tmp_path_factory.mktemp("desk"))
 
 
-def first_lines(desk: Desk, command: str) -> list[str]:
-    """Lines before the first blank one."""
+def printed(desk: Desk, command: str) -> list[str]:
+    """Lines that a command prints."""
     result = RUNNER.invoke(app, desk.words(command))
     assert result.exit_code == 0, result.output
-    return result.stdout.split("\n\n")[0].splitlines()
+    return result.stdout.splitlines()
 
 
-def test_a_run_says_first_where_how_good_and_how_sure(desk: Desk) -> None:
-    lines = first_lines(
-        desk,
-        "run --front {desk}/front.obs --rear {desk}/rear.obs --nav {desk}/brdc.nav --track {desk}/line.csv "
-        "--vehicle {desk}/train.toml --out {desk}/new",
-    )
-    assert [line.split(":")[0] for line in lines] == ["front", "rear", "in doubt", "next"]
+def first_lines(desk: Desk, command: str) -> list[str]:
+    """Lines before the first blank one."""
+    lines = printed(desk, command)
+    return lines[: lines.index("")]
+
+
+RUN = (
+    "run --front {desk}/front.obs --rear {desk}/rear.obs --nav {desk}/brdc.nav --track {desk}/line.csv "
+    "--vehicle {desk}/train.toml --out {desk}/new"
+)
+
+
+@pytest.fixture(scope="module")
+def lines(desk: Desk) -> list[str]:
+    return printed(desk, RUN)
+
+
+def test_a_run_says_where_how_good_and_how_sure_in_twelve_lines(desk: Desk, lines: list[str]) -> None:
+    assert len(lines) <= 12
+    heads = [line.split(":")[0] for line in lines]
+    assert heads[:4] == ["front", "rear", "single epochs", "filter along the track"]
+    assert heads[-2:] == ["results", "next"]
     train = pl.read_parquet(desk.folder / "new" / "train.parquet").filter(antenna="front")
     placed = train.drop_nulls("chainage_m")
+    level = placed["protection_level_m"].filter(placed["protection_level_m"].is_finite())
     assert f"a position in {len(placed):,} of {len(train):,} epochs" in lines[0]
     assert f"chainage {placed['chainage_m'].min():.0f} to {placed['chainage_m'].max():.0f} m" in lines[0]
-    assert f"largest {placed['along_sigma_m'].max():.1f} m" in lines[0]
+    assert f"{placed['along_sigma_m'].max():.1f} m at most" in lines[0]
+    assert f"indicative protection level {level.quantile(0.5):.1f} m at the median" in lines[0]
     single = pl.read_parquet(desk.folder / "new" / "positions.parquet").filter(pl.col("status") != "no_observation")
-    failed = int((single["status"] != "ok").sum())
-    assert f"{failed:,} of {len(single):,} single epochs" in lines[2]
-    assert lines[3].endswith(f"railfix report {desk.folder}/new --out report.html")
+    passed = int((single["status"] == "ok").sum())
+    assert f"{passed:,} of {len(single):,} with observations" in lines[2]
+    assert lines[-1].endswith(f"railfix report {desk.folder}/new --out report.html")
+
+
+def test_each_figure_is_the_same_on_the_terminal_in_python_in_json_and_on_the_report(
+    desk: Desk, lines: list[str], tmp_path: Path
+) -> None:
+    """Every card of the report has the name and value of the verdict, and the terminal states the same value."""
+    record = read_record(desk.folder / "new").record
+    verdict = judge_run(record)
+    again = json.loads(json.dumps(verdict.as_dict()))
+    out = tmp_path / "report.html"
+    printed(desk, f"report {{desk}}/new --out {out}")
+    page = out.read_text(encoding="utf-8")
+    keys = page[page.index('<dl class="keys">') : page.index("</dl>")]
+    cards = re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>(?:<dd class=\"single\">single epochs (.*?)</dd>)?", keys)
+    front = verdict.antennas[0]
+    assert cards == list(front.figures())
+    assert front.filter is not None
+    assert f"{front.level_name} {front.filter.level_p50_m:.1f} m" in lines[0]
+    assert again["antennas"][0]["filter"]["level_p50_m"] == front.filter.level_p50_m
+    assert again["antennas"][0]["single_epochs"]["level_p50_m"] == front.single_epochs.level_p50_m
+    # the filter's level and that of single epochs differ: a card that exchanged them would be seen
+    assert front.filter.level_p50_m != front.single_epochs.level_p50_m
+
+
+def test_notes_that_do_not_fit_are_counted_and_shown_on_request(desk: Desk, lines: list[str]) -> None:
+    notes = read_record(desk.folder / "new").record["notes"]
+    shown = [line for line in lines if line.startswith("note: ")]
+    joined = join_antennas(notes)
+    more = len(joined) - len(shown)
+    assert (f"{more} more note" in "\n".join(lines)) == (more > 0)
+    verbose = printed(desk, RUN.replace("{desk}/new", "{desk}/verbose") + " --verbose")
+    assert [line for line in verbose if line.startswith("note: ")] == [f"note: {note}" for note in joined]
+    assert "Filter along the track (train.csv)" in verbose
+
+
+def test_notes_on_two_antennas_are_joined() -> None:
+    notes = ["front: a", "x: y", "rear: a", "rear: b"]
+    assert join_antennas(notes) == ["front and rear: a", "x: y", "rear: b"]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
 START = np.datetime64("2024-03-05T01:00:00", "ns")
-STRAIGHT = Trajectory.from_track(
+STRAIGHT = Trajectory.from_antenna_path(
     Track.from_ecef(synthetic.enu_to_ecef(np.stack([np.arange(0, 501, 10.0), *np.zeros((2, 51))], axis=1)))
 )
 
@@ -37,7 +37,7 @@ def test_other_branch_of_a_hairpin_is_the_same_place_within_its_width():
     s = np.arange(0.0, 300.0, 5.0)
     out = np.stack([s, 0 * s, 0 * s], axis=1)
     back = np.stack([s[::-1], 0 * s + 12.0, 0 * s], axis=1)
-    hairpin = Trajectory.from_track(Track.from_ecef(synthetic.enu_to_ecef(np.concatenate([out, back]))))
+    hairpin = Trajectory.from_antenna_path(Track.from_ecef(synthetic.enu_to_ecef(np.concatenate([out, back]))))
     reference = hairpin.at_arc(np.array([100.0]))
     beside = hairpin.arc_m[-1] - 100.0
     assert along_track_error(np.array([beside + 4.0]), reference, hairpin) == pytest.approx([4.0], abs=1e-3)

@@ -17,7 +17,7 @@ import integrity_tables
 import recordings_score
 from railfix.evaluate import Score, along_track_error, interpolate_reference
 from railfix.io import read_observations
-from railfix.io.position_log import read_positions
+from railfix.io.positions import read_positions
 from railfix.run.processor import make_processor
 
 

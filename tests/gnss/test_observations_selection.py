@@ -56,7 +56,7 @@ def test_a_datetime_is_a_bound(log: Observations) -> None:
 
 def test_a_result_by_its_antenna(log: Observations) -> None:
     files = railfix.demo_files()
-    path = railfix.Trajectory.from_track(railfix.read_track(files["track"]))
+    path = railfix.Trajectory.from_antenna_path(railfix.read_track(files["track"]))
     navigation = railfix.read_navigation(files["nav"])
     processor = railfix.EpochProcessor(railfix.Config(filter="track"), {"front": path}, navigation=navigation)
     result, _ = processor.process({"front": log[:20]})

@@ -315,3 +315,20 @@ def test_chunks_give_the_same_bits() -> None:
         np.testing.assert_array_equal(piece.position_ecef_m, whole.position_ecef_m[part])
         np.testing.assert_array_equal(piece.velocity_ecef_mps, whole.velocity_ecef_mps[part])
         np.testing.assert_array_equal(piece.clock_m, whole.clock_m[part])
+
+
+def test_orbits_of_another_radius_and_clocks_of_zero_are_absent(tmp_path: Path) -> None:
+    lines = text().splitlines()
+    first = next(k for k, line in enumerate(lines) if line.startswith("PG05"))
+    zero = next(k for k, line in enumerate(lines) if line.startswith("PJ02"))
+    x, y, z = (float(lines[first][4 + 14 * i : 18 + 14 * i]) for i in range(3))
+    lines[first] = lines[first][:4] + "".join(f"{0.5 * v:14.6f}" for v in (x, y, z)) + lines[first][46:]
+    lines[zero] = lines[zero][:46] + f"{0.0:14.6f}" + lines[zero][60:]
+    path = tmp_path / "made.sp3"
+    path.write_text("\n".join(lines) + "\n")
+    found = read_sp3(path)
+    gps, qzss = (int(np.flatnonzero(found.satellite == name)[0]) for name in ("G05", "J02"))
+    assert np.isnan(found.position_ecef_m[0, gps]).all()
+    assert np.isfinite(found.position_ecef_m[1:, gps]).all()
+    assert np.isnan(found.clock_s[0, qzss])
+    assert np.isfinite(found.clock_s[1:, qzss]).all()

@@ -198,8 +198,8 @@ _RUN: Final = f"run {_LOG} --track {{desk}}/line.csv --out {{out}}"
 #: Files that are written, a command with a mistake in it, its exit code, and words of its sentence.
 MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
     "semicolons": (
-        {"s.csv": "latitude_deg;longitude_deg;height_m\n47,1;8,5;400\n"}, "map check {desk}/s.csv", 3,
-        "s.csv, line 1: has ';' between its columns; expected commas, and points in numbers",
+        {"s.csv": "latitude_deg;longitude_deg;height_m\n47,1,2;8,5;400\n47,1;8,5;400\n"}, "map check {desk}/s.csv", 3,
+        "s.csv, line 2: column latitude_deg: '47,1,2' is not a number",
     ),
     "height_sigma": (
         {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --height-sigma 1e9 "

@@ -77,11 +77,6 @@ def observations_binary(bench: Bench) -> Options:
     return {"front": bench.write("random.obs", random.Random(1).randbytes(5000))}
 
 
-@broken(INPUT, "utf16.obs")
-def observations_in_utf16(bench: Bench) -> Options:
-    return {"front": bench.write("utf16.obs", bench.front.read_text().encode("utf-16"))}
-
-
 @broken(INPUT, "front.zip", "zip")
 def observations_in_a_zip_archive(bench: Bench) -> Options:
     with zipfile.ZipFile(bench.folder / "front.zip", "w") as archive:

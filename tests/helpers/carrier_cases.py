@@ -24,7 +24,7 @@ def times(epochs: int, interval_s: float = 1.0) -> np.ndarray:
 
 def straight(length_m: float = 1000.0) -> Trajectory:
     s = np.arange(0.0, length_m + 1.0, 50.0)
-    return Trajectory.from_track(
+    return Trajectory.from_antenna_path(
         Track.from_ecef(synthetic.enu_to_ecef(np.stack([0.6 * s, 0.8 * s, 0.005 * s], axis=1)), name="straight")
     )
 

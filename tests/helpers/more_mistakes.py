@@ -225,12 +225,14 @@ MORE: Final[dict[str, Mistake]] = {
     "one_position": ({"s.csv": _TIMED + "2024-05-01T08:00:00,48,11,500\n"}, _MAP, 3, "1 of 1 positions left, a track"),
     "standing_still": ({"s.csv": _rows("48,11,500")}, _MAP, 3, "(30 standing still)"),
     "beyond_the_pole": ({"s.csv": _rows("91.k,11,500")}, _MAP, 3, "latitude_deg 91"),
-    "time_backwards": ({"s.csv": _rows("48.k,11,500", 59, -1)}, _MAP, 3, "line 3: the time is before that of"),
+    "time_backwards": (
+        {"s.csv": _rows("48.k,11,500", 59, -1).replace("08:00:5", "10:00:5")}, _MAP, 3, "the time is before that of",
+    ),
     "positions_in_utc": ({"s.csv": _rows("48.k,11,500").replace(",48", "Z,48")}, _MAP, 3, "carries a time zone"),
     "column_without_name": ({}, _MAP.replace("s.csv", "rtk.csv") + " --column x", 4, "expected NAME=COLUMN"),
     "column_unknown": ({}, _MAP.replace("s.csv", "rtk.csv") + " --column x=y", 4, "column 'x' is unknown"),
     "column_absent": ({}, _MAP.replace("s.csv", "rtk.csv") + " --column x_m=b", 3, "there is no column 'b'"),
-    "log_as_positions": ({}, _MAP.replace("s.csv", "front.obs"), 3, "there is no RTKLIB header line"),
+    "log_as_positions": ({}, _MAP.replace("s.csv", "front.obs"), 3, "is no log of positions"),
     "survey_of_two_countries": (
         {"s.csv": _rows("48.k,11,500")}, "map survey {desk}/rtk.csv {desk}/s.csv --out {out}.csv", 5,
         "give runs over one line",

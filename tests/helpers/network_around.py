@@ -38,7 +38,7 @@ class Around:
 def network_around(track: Track, shape: Shape, seed: int) -> Around:
     """The network of a shape around a line."""
     rng = np.random.default_rng(seed)
-    line = Trajectory.from_track(track)
+    line = Trajectory.from_antenna_path(track)
     total = float(line.arc_m[-1])
     places = np.unique(np.concatenate([line.arc_m, np.arange(0.0, total, 5.0)]))
     places = places[np.concatenate([[True], np.diff(places) > 0.01])]

@@ -116,7 +116,7 @@ def write_stations(
     import pyogrio
     import shapely
 
-    line = Trajectory.from_track(track)
+    line = Trajectory.from_antenna_path(track)
     bounds = [b for loop in loops_m for b in loop]
     places = np.unique(np.concatenate([track.chainage_m, bounds]))
     points = line.at_arc(places)

@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
-from railfix.io.position_log import read_positions
+from railfix.io.positions import read_positions
 
 Truth = tuple[Datetimes, Floats]
 

@@ -18,7 +18,7 @@ from railfix.track.trajectory import Trajectory
 START = np.datetime64("2024-03-05T01:00:00", "ns")
 #: 2 km, level and straight, points every 10 m.
 LINE = Track.from_ecef(synthetic.enu_to_ecef(np.stack([np.arange(0, 2001, 10.0), *np.zeros((2, 201))], axis=1)))
-PATH = Trajectory.from_track(LINE)
+PATH = Trajectory.from_antenna_path(LINE)
 
 
 def at(chainage: np.ndarray) -> np.ndarray:

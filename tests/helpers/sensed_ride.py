@@ -17,7 +17,7 @@ from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.processor import State
+from railfix.pipeline.state import State
 from railfix.run.processor import make_processor
 from railfix.run.sensors import read_listed_balises, read_sensors, read_units
 from railfix.simulate import Scenario, Simulation

@@ -25,7 +25,7 @@ def line(length_m: float = 1000.0, spacing_m: float = 5.0, *, curvature: float =
     heading = 0.3 + np.sin(s / 150.0) * 150.0 * curvature
     steps = np.stack([np.sin(heading), np.cos(heading), 0.01 * np.sin(s / 90.0)], axis=1)[:-1] * spacing_m
     enu = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    return Trajectory.from_track(Track.from_ecef(enu_to_ecef(enu), name="made line"))
+    return Trajectory.from_antenna_path(Track.from_ecef(enu_to_ecef(enu), name="made line"))
 
 
 def satellites(rng: np.random.Generator, epochs: int, systems: str) -> np.ndarray:

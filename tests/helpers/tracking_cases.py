@@ -36,7 +36,7 @@ def bent_line(length_m: float = 3000.0, *, turn_deg: float = 60.0) -> Trajectory
     origin = ecef_from_geodetic(LATITUDE, LONGITUDE, 40.0)
     axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
     points = origin + east[:, None] * axes[0] + north[:, None] * axes[1]
-    return Trajectory.from_track(Track.from_ecef(points))
+    return Trajectory.from_antenna_path(Track.from_ecef(points))
 
 
 def corner_line(length_m: float = 1200.0) -> Trajectory:
@@ -46,7 +46,9 @@ def corner_line(length_m: float = 1200.0) -> Trajectory:
     bearing = np.radians(30.0 + 90.0 * np.clip((s[:, None] - corners) / 10.0, 0.0, 1.0).sum(axis=1))
     east, north = (np.concatenate([[0.0], np.cumsum(f(bearing) * 5.0)]) for f in (np.sin, np.cos))
     axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
-    return Trajectory.from_track(Track.from_ecef(ORIGIN_M[0] + east[:, None] * axes[0] + north[:, None] * axes[1]))
+    return Trajectory.from_antenna_path(
+        Track.from_ecef(ORIGIN_M[0] + east[:, None] * axes[0] + north[:, None] * axes[1])
+    )
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
-from railfix.io.position_log import read_positions
+from railfix.io.positions import read_positions
 from railfix.track import ThinningLimits, from_position_log, from_positions, read_track, thin
 from railfix.track.from_positions import ANTENNA_PATH, usable_rows
 from railfix.track.trajectory import Trajectory
@@ -155,10 +155,52 @@ def test_csv_in_ecef_and_under_other_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("names", "separator", "encoding", "ending"),
+    [
+        ("lat,lon,height", ",", "utf-8", ".csv"),
+        ("Latitude,Longitude,Altitude", ",", "utf-8-sig", ".txt"),
+        ("LATITUDE_DEG,LONGITUDE_DEG,Height_m", ";", "utf-16", ".csv"),
+        ("Lat,Lng,Ellipsoidal height (m)", "\t", "utf-16", ".txt"),
+    ],
+)
+def test_tables_as_other_programs_write_them(
+    tmp_path: Path, names: str, separator: str, encoding: str, ending: str
+) -> None:
+    """Usual names, separators, decimal commas beside semicolons, UTF-16 of a spreadsheet: the same positions."""
+    text = CSV.replace("latitude_deg,longitude_deg,height_m", names).replace(",", separator)
+    if separator == ";":
+        text = text.replace("35.342", "35,342").replace("47.5764", "47,5764")
+    path = tmp_path / f"run{ending}"
+    path.write_text(text, encoding=encoding)
+    log = read_positions(path)
+    np.testing.assert_allclose(log.ecef_m[:2], EXPECTED, atol=1e-6)
+    if "deg" not in names.lower():
+        assert "is taken as heights above the ellipsoid" in log.notes[0]
+
+
+def test_rows_out_of_order_are_sorted_or_noted(tmp_path: Path) -> None:
+    """Two rows exchanged are sorted, with a note; a clock that goes back by an hour only has a note."""
+    path = tmp_path / "run.csv"
+    seconds = np.array([0, 1, 3, 2, 4, 5])
+    for step, sorted_rows in ((0, True), (3600, False)):
+        time = START + (seconds - step * (seconds > 3)).astype("timedelta64[s]")
+        rows = [f"{t},35.3,139.5,{40 + k}" for k, t in enumerate(time)]
+        path.write_text("time_gpst,latitude_deg,longitude_deg,height_m\n" + "\n".join(rows), encoding="utf-8")
+        log = read_positions(path)
+        assert log.line.tolist() == ([2, 3, 5, 4, 6, 7] if sorted_rows else [2, 3, 4, 5, 6, 7])
+        np.testing.assert_allclose(log.geodetic[2], log.line + 38.0, atol=1e-6)
+        assert "line 5: the time goes back" in log.notes[-1]
+        assert ("sorted by time" in log.notes[-1]) == sorted_rows
+
+
+@pytest.mark.parametrize(
     ("text", "columns", "error", "said"),
     [
         (CSV.replace("latitude_deg", "lattitude_deg"), {}, InputFileError, "is 'latitude_deg' meant"),
-        (CSV.replace("height_m", "z"), {}, InputFileError, "no columns latitude_deg"),
+        (CSV.replace("height_m", "z"), {}, InputFileError, "have no height"),
+        (CSV.replace("longitude_deg", "x"), {}, InputFileError, "no columns latitude_deg"),
+        (CSV.replace("height_m", "height_ft"), {}, InputFileError, "line 1: column 'height_ft' is in feet; convert"),
+        (CSV.replace("height_m", "Altitude (km)"), {}, InputFileError, "is in kilometres; convert"),
         (CSV.replace("47.5764", "high"), {}, InputFileError, "line 2: column height_m"),
         (CSV.replace("06:30:01.2", "6h30"), {}, InputFileError, "line 3: time_gpst"),
         (CSV.replace("06:30:01.2", "06:30:01.2Z"), {}, InputFileError, "time zone"),
@@ -271,8 +313,10 @@ def test_bends_between_two_points_are_kept() -> None:
     enu = np.stack([6.0 * (1.0 - np.cos(angle)), 6.0 * np.sin(angle), 0 * angle], axis=1)
     ecef = ecef_from_geodetic(*ORIGIN) + enu @ enu_axes(*ORIGIN[:2])
     time = START + (np.arange(len(angle)) * 1e8).astype("timedelta64[ns]")
-    _, offset = Trajectory.from_track(from_positions(time, ecef)).nearest(ecef)
-    _, coarse = Trajectory.from_track(from_positions(time, ecef, limits=ThinningLimits(chord_m=9.0))).nearest(ecef)
+    _, offset = Trajectory.from_antenna_path(from_positions(time, ecef)).nearest(ecef)
+    _, coarse = Trajectory.from_antenna_path(from_positions(time, ecef, limits=ThinningLimits(chord_m=9.0))).nearest(
+        ecef
+    )
     assert offset.max() < 0.30 < coarse.max()
 
 
@@ -310,7 +354,7 @@ def test_maps_of_the_recordings(name: str, tmp_path: Path, recordings: Path) -> 
     np.testing.assert_allclose(log.ecef_m, ecef, atol=1e-4)
     track, thinned = from_position_log(log)
     assert ANTENNA_PATH in track.provenance.notes
-    _, offset = Trajectory.from_track(track).nearest(ecef)
+    _, offset = Trajectory.from_antenna_path(track).nearest(ecef)
     assert np.percentile(offset, 50) < 0.05
     assert np.percentile(offset, 99) < 1.1
     assert len(thinned.turns) == (name == "gsdc")  # that car backs out of a parking place once

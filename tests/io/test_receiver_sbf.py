@@ -16,7 +16,7 @@ import railfix
 from railfix.core.timescale import to_week
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io import read_any_positions
+from railfix.io import read_positions
 from railfix.io.receiver import sbf, ubx
 from railfix.io.receiver.framing import Subframes, find_frames, sbas_frames
 from railfix.io.receiver.log import StreamState, decode
@@ -357,7 +357,7 @@ def test_positions_of_the_receiver(tmp_path: Path, kind: int, name: str) -> None
         data += block(kind, head + bytes(40))
     path = tmp_path / "log.sbf"
     path.write_bytes(data)
-    log = read_any_positions(path)
+    log = read_positions(path)
     assert log.quality.tolist() == [1, 2, 5, 3, 6], name
     assert np.abs(log.ecef_m - ecef).max() < 1e-6
     assert np.diff(log.time).tolist() == [1_000_000_000] * 4

@@ -12,8 +12,8 @@ import pytest
 
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.io.nmea import read_any_positions, read_nmea
-from railfix.io.position_log import read_positions
+from railfix.io.nmea import read_nmea
+from railfix.io.positions import read_positions
 
 pytestmark = pytest.mark.requirement("D1")
 
@@ -71,24 +71,59 @@ def test_an_epoch_without_a_position_stays_a_row(tmp_path: Path) -> None:
     path = log(
         tmp_path / "a.nma", rmc("010000.00", "050324"), signed("GNGGA,010000.00,,,,,0,00,,,M,,M,,"), gga("010001.00")
     )
-    found = read_any_positions(path)
+    found = read_positions(path)
     assert found.quality.tolist() == [0, 1]
     assert np.isnan(found.ecef_m[0]).all()
     assert not np.isnan(found.ecef_m[1]).any()
 
 
 GOOD = [rmc("010000.00", "050324"), gga("010000.00")]
+LAST = gga("010005.00")
+
+
+@pytest.mark.parametrize(
+    ("line", "note"),
+    [
+        ("!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24", "1 lines skipped that are no sentence"),
+        ("garbage", "1 lines skipped that are no sentence"),
+        ("NMEA," + gga("010001.00") + ",1709600401000", ""),
+        (gga("010001.00").partition("*")[0], "1 sentences without checksum"),
+        (gga("010001.00", geoid=""), "1 of 3 fixes have no height or no geoid separation"),
+    ],
+)
+def test_logs_as_recorders_write_them_are_read(line: str, note: str, tmp_path: Path) -> None:
+    """Sentences of AIS, other lines, a word before the sentence, no checksum, a fix in two dimensions."""
+    found = read_nmea(log(tmp_path / "a.nmea", *GOOD, line, LAST))
+    a_fix = "GGA" in line
+    assert len(found) == (3 if a_fix else 2)
+    assert any(note in text for text in found.notes)
+    latitude, longitude, height = found.geodetic
+    np.testing.assert_allclose(latitude, latitude[0], atol=1e-9)
+    np.testing.assert_allclose(longitude, longitude[0], atol=1e-9)
+    assert np.isnan(height).tolist() == ([False, "fixes" in note, False] if a_fix else [False, False])
+    assert read_positions(tmp_path / "a.nmea").line.tolist() == found.line.tolist()
+
+
+@pytest.mark.parametrize("last", [gga("010005.00")[:20], gga("010005.00")[:-1]])
+def test_a_cut_last_sentence_is_dropped_with_a_note(last: str, tmp_path: Path) -> None:
+    found = read_nmea(log(tmp_path / "a.nmea", *GOOD, last))
+    assert len(found) == 1
+    assert "line 3" in found.notes[-1]
+    assert "skipped" in found.notes[-1]
+
+
+def test_a_separation_of_zero_is_doubted_where_the_geoid_is_elsewhere(tmp_path: Path) -> None:
+    found = read_nmea(log(tmp_path / "a.nmea", rmc("010000.00", "050324"), gga("010000.00", geoid="0.0")))
+    (note,) = (text for text in found.notes if "separation is 0" in text)
+    assert "38 m (EGM96)" in note  # at 35.35 N, 139.5 E
 
 
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
-        ([*GOOD, gga("010001.00")[:-2] + "00"], r"line 3: the checksum is 00, \w\w was expected"),
-        ([*GOOD, "garbage"], "line 3: this sentence does not begin with"),
-        ([*GOOD, "$GNGGA,010001.00"], "line 3: this sentence has no checksum"),
-        ([*GOOD, signed("GNGGA,010001.00,3521,N")], "line 3: a field of GGA is invalid"),
-        ([*GOOD, gga("010001.00", latitude="9921.0,N")], "line 3: a field of GGA is invalid"),
-        ([*GOOD, gga("010001.00", geoid="")], "line 3: height or geoid separation is missing"),
+        ([*GOOD, gga("010001.00")[:-2] + "00", LAST], r"line 3: the checksum is 00, \w\w was expected; --lenient"),
+        ([*GOOD, signed("GNGGA,010001.00,3521,N"), LAST], "line 3: a field of GGA is invalid; --lenient"),
+        ([*GOOD, gga("010001.00", latitude="9921.0,N"), LAST], "line 3: a field of GGA is invalid"),
         ([gga("010000.00")], "no RMC or ZDA sentence, the date is unknown"),
         (GOOD[:1], "there is no GGA sentence"),
     ],
@@ -117,7 +152,7 @@ def test_nmea_written_by_rtklib_is_its_own_solution(tmp_path: Path, recordings: 
     for name, options in (("a.nmea", ["-n"]), ("a.pos", ["-e"])):
         out = tmp_path / name
         subprocess.run([program, "-p", "2", *options, "-o", str(out), *inputs], check=True, capture_output=True)
-        logs.append(read_any_positions(out))
+        logs.append(read_positions(out))
     nmea, table = logs
     assert nmea.ratio is None
     assert table.ratio is not None

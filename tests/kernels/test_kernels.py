@@ -34,7 +34,7 @@ from railfix.kernels.compiling import by_reference
 from railfix.kernels.tracking.recursion import advance
 from railfix.kernels.tracking.velocity import fitted_velocities
 from railfix.pipeline.config import Config
-from railfix.pipeline.processor import Result
+from railfix.pipeline.results import Result
 from railfix.positioning.noise_scale import robust_fit
 from railfix.positioning.normal_equations import constrained_position, fit, normal_equations, single_point
 from railfix.run.processor import make_processor

@@ -21,7 +21,7 @@ from railfix.core.errors import ChannelsDisagreeError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
-from railfix.io import read_any_positions
+from railfix.io import read_positions
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
 from railfix.live import session
 from railfix.live.channels import TwoChannels, compare, digests
@@ -296,7 +296,7 @@ def test_a_clock_step_is_counted(logs: dict[str, tuple[Observations, ...]]) -> N
 
 def ubx_line(log: Path, folder: Path) -> Path:
     """A line of 1 km through the place that the receiver itself gives."""
-    latitude, longitude, height = (float(np.median(v)) for v in geodetic_from_ecef(read_any_positions(log).ecef_m))
+    latitude, longitude, height = (float(np.median(v)) for v in geodetic_from_ecef(read_positions(log).ecef_m))
     rows = [f"{latitude + 2e-5 * k:.9f},{longitude + 3e-5 * k:.9f},{height:.3f}" for k in range(-100, 101)]
     path = folder / "line.csv"
     path.write_text("# crs: EPSG:4979\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
@@ -331,7 +331,7 @@ def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) 
     data = gzip.decompress(log.read_bytes())[:700_000]
     part = tmp_path / "part.ubx"
     part.write_bytes(data)
-    trajectory = {"front": railfix.Trajectory.from_track(railfix.read_track([ubx_line(log, tmp_path)]))}
+    trajectory = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([ubx_line(log, tmp_path)]))}
 
     async def session(source: str | None) -> list[LiveOutput]:
         outputs: list[LiveOutput] = []
@@ -364,7 +364,7 @@ def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_pat
     """A cold start: no position until subframes of enough satellites have been received whole."""
     log = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
     data = gzip.decompress(log.read_bytes())
-    trajectory = {"front": railfix.Trajectory.from_track(railfix.read_track([ubx_line(log, tmp_path)]))}
+    trajectory = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([ubx_line(log, tmp_path)]))}
     engine = LiveEngine(
         railfix.EpochProcessor(railfix.Config(), trajectory), LiveSettings(period_s=1.0, no_input="skip")
     )

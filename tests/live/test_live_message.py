@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from live_outputs import output_of
 from pipeline_cases import clean_trajectories, demo_observations
+from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.rinex import read_navigation
-from railfix.io.train_message import MessageStatus, Source, SuspectedInterference
+from railfix.io.train_message import MessageStatus, Source, SuspectedInterference, Unknown
 from railfix.live.console import Metrics
-from railfix.live.engine import EngineState, LiveEngine, LiveOutput
+from railfix.live.engine import EngineState, LiveEngine
 from railfix.live.forms import gga_sentence, nmea_bytes, tpv_bytes
-from railfix.live.message import create_message
 from railfix.live.session import Hooks, _Session
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import FOREVER, Sensed, SensorLines, single_epochs
@@ -26,7 +27,8 @@ from railfix.motion.samples import RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.motion.slip import MotionState
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.results import Result, State
+from railfix.pipeline.results import Result
+from railfix.pipeline.state import State
 from railfix.simulate.demonstration import demo_files
 from railfix.tracking import Kind, TrackStatus
 
@@ -49,7 +51,7 @@ def test_no_bound_of_a_position_that_failed_a_check_goes_out_as_coasting() -> No
             antennas={"front": replace(antenna, status=np.full(3, single, dtype=np.int8))},
             fusion={"front": replace(track, tracked=tracked)},
         )
-        message = create_message(changed, LiveSettings())
+        message = output_of(changed, LiveSettings()).message
         assert message.status is expected
         assert (message.over_cm is None) == (expected is MessageStatus.DOUBTFUL)
 
@@ -75,18 +77,32 @@ def with_track(result: Result, name: str, *, tracked: dict[str, Any] | None = No
 @pytest.mark.requirement("A8")
 @pytest.mark.parametrize("facing", [-1, 0, 1])
 def test_the_front_end_is_ahead_of_the_place_in_the_direction_it_looks(filtered: Result, facing: int) -> None:
+    """A train of 40 m whose front end is 7.5 m ahead of the front antenna, 9.1 m ahead of the vehicle's middle."""
     one = with_track(filtered, "front")
-    place = float(one.fusion["front"].chainage_m[-1])
-    message = create_message(one, LiveSettings(facing=facing, front_offset_m=7.5))
-    assert message.chainage_cm == pytest.approx(100.0 * (place + facing * 7.5), abs=0.51)
-    assert message.facing == facing
+    apart_m = float(abs(one.fusion["front"].chainage_m[-1] - one.antennas["front"].chainage_m[-1]))
+    middle = float(one.fusion["front"].chainage_m[-1]) - 9.1
+    message = output_of(one, LiveSettings(facing=facing, front_offset_m=7.5, length_m=40.0)).message
+    ahead = {1: 9.1 + 7.5, 0: 0.0, -1: 40.0 - 9.1 - 7.5}[facing]
+    assert message.chainage_cm == pytest.approx(100.0 * (middle + facing * ahead), abs=0.6)
+    assert (message.facing, message.length_cm) == (facing, 4000)
+    assert message.unknown == (Unknown(0) if facing else Unknown.FACING)
+    assert message.over_cm is not None
+    assert message.protection_level_cm is not None
+    either = 0.0 if facing else 40.0 - 9.1 - 7.5  # the rear end, the further one, may be ahead on either side
+    assert message.over_cm - message.protection_level_cm == pytest.approx(100.0 * (either + apart_m) + 1.0, abs=2.0)
+    if not facing:
+        assert (message.safe_front_cm, message.safe_rear_cm) == (None, None)
+        return
+    assert message.chainage_cm is not None
+    assert message.safe_front_cm == pytest.approx(message.chainage_cm + facing * message.over_cm, abs=1)
+    assert message.safe_rear_cm == pytest.approx(message.chainage_cm - facing * (message.over_cm + 4000), abs=1)
 
 
 @pytest.mark.requirement("A8")
 def test_bound_of_the_speed_and_probability_of_the_track(filtered: Result) -> None:
     """0.1 m/s: 5.33 sigmas are 53.3 cm/s, rounded up; 0.9876 is 987 thousandths."""
     values = {"speed_sigma_mps": np.full(3, 0.1), "probability": np.full(3, 0.9876)}
-    message = create_message(with_track(filtered, "front", tracked=values), LiveSettings())
+    message = output_of(with_track(filtered, "front", tracked=values), LiveSettings()).message
     assert (message.speed_bound_cmps, message.track_permille) == (54, 987)
 
 
@@ -97,7 +113,7 @@ def test_the_bound_holds_for_the_single_epoch_and_for_the_filter(filtered: Resul
     bounds = []
     for away_m in (0.0, 4.0, -4.0):
         moved = with_track(filtered, "front", chainage_m=single + away_m)
-        message = create_message(moved, LiveSettings())
+        message = output_of(moved, LiveSettings()).message
         assert message.over_cm is not None
         assert message.protection_level_cm is not None
         bounds.append(message.over_cm - message.protection_level_cm)
@@ -105,32 +121,32 @@ def test_the_bound_holds_for_the_single_epoch_and_for_the_filter(filtered: Resul
 
 
 @pytest.mark.requirement("A8")
-def test_forms_name_hemispheres_utc_and_the_antenna_of_the_message(filtered: Result) -> None:
+def test_forms_name_hemispheres_utc_and_the_place_of_the_first_antenna(filtered: Result) -> None:
     """GPS time is 18 s ahead of UTC from 2017 on."""
     for latitude, longitude, letters in ((35.5, 139.5, ("N", "E")), (-35.5, -139.5, ("S", "W"))):
         one = with_track(filtered, "front", latitude_deg=np.full(3, latitude), longitude_deg=np.full(3, longitude))
-        message = create_message(one, LiveSettings())
+        message = output_of(one, LiveSettings()).message
         at = (np.datetime64("2024-03-05T00:00:10", "ns") - GPS_EPOCH) // np.timedelta64(1, "ns")
-        output = LiveOutput(message=message.replaced(time_ns=int(at)), result=one)
+        output = replace(output_of(one), message=message.replaced(time_ns=int(at)))
         fields = nmea_bytes(output).decode().splitlines()[0].split(",")
         assert fields[1] == "235952.00"
         assert (fields[3], fields[5]) == letters
         assert (fields[2], fields[4]) == ("3530.0000000", "13930.0000000")
         tpv = json.loads(tpv_bytes(output))
         assert (tpv["time"], tpv["lat"], tpv["lon"]) == ("2024-03-04T23:59:52.000Z", latitude, longitude)
-    for name in ("front", "rear"):
-        level = {"level_m": np.full(3, 3.0)}
+    places = []
+    for name in ("rear", "front"):  # whichever has the smaller level, the point is the same
         fusion = {
-            other: replace(
-                track,
-                latitude_deg=np.full(3, 10.0 if other == "front" else 20.0),
-                tracked=replace(track.tracked, **(level if other == name else {"level_m": np.full(3, 99.0)})),
-            )
+            other: replace(track, tracked=replace(track.tracked, level_m=level, amount_m=level))
             for other, track in filtered.fusion.items()
+            for level in [np.full(3, 3.0 if other == name else 99.0)]
         }
-        both = replace(filtered, fusion=fusion)
-        output = LiveOutput(message=create_message(both, LiveSettings()), result=both)
-        assert json.loads(tpv_bytes(output))["lat"] == {"front": 10.0, "rear": 20.0}[name]
+        output = output_of(replace(filtered, fusion=fusion))
+        assert output.place is not None
+        assert output.place.antenna == name
+        tpv = json.loads(tpv_bytes(output))
+        places.append(ecef_from_geodetic(tpv["lat"], tpv["lon"], tpv["altHAE"]))
+    assert np.linalg.norm(places[0] - places[1]) < 3.0  # the antennas are 18.2 m apart
 
 
 @pytest.mark.requirement("A8")
@@ -197,11 +213,11 @@ def test_interference_is_the_worst_of_both_antennas_and_satellites_are_the_most(
             for name, found in (("front", front), ("rear", rear))
         }
         both = replace(filtered, antennas=antennas)
-        message = create_message(both, LiveSettings())
+        message = output_of(both, LiveSettings()).message
         assert message.interference == SuspectedInterference(2)
-        gga = nmea_bytes(LiveOutput(message=message, result=both)).decode().split(",")
+        gga = nmea_bytes(output_of(both)).decode().split(",")
         assert gga[7] == "07"
-    assert create_message(filtered, LiveSettings()).interference == SuspectedInterference(0)
+    assert output_of(filtered, LiveSettings()).message.interference == SuspectedInterference(0)
 
 
 @pytest.mark.requirement("A8", "E5")
@@ -210,7 +226,9 @@ def test_a_way_that_inertia_carries_is_of_the_inertial_unit(filtered: Result) ->
     used[-1, Kind.WHEEL] = 1
     for state, expected in ((MotionState.NORMAL, Source.TACHOMETER), (MotionState.INERTIAL_SLIDE, Source.INERTIAL)):
         sensed = replace(filtered.fusion["front"].sensed, state=np.full(3, state, dtype=np.int8))
-        message = create_message(with_track(filtered, "front", tracked={"used": used}, sensed=sensed), LiveSettings())
+        message = output_of(
+            with_track(filtered, "front", tracked={"used": used}, sensed=sensed), LiveSettings()
+        ).message
         assert message.sources == Source.FRONT_RECEIVER | expected
 
 
@@ -218,12 +236,12 @@ def test_a_way_that_inertia_carries_is_of_the_inertial_unit(filtered: Result) ->
 def test_speeds_of_forms_are_without_a_sign_and_carried_places_are_estimates(filtered: Result) -> None:
     """10 m/s toward falling chainage are 19.44 knots; quality 6 of NMEA is an estimated position."""
     one = with_track(filtered, "front", tracked={"speed_mps": np.full(3, -10.0)})
-    message = create_message(one, LiveSettings())
+    message = output_of(one, LiveSettings()).message
     assert message.speed_cmps == -1000
     for status, quality, valid in (
         (MessageStatus.POSITION, "1", "A"), (MessageStatus.COASTING, "6", "A"), (MessageStatus.DOUBTFUL, "0", "V"),
     ):  # fmt: skip
-        output = LiveOutput(message=message.replaced(status=status), result=one)
+        output = replace(output_of(one), message=message.replaced(status=status))
         gga, rmc, _ = (line.split(",") for line in nmea_bytes(output).decode().splitlines())
         assert (gga[6], rmc[2], rmc[7]) == (quality, valid, "19.44")
         assert json.loads(tpv_bytes(output))["speed"] == 10.0
@@ -232,8 +250,9 @@ def test_speeds_of_forms_are_without_a_sign_and_carried_places_are_estimates(fil
 @pytest.mark.requirement("A12")
 def test_a_caster_keeps_the_last_valid_place_while_there_is_none(filtered: Result) -> None:
     one = with_track(filtered, "front")
-    good = LiveOutput(message=create_message(one, LiveSettings()).replaced(status=MessageStatus.POSITION), result=one)
-    bad = LiveOutput(message=good.message.replaced(status=MessageStatus.DOUBTFUL), result=one)
+    good = output_of(one)
+    good = replace(good, message=good.message.replaced(status=MessageStatus.POSITION))
+    bad = replace(good, message=good.message.replaced(status=MessageStatus.DOUBTFUL))
     polled = [[good], [bad], []]
     engine: Any = SimpleNamespace(poll=lambda **_: polled.pop(0), settings=LiveSettings(gga_s=10.0), reports=[])
     session = _Session(engine=engine, sinks=[], metrics=Metrics(), hooks=Hooks())

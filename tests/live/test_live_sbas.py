@@ -120,7 +120,7 @@ def test_messages_of_two_receivers_count_once(log: dict[str, Path]) -> None:
 
 def test_without_a_message_every_satellite_is_rejected(log: dict[str, Path]) -> None:
     observations = railfix.read_observations(log["log"])[:3]
-    line = {"front": railfix.Trajectory.from_track(railfix.read_track([log["line"]]))}
+    line = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track([log["line"]]))}
     config = railfix.Config(sbas="stream", sbas_prn=137)
     result, _ = railfix.EpochProcessor(config, line, navigation=railfix.read_navigation(log["nav"])).process(
         {"front": observations}

@@ -419,6 +419,10 @@ def up_cm(value: float) -> int:
     return math.ceil(value * 100.0 - 1e-9)
 
 
+#: The front end of the demonstration's vehicle ahead of its middle [m].
+FRONT_M = 11.6
+
+
 def of_message(row: dict[str, Any], message: TrainMessage) -> bool:
     """Whether a message says what a row of the filter says, rounded: bounds up, 1 cm more for that of the place."""
     if not math.isfinite(row["chainage_m"]):
@@ -429,7 +433,7 @@ def of_message(row: dict[str, Any], message: TrainMessage) -> bool:
         bounds = (up_cm(row["over_reading_m"] + 0.01), up_cm(level))
     said = (message.over_cm, message.protection_level_cm)
     return (
-        message.chainage_cm == round(row["chainage_m"] * 100.0)
+        message.chainage_cm == round((row["chainage_m"] + FRONT_M) * 100.0)
         and message.sigma_cm == up_cm(row["along_sigma_m"])
         and message.speed_cmps == round(row["speed_mps"] * 100.0)
         and (said == bounds or bounds == (None, None))

@@ -59,7 +59,7 @@ def tags(log: bytes) -> list[np.datetime64]:
 
 def engine(settings: LiveSettings = QUICK) -> LiveEngine:
     files = demo_files()
-    path = railfix.Trajectory.from_track(railfix.read_track([files["track"]]))
+    path = railfix.Trajectory.from_antenna_path(railfix.read_track([files["track"]]))
     return LiveEngine(
         railfix.EpochProcessor(railfix.Config(), {"front": path}, navigation=railfix.read_navigation(files["nav"])),
         settings,

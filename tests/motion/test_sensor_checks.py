@@ -32,7 +32,7 @@ ORIGIN = ecef_from_geodetic(35.0, 139.0, 60.0)
 EAST, _, UP = enu_axes(35.0, 139.0)
 SOUTH = np.cross(EAST, UP)
 AT = np.arange(0.0, 900.0, 10.0)
-LINE = Trajectory.from_track(Track.from_ecef(ORIGIN + AT[:, None] * EAST, name="east"))
+LINE = Trajectory.from_antenna_path(Track.from_ecef(ORIGIN + AT[:, None] * EAST, name="east"))
 #: Units 3 m to the right of the line, 1 m above the antenna.
 UNITS = GroundUnits(
     name=np.array(["A", "B"]), ecef_m=np.stack([ORIGIN + x * EAST + 3.0 * SOUTH + UP for x in (300.0, 600.0)])
@@ -109,7 +109,7 @@ def round_line() -> Trajectory:
     angle = distance / RADIUS_M  # heading, from east to the south
     flat = np.cos(angle)[:, None] * -SOUTH + np.sin(angle)[:, None] * EAST
     ecef = ORIGIN + RADIUS_M * (flat + SOUTH) + CLIMB * distance[:, None] * UP
-    line = Trajectory.from_track(Track.from_ecef(ecef, name="circle"))
+    line = Trajectory.from_antenna_path(Track.from_ecef(ecef, name="circle"))
     return replace(line, chainage_m=distance)
 
 

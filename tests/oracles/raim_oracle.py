@@ -38,7 +38,7 @@ def point_model(ranges: Ranges, ecef_m: np.ndarray) -> LinearModel:
 def straight(length_m: float = 2000.0) -> Trajectory:
     """A line to the north-east, points every 20 m."""
     s = np.arange(0.0, length_m + 1.0, 20.0)
-    return Trajectory.from_track(
+    return Trajectory.from_antenna_path(
         Track.from_ecef(synthetic.enu_to_ecef(np.stack([0.6 * s, 0.8 * s, 0.002 * s], axis=1)))
     )
 

@@ -13,16 +13,18 @@ import numpy as np
 import pytest
 
 import integrity_tables
+from railfix.core.epoch_rows import EVERY, join_epochs, take_epochs
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline import processor as processing
 from railfix.pipeline.antennas import filter_verdicts, position_verdicts
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import correct_ranges
-from railfix.pipeline.processor import EpochProcessor, Models
-from railfix.pipeline.results import AntennaResult, State
-from railfix.positioning.antenna_rows import EVERY, AntennaRows, join_epochs, stack_observations, take_epochs
+from railfix.pipeline.corrected_ranges import Models, correct_ranges
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.state import State
+from railfix.positioning.antenna_rows import AntennaRows, stack_observations
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import ErrorModel
 from railfix.run.processor import make_processor

@@ -20,8 +20,9 @@ from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
 from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
-from railfix.pipeline.results import State
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.state import State
 from railfix.ranges.base_station import BaseErrors
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory
@@ -36,7 +37,7 @@ class Drive:
     def __init__(self, recordings: Path) -> None:
         folder = next((recordings / "kinematic").glob("japan_mosaic*"))
         self.time, self.ecef_m = recordings_truth.japan_truth(folder)
-        self.trajectory = Trajectory.from_track(from_positions(self.time, self.ecef_m, spacing_m=5.0))
+        self.trajectory = Trajectory.from_antenna_path(from_positions(self.time, self.ecef_m, spacing_m=5.0))
         self.navigation = read_navigation([folder / "SEPT2650.21P"])
         self.train = read_observations(folder / "SEPT265G.21O")
         self.base = read_observations(folder / "3034265G.21O")
@@ -216,4 +217,4 @@ def test_one_frequency_in_place_of_two_is_told(drive: Drive, base: bool, setting
 def line_trajectory() -> Trajectory:
     from railfix.track import Track
 
-    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(35.0 + np.array([0.0, 0.01]), 139.0, 50.0)))
+    return Trajectory.from_antenna_path(Track.from_ecef(ecef_from_geodetic(35.0 + np.array([0.0, 0.01]), 139.0, 50.0)))

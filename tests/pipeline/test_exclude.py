@@ -14,7 +14,7 @@ from railfix.pipeline.config import parse_config
 
 def test_excluded_satellites_are_as_if_they_were_not_there() -> None:
     files, log = railfix.demo_files(), demo_observations()["front"][:40]
-    path = {"front": railfix.Trajectory.from_track(railfix.read_track(files["track"]))}
+    path = {"front": railfix.Trajectory.from_antenna_path(railfix.read_track(files["track"]))}
     navigation = railfix.read_navigation(files["nav"])
     kept = [name for name in np.unique(log.satellite).tolist() if name[0] != "E" and name != "G06"]
     excluding = parse_config({"filter": "track", "exclude": ["G06", "E"]})

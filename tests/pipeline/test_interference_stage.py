@@ -10,13 +10,12 @@ import pytest
 
 import pipeline_cases
 import signal_attacks
+from live_outputs import output_of
 from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations
 from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
-from railfix.live.message import create_message
-from railfix.live.settings import LiveSettings
-from railfix.pipeline.processor import Result
+from railfix.pipeline.results import Result
 from railfix.tracking import TrackStatus
 from railfix.tracking.result import is_bounded
 from signal_attacks import Scene
@@ -124,7 +123,7 @@ def test_the_filter_gives_no_bound_and_the_message_says_why() -> None:
     # the filter's own monitors have the place in doubt before, or with, the suspicion
     assert np.isin(tracked.status[spoofed][:5], (TrackStatus.DOUBTFUL, TrackStatus.SPOOFING_SUSPECTED)).all()
     assert not np.isfinite(tracked.level_m[spoofed]).any()
-    message = create_message(whole, LiveSettings())
+    message = output_of(whole).message
     assert message.interference == Suspicion.SPOOFING_SUSPECTED
     assert message.over_cm is None
 

@@ -15,14 +15,9 @@ from railfix.core.timescale import timedelta
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.along_track import apply_spacing_verdict
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.filter_result import (
-    AlongTrack,
-    FilterState,
-    OffMapState,
-    ReturnState,
-    gated_codes,
-    off_map_epochs,
-)
+from railfix.pipeline.filter_result import AlongTrack, FilterState
+from railfix.pipeline.off_map import OffMapState, off_map_epochs
+from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.sensor_epochs import SensorLimits

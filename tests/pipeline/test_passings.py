@@ -31,7 +31,7 @@ SECOND = np.timedelta64(1, "s")
 def line(length_m: float = 2000.0) -> Trajectory:
     """Straight north along a meridian."""
     north = np.linspace(0.0, length_m / 111_000.0, 41)
-    return Trajectory.from_track(Track.from_geodetic(35.0 + north, np.full(41, 139.0), np.full(41, 50.0)))
+    return Trajectory.from_antenna_path(Track.from_geodetic(35.0 + north, np.full(41, 139.0), np.full(41, 50.0)))
 
 
 def at(seconds: float) -> np.datetime64:

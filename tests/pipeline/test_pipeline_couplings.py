@@ -20,8 +20,8 @@ from railfix.integrity.raim import Outcome
 from railfix.pipeline import level_stage, solution, solve
 from railfix.pipeline.along_track import gnss_epochs
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.processor import EpochProcessor, Models
+from railfix.pipeline.corrected_ranges import CorrectedRanges, Models
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_scale import RobustFit
 from railfix.positioning.normal_equations import Ranges

@@ -24,7 +24,7 @@ from pipeline_cases import (
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.tables import observations_table
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -55,7 +55,7 @@ def all_are(found: AntennaResult, status: Status) -> None:
 
 
 def line(points_ecef_m: np.ndarray) -> dict[str, Trajectory]:
-    return {"front": Trajectory.from_track(Track.from_ecef(points_ecef_m))}
+    return {"front": Trajectory.from_antenna_path(Track.from_ecef(points_ecef_m))}
 
 
 @pytest.mark.requirement("A3")

@@ -158,7 +158,7 @@ def test_corrected_codes_are_true_ranges() -> None:
     simulation = Simulation(quiet)
     observations = concatenate(list(simulation.observations("front")))[:30]
     config = parse_config({"filter": "off", "protection": "off", "sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})
-    line = Trajectory.from_track(simulation.line.track())
+    line = Trajectory.from_antenna_path(simulation.line.track())
     processor = make_processor(config, simulation.navigation, {"front": line})
     messages = sbas_messages(simulation, SbasSettings(band="L5"))
     found = processor.process({"front": observations}, messages=messages)[0].antennas["front"]

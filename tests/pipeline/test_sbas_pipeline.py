@@ -25,9 +25,9 @@ from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
-from railfix.pipeline.processor import AntennaResult
-from railfix.pipeline.results import State
+from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solve import fault_free, line_model, place_on_line
+from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import single_point

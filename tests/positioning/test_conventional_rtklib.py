@@ -28,9 +28,9 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.io import read_navigation, read_observations
-from railfix.io.position_log import read_positions
+from railfix.io.positions import read_positions
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
 from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.run.processor import make_processor

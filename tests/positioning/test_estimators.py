@@ -145,7 +145,7 @@ def test_two_branches_side_by_side_are_ambiguous():
     s = np.arange(0.0, 300.0, 5.0)
     out = np.stack([s, np.zeros_like(s), np.zeros_like(s)], axis=1)
     back = np.stack([s[::-1], np.full_like(s, 6.0), np.zeros_like(s)], axis=1)
-    hairpin = Trajectory.from_track(Track.from_ecef(synthetic.enu_to_ecef(np.concatenate([out, back]))))
+    hairpin = Trajectory.from_antenna_path(Track.from_ecef(synthetic.enu_to_ecef(np.concatenate([out, back]))))
     where = np.linspace(40.0, 200.0, 30)
     threshold = SectionLimits().threshold
     for sigma_m, ambiguous in ((12.0, True), (0.05, False)):
@@ -189,7 +189,7 @@ def oracle(ranges: Ranges, t: int, line: Trajectory, arc: float) -> float:
 def test_constrained_position_equals_a_general_optimiser(used):
     """On a straight line, where the optimum is smooth: within 1 mm."""
     s = np.arange(0.0, 1001.0, 20.0)
-    straight = Trajectory.from_track(
+    straight = Trajectory.from_antenna_path(
         Track.from_ecef(synthetic.enu_to_ecef(np.stack([0.6 * s, 0.8 * s, 0.005 * s], axis=1)))
     )
     where = np.linspace(150.0, 850.0, 12)
@@ -239,7 +239,7 @@ def test_convex_vertex_ends_the_walk():
     bent = np.concatenate(
         [np.stack([s, np.zeros_like(s), 0 * s], axis=1), np.stack([np.full(10, 200.0), -s[1:], 0 * s[1:]], axis=1)]
     )
-    line = Trajectory.from_track(Track.from_ecef(synthetic.enu_to_ecef(bent)))
+    line = Trajectory.from_antenna_path(Track.from_ecef(synthetic.enu_to_ecef(bent)))
     outside = synthetic.enu_to_ecef(np.array([[215.0, 15.0, 0.0]]))
     made = synthetic.ranges(line, np.array([10.0]))
     code = synthetic.travelled_range(made.sat_ecef_m, outside[:, None, :])

@@ -18,9 +18,9 @@ import recordings_score
 import synthetic
 from exhaustive_search import exhaustive_search
 from pipeline_cases import demo_observations, processor
+from railfix.core.epoch_rows import take_epochs
 from railfix.pipeline import corrected_ranges, solve
 from railfix.positioning import normal_equations, section_search
-from railfix.positioning.antenna_rows import take_epochs
 from railfix.positioning.normal_equations import UNTIED_M, Constrained, ConstrainedLimits, Ranges, SinglePoint
 from railfix.positioning.section_search import SearchIndex, Section, SectionLimits
 from railfix.track.trajectory import Trajectory

@@ -17,9 +17,10 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline.channels import NAME, signal_delays
+from railfix.pipeline.channels import signal_delays
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.frequency_stage import NAME
+from railfix.pipeline.results import AntennaResult
 from railfix.positioning.two_frequencies import (
     Combined,
     SecondCodes,
@@ -191,7 +192,7 @@ def japan(recordings: Path) -> tuple[Observations, Navigation, Trajectory, Float
     """Four minutes of open sky in Japan: log, navigation, line, and the reference positions."""
     folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
     time, ecef = recordings_truth.japan_truth(folder)
-    line = Trajectory.from_track(from_positions(time, ecef, spacing_m=5.0))
+    line = Trajectory.from_antenna_path(from_positions(time, ecef, spacing_m=5.0))
     log, navigation = read_observations(folder / "SEPT265G.21O")[:240], read_navigation(folder / "SEPT2650.21P")
     return log, navigation, line, interpolate_reference(log.time, time, ecef)
 

@@ -24,7 +24,7 @@ def test_another_reader_is_named() -> None:
 
 def test_a_log_or_a_trajectory_without_its_antenna_is_named() -> None:
     log = railfix.read_observations(FILES["front"])[:5]
-    path = railfix.Trajectory.from_track(railfix.read_track(FILES["track"]))
+    path = railfix.Trajectory.from_antenna_path(railfix.read_track(FILES["track"]))
     processor = railfix.EpochProcessor(railfix.Config(), {"front": path})
     for wrong in (log, {}):
         with pytest.raises(ValueError, match="one log for each antenna, at least one"):

@@ -19,7 +19,8 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import EpochProcessor, Models
+from railfix.pipeline.corrected_ranges import Models
+from railfix.pipeline.processor import EpochProcessor
 from railfix.positioning.normal_equations import Ranges
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.corrected import (

@@ -113,7 +113,7 @@ def test_an_error_put_into_a_code_comes_back_and_touches_no_other_satellite() ->
 def test_the_errors_of_a_simulated_run_have_the_noise_that_was_put_in() -> None:
     made = Simulation(Scenario(duration_s=60.0))
     (piece,) = made.pieces("front", chunk_epochs=600)
-    path = Trajectory.from_track(made.line.track())
+    path = Trajectory.from_antenna_path(made.line.track())
     processor = make_processor(
         parse_config({"filter": "off", "screens": ["elevation"]}), made.navigation, {"front": path}
     )
@@ -156,7 +156,7 @@ def test_a_station_takes_the_common_errors_away(recordings: Path) -> None:
     folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
     time, ecef = recordings_truth.japan_truth(folder)
     navigation = read_navigation([folder / "SEPT2650.21P"])
-    path = Trajectory.from_track(from_positions(time, ecef, spacing_m=5.0))
+    path = Trajectory.from_antenna_path(from_positions(time, ecef, spacing_m=5.0))
     config = parse_config({"filter": "off", "ionosphere": "off", "troposphere": "off"})
     result, _ = make_processor(config, navigation, {"front": path}).process(
         {"front": read_observations(folder / "SEPT265G.21O")}

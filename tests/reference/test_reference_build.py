@@ -43,7 +43,7 @@ def curved_track(length_m: float = 6000.0, *, grade: float = 0.0) -> Trajectory:
     """An arc of 2 km radius, points every 5 m, climbing evenly."""
     s = np.arange(0.0, length_m + 1.0, 5.0)
     enu = np.stack([2000.0 * np.sin(s / 2000.0), 2000.0 * (1.0 - np.cos(s / 2000.0)), grade * s], axis=1)
-    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(*ORIGIN) + enu @ enu_axes(*ORIGIN[:2])))
+    return Trajectory.from_antenna_path(Track.from_ecef(ecef_from_geodetic(*ORIGIN) + enu @ enu_axes(*ORIGIN[:2])))
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ class DopplerRun:
         self.simulation = Simulation(self.scenario)
         middle = np.arange(15.0, self.simulation.line.length_m - 15.0, 1.0)
         path = self._antenna(middle).ecef_m
-        self.trajectory = Trajectory.from_track(Track.from_ecef(path))
+        self.trajectory = Trajectory.from_antenna_path(Track.from_ecef(path))
         obs = concatenate(list(self.simulation.observations("front")))
         self.dopplers: Dopplers = dopplers_of_log(
             obs, self.simulation.navigation, systems=("G", "J", "E"), signals=DEFAULT_SIGNALS
@@ -401,7 +401,7 @@ def test_a_loop_is_followed_pass_by_pass() -> None:
     angle = s / radius
     enu = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros_like(s)], axis=1)
     path = ecef_from_geodetic(*ORIGIN) + enu @ enu_axes(*ORIGIN[:2])
-    trajectory = Trajectory.from_track(Track.from_ecef(path))
+    trajectory = Trajectory.from_antenna_path(Track.from_ecef(path))
     t = np.arange(0.0, 180.0, 1.0)
     arc = 5.0 + 10.0 * t
     keep = (t < 60.0) | (t > 100.0)

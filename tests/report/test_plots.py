@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from matplotlib import pyplot
 from matplotlib.figure import Figure
 
 from railfix.core.geodesy import ecef_from_geodetic
@@ -285,7 +286,7 @@ def test_sky_has_each_satellite_once(observations: pl.DataFrame) -> None:
     }  # fmt: skip
     reasons = dict(zip(sky.satellite[rows].tolist(), sky.reason[rows].tolist(), strict=True))
     assert reasons == {"E05": "elevation_mask", "G01": "used", "J02": "used"}
-    axes = plots.draw_sky(sky, times(0.8))
+    axes = plots.draw_sky(sky, times(0.8), ax=Figure().subplots(subplot_kw={"projection": "polar"}))
     assert "03:10:01" in axes.get_title()
     assert {text.get_text().split("\n")[0] for text in axes.texts} == {"E05", "G01", "J02"}
 
@@ -357,14 +358,28 @@ def test_the_line_is_drawn_in_the_tunnel_over_its_background(positions: pl.DataF
     assert {"level 0 to 5 m (1)", "level 5 to 10 m (1)", "level 40 m and more (1)", "no level (1)"} <= labels
 
 
-def test_functions_that_plot_say_that_they_return_a_figure(errors: pl.DataFrame) -> None:
+def test_a_sky_needs_polar_axes(observations: pl.DataFrame) -> None:
+    with pytest.raises(ValueError, match="polar"):
+        plots.draw_sky(plots.sky_epochs(observations), START, ax=Figure().subplots())
+
+
+def test_functions_that_plot_take_axes_and_return_them(errors: pl.DataFrame) -> None:
     for name in plots.__all__:
         if name.startswith("plot_"):
             function = getattr(plots, name)
             assert function.__name__ == name
-            assert inspect.signature(function).return_annotation == "Figure"
-            assert "Chart" not in function.__doc__.partition("Returns")[2]
-    assert isinstance(plots.plot_error_over_time(errors), Figure)
+            own = inspect.signature(function)
+            assert own.return_annotation == "Axes"
+            assert own.parameters["ax"].default is None
+            assert "the axes are returned" in function.__doc__
+    _, (left, right) = pyplot.subplots(1, 2)
+    assert plots.plot_error_over_time(errors, ax=right) is right
+    assert right.has_data()
+    assert not left.has_data()
+    new = plots.plot_error_over_time(errors)
+    assert new.figure is not right.figure
+    assert new.figure.number in pyplot.get_fignums()  # a notebook shows it
+    pyplot.close("all")
 
 
 def test_one_per_cell_leaves_no_cell_empty() -> None:
@@ -392,7 +407,7 @@ def test_layers_of_unequal_length_are_refused() -> None:
 @pytest.mark.slow
 def test_every_picture_is_drawn(errors: pl.DataFrame, positions: pl.DataFrame, observations: pl.DataFrame) -> None:
     chunks = {"first_epoch_gpst": [str(START)], "epochs": [100], "positioning_s": [0.2]}
-    figures: list[Figure] = [
+    drawn = [
         plots.plot_plan(positions),
         plots.plot_error_over_time(errors),
         plots.plot_error_over_chainage(errors),
@@ -404,19 +419,19 @@ def test_every_picture_is_drawn(errors: pl.DataFrame, positions: pl.DataFrame, o
         plots.plot_interval_distribution(errors),
         plots.plot_satellites_over_time(positions),
         plots.plot_processing_time(chunks),
-        *(plots.draw_figure(chart) for chart in plots.cn0_over_elevation(observations)),
+        *(plots.draw_chart(chart) for chart in plots.cn0_over_elevation(observations)),
     ]
-    for figure in figures:
-        (axes,) = figure.axes
+    for axes in drawn:
         assert axes.get_title()
         assert axes.has_data()
         written = BytesIO()
-        figure.savefig(written, format="png", dpi=40)
+        axes.figure.savefig(written, format="png", dpi=40)
         assert written.getvalue().startswith(b"\x89PNG")
+        pyplot.close(axes.figure)
 
 
 def test_the_axes_of_a_drawing_hold_the_numbers_of_the_chart(errors: pl.DataFrame) -> None:
-    (axes,) = plots.plot_error_over_time(errors).axes
+    axes = plots.plot_error_over_time(errors, ax=Figure().subplots())
     (on_map,) = [line for line in axes.lines if line.get_label() == "on the map"]
     np.testing.assert_array_equal(on_map.get_ydata(), [0.5, -1.0, 2.0])
     np.testing.assert_array_equal(np.asarray(on_map.get_xdata()), times([0.0, 1.0, 2.0]))

@@ -106,7 +106,7 @@ def test_the_sigma_grows_with_the_scatter_of_the_stretches() -> None:
 def test_there_is_no_order_of_one_antenna_or_without_a_vehicle() -> None:
     front, rear = paths()
     assert EpochProcessor(Config(filter="off"), {"front": front}).antenna_order() is None
-    track = Trajectory.from_track(read_track(demo_files()["track"]))
+    track = Trajectory.from_antenna_path(read_track(demo_files()["track"]))
     assert EpochProcessor(Config(filter="off"), {"front": track, "rear": track}).antenna_order() is None
     assert EpochProcessor(Config(filter="off"), {"front": front, "rear": rear}).antenna_order() is not None
 

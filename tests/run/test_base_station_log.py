@@ -83,7 +83,7 @@ def test_a_station_of_another_time_or_place_does_not_match(late_s: float, east_m
     log.until(last)
     tally = Tally(antennas={"front": AntennaTally(first=first, last=last)})
     away = np.array([PLACE[1], -PLACE[0], 0.0]) / np.hypot(*PLACE[:2]) * east_m
-    line = Trajectory.from_track(Track.from_ecef(PLACE + away + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 50.0]])))
+    line = Trajectory.from_antenna_path(Track.from_ecef(PLACE + away + np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 50.0]])))
     with pytest.raises(MismatchError, match=words) if words else contextlib.nullcontext():
         check_base(log, tally, {"front": line})
 

@@ -17,7 +17,7 @@ from broken_bench import Bench, bench_in
 from railfix.cli import app
 from railfix.core.reasons import Reason, Status
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.run import RunSummary, run_files
 from railfix.run.tally import AntennaTally
 from railfix.simulate.demonstration import demo_inputs

@@ -14,8 +14,8 @@ from railfix.io.logs import read_observations
 from railfix.io.mate import READ, WRITTEN, mate_table, signal_code
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, run_files
-from railfix.run.convert import find_inputs
 from railfix.run.inputs import TrackReading
+from railfix.run.mate_folder import find_inputs
 from railfix.run.sensors import read_listed_balises, read_sensors
 from railfix.simulate import Simulation
 from railfix.simulate.run import write_run

@@ -20,8 +20,8 @@ from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reaso
 from railfix.evaluate import evaluate_run
 from railfix.io import read_navigation, read_observations, scan_observations
 from railfix.pipeline.config import Config
-from railfix.pipeline.processor import Result
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.results import Result
 from railfix.pipeline.tables import TRAIN_COLUMNS, observations_table, positions_table, to_xarray, train_table
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.run.processor import make_processor

@@ -12,8 +12,8 @@ from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.integrity.raim import Outcome, threshold
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import Result
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.results import Result
 from railfix.pipeline.tables import observations_table, positions_table
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.processor import make_processor

@@ -219,7 +219,7 @@ def case_of_folder(folder: Path) -> Case:
     """The case of the benchmark in a folder."""
     case = read_case(folder)
     reference = read_reference(case.truth, ["front"])["front"]
-    trajectory = Trajectory.from_track(read_track(case.inputs.track))
+    trajectory = Trajectory.from_antenna_path(read_track(case.inputs.track))
     truth = (reference.time, reference.ecef_m)
     return made(folder.name, case.inputs.front[0], list(case.inputs.nav), truth, trajectory)
 
@@ -317,7 +317,7 @@ def ended(case: Case, share: float = 0.6) -> Case:
     kept = (arc >= ends[0]) & (arc <= ends[1])
     if kept.sum() < 2:
         return case
-    other = Trajectory.from_track(Track.from_ecef(points[kept]))
+    other = Trajectory.from_antenna_path(Track.from_ecef(points[kept]))
     at, aside = other.nearest(case.reference_ecef_m)
     arc_m = case.reference_arc_m - arc[kept][0]
     lap = (aside < 30.0) & (np.abs(at - arc_m) > 30.0)
@@ -352,7 +352,7 @@ def stretched(case: Case, share: float) -> Case:
 def on_line(case: Case, ecef_m: np.ndarray, *, sigma_m: float | None = None) -> Case:
     """The case on another line with the same vertices; with an accuracy of its own, or that of a survey."""
     stated = {} if sigma_m is None else {"sigma_plan_m": sigma_m, "sigma_height_m": sigma_m}
-    other = Trajectory.from_track(Track.from_ecef(ecef_m, **stated))
+    other = Trajectory.from_antenna_path(Track.from_ecef(ecef_m, **stated))
     arc = np.interp(case.reference_arc_m, np.asarray(case.trajectory.arc_m), np.asarray(other.arc_m))
     return replace(case, trajectory=other, reference_arc_m=np.where(np.isfinite(case.reference_arc_m), arc, np.nan))
 

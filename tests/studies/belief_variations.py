@@ -53,7 +53,7 @@ def window(whole: Case, part: Case) -> Case:
 
 def reverse(_: Case, part: Case) -> Case:
     old = part.trajectory
-    new = Trajectory.from_track(Track.from_ecef(np.asarray(old.ecef_m)[::-1]))
+    new = Trajectory.from_antenna_path(Track.from_ecef(np.asarray(old.ecef_m)[::-1]))
     arc = np.interp(part.reference_arc_m, np.asarray(old.arc_m), np.asarray(new.arc_m)[::-1])
     return replace(part, trajectory=new, reference_arc_m=arc)
 

@@ -26,7 +26,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.positioning.carrier import (
     PhaseLimits,
     PhasePositions,

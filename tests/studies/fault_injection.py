@@ -35,7 +35,7 @@ from railfix.integrity.raim import (
 from railfix.integrity.raim.model import compact
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position
 from railfix.run.processor import make_processor
 from railfix.track.trajectory import Trajectory

@@ -28,7 +28,8 @@ from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.stanford import Region, stanford
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.results import AntennaResult, State
+from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.state import State
 from railfix.ranges.error_model import ErrorBins, ErrorModel, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, fit_bins
 from railfix.run.processor import make_processor

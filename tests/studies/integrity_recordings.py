@@ -33,7 +33,7 @@ from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.level_stage import get_risk_budget
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position, fit
 from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit

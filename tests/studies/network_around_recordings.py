@@ -135,7 +135,7 @@ def stated(errors: Errors, shape: Shape, seed: int) -> tuple[np.ndarray, np.ndar
     seconds = (errors.time - errors.time[0]) / np.timedelta64(1, "s")
     line = made_line(_SPEED_MPS * float(seconds[-1]), rng)
     around = network_around(line, shape, seed)
-    network, path = made(around), Trajectory.from_track(line)
+    network, path = made(around), Trajectory.from_antenna_path(line)
     place = path.at_arc(np.minimum(_SPEED_MPS * seconds, path.arc_m[-1]))
     latitude, longitude, _ = geodetic_from_ecef(place)
     axes = enu_axes(latitude, longitude)[:, [1, 0, 2]]

@@ -20,8 +20,10 @@ from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solve import PointStatus
+from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.run.processor import make_processor
 from railfix.run.sensors import read_sensors

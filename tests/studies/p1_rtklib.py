@@ -19,7 +19,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.evaluate.benchmark import rows_at_epochs
 from railfix.gnss.observations import Observations
-from railfix.io.position_log import read_positions
+from railfix.io.positions import read_positions
 from railfix.io.rinex import write_navigation, write_observations
 from railfix.simulate import Simulation
 

@@ -23,7 +23,7 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.raim import Outcome, RaimLimits
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.run.processor import make_processor
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -89,7 +89,7 @@ def line_between(first_ecef_m: Floats, last_ecef_m: Floats, *, spacing_m: float 
     latitude, longitude, _ = geodetic_from_ecef(first_ecef_m + share[:, None] * (last_ecef_m - first_ecef_m))
     heights = geodetic_from_ecef(np.stack([first_ecef_m, last_ecef_m]))[2]
     height = heights[0] + share * (heights[1] - heights[0])
-    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(latitude, longitude, height)))
+    return Trajectory.from_antenna_path(Track.from_ecef(ecef_from_geodetic(latitude, longitude, height)))
 
 
 def two_points(station_ecef_m: Floats, beside_m: float) -> tuple[Floats, Floats]:

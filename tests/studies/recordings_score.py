@@ -24,7 +24,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import without
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_scale import (
     NoiseState,
     OffsetState,
@@ -76,7 +76,7 @@ class Outcome:
 
 def trajectory_of(time: np.ndarray, ecef_m: np.ndarray) -> Trajectory:
     """The map made from the reference, 5 m, standing still removed."""
-    return Trajectory.from_track(from_positions(time, ecef_m, spacing_m=5.0))
+    return Trajectory.from_antenna_path(from_positions(time, ecef_m, spacing_m=5.0))
 
 
 def run_rinex(
@@ -141,7 +141,9 @@ def straight_line(station_ecef_m: np.ndarray, azimuth_deg: float, *, half_m: flo
     points = station_ecef_m + along[:, None] * (np.sin(bearing) * axes[0] + np.cos(bearing) * axes[1])
     lat, lon, _ = geodetic_from_ecef(points)
     # Level: the tangent plane leaves the ellipsoid by 8 cm at 1 km.
-    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(lat, lon, np.full(len(along), float(height)))))
+    return Trajectory.from_antenna_path(
+        Track.from_ecef(ecef_from_geodetic(lat, lon, np.full(len(along), float(height))))
+    )
 
 
 def geonet(data: Path, station: str, azimuth_deg: float, config: Config = SETTINGS) -> Outcome:

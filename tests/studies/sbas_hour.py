@@ -99,7 +99,9 @@ def great_circle(begin: tuple[float, float], end: tuple[float, float], spacing_m
     part = np.linspace(0.0, 1.0, round(angle * 6.371e6 / spacing_m) + 1)[:, None]
     points = (np.sin((1.0 - part) * angle) * unit[0] + np.sin(part * angle) * unit[1]) / np.sin(angle)
     latitude, longitude, _ = geodetic_from_ecef(points * 6.371e6)
-    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(latitude, longitude, np.full(len(part), HEIGHT_M))))
+    return Trajectory.from_antenna_path(
+        Track.from_ecef(ecef_from_geodetic(latitude, longitude, np.full(len(part), HEIGHT_M)))
+    )
 
 
 def sky(data: Path, *, step_s: int = 10) -> Sky:

@@ -80,7 +80,7 @@ def scored(simulation: Simulation, scores: dict[str, Score]) -> None:
     scenario, line = simulation.scenario, simulation.line
     samples, _ = sensors_of(simulation)
     begin = scenario.start
-    trajectory = Trajectory.from_track(line.track())
+    trajectory = Trajectory.from_antenna_path(line.track())
     course = Line.of(trajectory)
 
     def sine_at(arc: np.ndarray) -> np.ndarray:

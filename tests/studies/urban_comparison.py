@@ -28,7 +28,7 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.evaluate import interpolate_reference
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.results import AntennaResult
 from railfix.ranges.corrected import CodeNoise, code_sigma_m
 from railfix.simulate import LineSettings, RunSettings, Scenario, Simulation, SkySettings, write_run
 from railfix.simulate.environment import ElectrificationSettings, Environment, EnvironmentSettings, SectionSettings

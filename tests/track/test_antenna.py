@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from railfix.core.errors import RailfixWarning
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Track
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory, project_on_segments
@@ -21,7 +22,7 @@ def ecef(enu_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def trajectory(enu_m: object, **attributes: object) -> Trajectory:
-    return Trajectory.from_track(Track.from_ecef(ecef(np.array(enu_m, dtype=np.float64)), **attributes))  # type: ignore[arg-type]
+    return Trajectory.from_antenna_path(Track.from_ecef(ecef(np.array(enu_m, dtype=np.float64)), **attributes))  # type: ignore[arg-type]
 
 
 @pytest.mark.requirement("A2")
@@ -31,6 +32,9 @@ def test_track_taken_as_the_antennas_path_says_so() -> None:
     np.testing.assert_allclose(line.arc_m, [0.0, 100.0, 150.0], atol=1e-6)
     np.testing.assert_allclose(line.chainage_m, line.arc_m, atol=1e-6)
     assert (line.sigma_plan_m, line.sigma_height_m) == (0.30, 0.60)
+    track = Track.from_ecef(ecef(np.array([[0, 0, 0], [0, 100, 0]], dtype=np.float64)))
+    with pytest.warns(RailfixWarning, match="no vehicle file"):
+        assert len(Trajectory.from_track(track)) == 2
 
 
 def test_axes_of_a_line_to_the_north() -> None:

@@ -16,8 +16,9 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.core.timescale import timedelta
 from railfix.evaluate import evaluate_run
 from railfix.io.reference_log import AntennaReference
-from railfix.pipeline.filter_result import Replay, ReturnState, gated_codes, smooth
+from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.pipeline.smoothing import Replay, smooth
 from railfix.positioning.normal_equations import constrained_position, single_point
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
 from railfix.run.inputs import TrackReading
@@ -41,7 +42,7 @@ def ring(laps: float, *, apart_m: float = 0.0, backward: bool = False) -> Trajec
     radius = RADIUS_M + apart_m * turn
     axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
     flat = radius[:, None] * (np.sin(angle)[:, None] * axes[0] + np.cos(angle)[:, None] * axes[1])
-    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(LATITUDE, LONGITUDE, 40.0) + flat))
+    return Trajectory.from_antenna_path(Track.from_ecef(ecef_from_geodetic(LATITUDE, LONGITUDE, 40.0) + flat))
 
 
 def test_where_a_line_closes() -> None:
@@ -180,7 +181,7 @@ def test_single_epochs_at_the_join_are_placed_and_have_one_place() -> None:
     """Points of the map 20 m apart, and a start on the other side of the join."""
     angle = np.linspace(0.0, 2.0 * np.pi, POINTS + 1)
     circle = 800.0 * np.stack([np.sin(angle), np.cos(angle), 0.0 * angle], axis=1)
-    closed = Trajectory.from_track(Track.from_ecef(synthetic.enu_to_ecef(circle)))
+    closed = Trajectory.from_antenna_path(Track.from_ecef(synthetic.enu_to_ecef(circle)))
     length = float(closed.arc_m[-1])
     true = np.array([length - 8.0, 8.0, 0.0, 1500.0])
     ranges = synthetic.ranges(closed, true, sigma_m=0.0)

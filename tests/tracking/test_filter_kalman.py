@@ -24,7 +24,7 @@ EPOCHS = 150
 def straight_line(length_m: float = 3000.0) -> Trajectory:
     """Points 50 m apart, at which the filter begins."""
     along = np.arange(0.0, length_m + 1.0, 50.0)
-    return Trajectory.from_track(Track.from_ecef(ORIGIN_M[0] + along[:, None] * ORIGIN_M[1]))
+    return Trajectory.from_antenna_path(Track.from_ecef(ORIGIN_M[0] + along[:, None] * ORIGIN_M[1]))
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,7 @@ def test_gradient_curvature_and_cant_are_those_of_the_map(case: Ride) -> None:
     """Under the body's middle, where the map's curvature is even over 30 m (the bodies' bogies are 14 m apart)."""
     found, line = case.run(), case.simulation.line
     track = line.track()
-    series = line_series(Trajectory.from_track(track))
+    series = line_series(Trajectory.from_antenna_path(track))
     body = found.chainage_m - case.simulation.scenario.vehicle.front[0]
     curvature, gradient = (np.interp(body, series.arc_m, v) for v in (series.curvature_1pm, series.gradient))
     near = [np.interp(body + d, series.arc_m, series.curvature_1pm) for d in (-15.0, 15.0)]

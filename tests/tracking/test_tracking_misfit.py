@@ -16,7 +16,7 @@ def drawn_in_waves(trajectory: Trajectory, amplitude_m: float, wavelength_m: flo
     arc = np.arange(0.0, trajectory.arc_m[-1], 5.0)
     points, axes = Line.of(trajectory).at(arc)
     aside = amplitude_m * np.sin(2.0 * np.pi * arc / wavelength_m)
-    return Trajectory.from_track(Track.from_ecef(points + aside[:, None] * axes[:, 1]))
+    return Trajectory.from_antenna_path(Track.from_ecef(points + aside[:, None] * axes[:, 1]))
 
 
 def error_m(found_arc_m: np.ndarray, on: Trajectory, run: Ride) -> np.ndarray:
@@ -52,7 +52,7 @@ def test_what_was_learnt_is_forgotten_on_a_right_map() -> None:
     points, axes = Line.of(line).at(np.arange(0.0, line.arc_m[-1], 5.0))
     arc = np.arange(0.0, line.arc_m[-1], 5.0)
     aside = np.where(arc < 2500.0, 5.0 * np.sin(2.0 * np.pi * arc / 100.0), 0.0)
-    drawn = Trajectory.from_track(Track.from_ecef(points + aside[:, None] * axes[:, 1]))
+    drawn = Trajectory.from_antenna_path(Track.from_ecef(points + aside[:, None] * axes[:, 1]))
     run = ride(590, trajectory=line, noise=1.0, seed=4)
     found, _ = track(run.epochs, Line.of(drawn))
     assert found.map_scale.max() > 3.0

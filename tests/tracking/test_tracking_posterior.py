@@ -24,7 +24,7 @@ def _laps(apart_m: float) -> Trajectory:
     axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
     origin = ecef_from_geodetic(LATITUDE, LONGITUDE, 40.0)
     points = origin + (distance * np.cos(angle))[:, None] * axes[0] + (distance * np.sin(angle))[:, None] * axes[1]
-    return Trajectory.from_track(Track.from_ecef(points))
+    return Trajectory.from_antenna_path(Track.from_ecef(points))
 
 
 @pytest.mark.requirement("E5")

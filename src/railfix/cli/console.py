@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,7 +19,6 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from railfix import kernels
-from railfix.core.reasons import Status
 from railfix.core.tables import Table, plural
 from railfix.run.record import budget_tables, level_basis
 
@@ -30,63 +28,13 @@ if TYPE_CHECKING:
     from railfix.run.driver import Progress as ProgressCall
 
 
-#: Statuses of the filter whose places are vouched for.
-_SOUND: Final = ("tracking", "coasting")
-#: Most lines of a verdict.
+#: Most lines of the verdict of an evaluation.
 _MOST: Final = 5
+#: Most lines that a run prints without ``--verbose``.
+_MOST_LINES: Final = 12
+_ANTENNAS: Final = ("front", "rear")
 #: Errors that are this many stated standard deviations at their 95th percentile (2.0 for normal ones) are no match.
 _OVERCONFIDENT: Final = 3.0
-
-
-def verdict_of_run(summary: RunSummary) -> list[str]:
-    """Say where a run was, how good and how sure its positions are, what is wrong, and what to do next."""
-    file = summary.files.get("train.parquet", summary.files["positions.parquet"])
-    chainage = pl.scan_parquet(file).select("antenna", "chainage_m")
-    lines = []
-    for name, facts in summary.record["antennas"].items():
-        of_antenna = chainage.filter(antenna=name).select(
-            pl.len().alias("epochs"),
-            pl.col("chainage_m").count().alias("positions"),
-            pl.col("chainage_m").min().alias("first"),
-            pl.col("chainage_m").max().alias("last"),
-        )
-        found = of_antenna.collect().row(0, named=True)
-        filtered = facts["filter"]
-        sigma = (filtered or facts)["along_sigma_m"]
-        level = filtered["level"] if filtered else facts["protection_level"]
-        text = f"{name}: a position in {found['positions']:,} of {facts['epochs']:,} epochs"
-        if found["positions"]:
-            text += f", chainage {found['first']:.0f} to {found['last']:.0f} m"
-        if sigma is not None:
-            text += f"; standard deviation {sigma['p50_m']:.1f} m, largest {sigma['max_m']:.1f} m"
-        if level is not None and level["p50_m"] is not None:
-            text += f"; {level_basis(summary.record)} level {level['p50_m']:.0f} m at the median"
-        lines.append(text)
-    lines.append(_doubts(summary))
-    lines += [f"likely cause: {cause}" for cause in summary.causes.values() if cause][:1]
-    lines.append(f"next: railfix report {shlex.quote(str(file.parent))} --out report.html")
-    return lines
-
-
-def _doubts(summary: RunSummary) -> str:
-    """Say how many single epochs failed a check, of which kind most are, and how many notes there are."""
-    statuses, of_filter = Counter[str](), Counter[str]()
-    for facts in summary.record["antennas"].values():
-        statuses.update(facts["status"])
-        of_filter.update(
-            {word: n for word, n in (facts["filter"] or {"status": {}})["status"].items() if word not in _SOUND}
-        )
-    lost = statuses.pop(Status.NO_OBSERVATION.text, 0)
-    passed = statuses.pop(Status.OK.text, 0)
-    failed = statuses.total()
-    text = f"in doubt: {failed:,} of {failed + passed:,} single epochs with observations did not pass every check"
-    if failed:
-        text += f", most of them {statuses.most_common(1)[0][0]}"
-    if of_filter.total():
-        text += "; of the filter " + ", ".join(f"{count:,} {word}" for word, count in of_filter.items() if count)
-    if lost:
-        text += f"; {lost:,} epochs have no observation"
-    return f"{text}; {plural(summary.notes, 'note')} below the tables"
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
@@ -104,6 +52,30 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
         run, reference = shlex.quote(paths.pop()), shlex.quote(references.pop())
         return [*texts, f"next: railfix report {run} --reference {reference} --out report.html"]
     return [*texts, "next: railfix report draws runs beside each other, with the same references"]
+
+
+def describe_errors(evaluation: Evaluation) -> str:
+    """Return how good the positions of a run are against its ground truth, in one sentence: the filter's positions
+    where there are any, errors above their protection level, and the conventional positions.
+    """
+    rows = evaluation.figures.filter(
+        pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("run") != "all", pl.col("antenna") == "all"
+    )
+    on_map = rows.filter(pl.col("position") == "constrained")
+    filtered = on_map.filter(pl.col("run").str.ends_with("(train)"))
+    row = (filtered if len(filtered) else on_map).row(0, named=True)
+    kind = "train" if len(filtered) else next(iter(evaluation.integrity), "")
+    errors = "errors of {p50_m:.1f} m at the median, {p95_m:.1f} m for 95 %, {max_m:.1f} m at most"
+    text = f"against the ground truth: {errors.format(**row)} over {row['errors']:,} epochs"
+    if kind in evaluation.integrity:
+        beyond = evaluation.integrity[kind].beyond["usable"].sum()
+        text += f", {beyond or 'none'} above {'their' if beyond != 1 else 'its'} protection level"
+    other = rows.filter(pl.col("position") == "conventional", pl.col("run") == row["run"])
+    if len(other):
+        text += "; conventional positions {p50_m:.1f} m, {p95_m:.1f} m, {max_m:.1f} m".format(
+            **other.row(0, named=True)
+        )
+    return text
 
 
 def _judge(row: Mapping[str, Any]) -> str:
@@ -254,13 +226,48 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
         bar.stop()
 
 
-def show_summary(summary: RunSummary) -> None:
-    """Epochs, positions, statuses, the budget of reasons, and where the results are."""
+def show_summary(summary: RunSummary, *, verbose: bool) -> None:
+    """Print the verdict on a run, its notes, where the results are and what to do next, in at most `_MOST_LINES` lines.
+
+    With `verbose` all notes, and the tables of statuses and reasons.
+    """
     console = TableConsole()
-    show_verdict(console, verdict_of_run(summary))
+    lines = summary.verdict.lines()
+    folder = summary.files["run.json"].parent
+    rate = summary.tally.epochs / summary.wall_s
+    names = ", ".join(sorted(path.name for path in summary.files.values()))
+    end = [
+        f"results: {folder} ({names}); {summary.tally.epochs:,} epochs in {summary.wall_s:.2f} s "
+        f"({rate:,.0f} epochs/s, reading included)",
+        f"next: railfix report {shlex.quote(str(folder))} --out report.html",
+    ]
+    notes = [f"note: {note}" for note in join_antennas(summary.notes)]
+    room = _MOST_LINES - len(lines) - len(end)
+    if not verbose and len(notes) > room:
+        notes = [
+            *notes[: room - 1],
+            f"{plural(notes[room - 1 :], 'more note')} in {folder / 'run.json'}; --verbose shows all",
+        ]
+    for line in [*lines, *notes, *end]:
+        console.print(line)
+    if verbose:
+        console.print()
+        show_budget(console, summary)
+
+
+def show_budget(console: Console, summary: RunSummary) -> None:
+    """Print epochs by status and pseudoranges by reason."""
     for table in budget_tables(summary.record["antennas"], level_basis(summary.record)):
         show_table(console, table)
-    show_notes(console, summary.notes)
-    show_files(console, summary.files.values())
-    rate = summary.tally.epochs / summary.wall_s
-    console.print(f"{summary.tally.epochs:,} epochs in {summary.wall_s:.2f} s ({rate:,.0f} epochs/s, reading included)")
+
+
+def join_antennas(notes: Iterable[str]) -> list[str]:
+    """Return notes in their order, those that say the same of two antennas as one."""
+    texts: dict[str, list[str]] = {}
+    for note in notes:
+        antenna, colon, text = note.partition(": ")
+        if colon and antenna in _ANTENNAS:
+            texts.setdefault(text, []).append(antenna)
+        else:
+            texts.setdefault(note, [])
+    return [f"{' and '.join(names)}: {text}" if names else text for text, names in texts.items()]

@@ -16,8 +16,8 @@ from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.core.tables import plain_table, plural
-from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import column_names, read_positions
+from railfix.io.position_log import column_names
+from railfix.io.positions import read_positions
 from railfix.run.inputs import TrackReading
 from railfix.track import (
     MapLimits,
@@ -144,7 +144,7 @@ def features(
     tables = [folder / "train.parquet" for folder in run or ()]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[*tracks, *tables])
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    trajectory = Trajectory.from_track(track)
+    trajectory = Trajectory.from_antenna_path(track)
     series = line_series(trajectory)
     found = map_features(series)
     if run:
@@ -221,7 +221,7 @@ def from_positions_command(
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[positions])
-    log = read_positions(positions, columns=column_names(column)) if column else read_any_positions(positions)
+    log = read_positions(positions, columns=column_names(column or ()))
     track, thinned = from_position_log(
         log, spacing_m=spacing, quality=_qualities(quality), max_sigma_m=max_sigma, name=name or positions.stem
     )

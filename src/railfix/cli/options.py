@@ -31,6 +31,10 @@ OutOption = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder fo
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", rich_help_panel="Choices", help="Replace results that are already there.")
 ]
+VerboseOption = Annotated[
+    bool,
+    typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables of statuses and reasons."),
+]
 LenientOption = Annotated[
     bool,
     typer.Option(

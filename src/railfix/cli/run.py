@@ -10,7 +10,7 @@ import typer
 
 from railfix.cli.command import SIGNALLED
 from railfix.cli.console import prepare_kernels, progress_bar, show_summary
-from railfix.cli.options import Choices, OutOption, Without, from_models, resolve_settings, set_value
+from railfix.cli.options import Choices, OutOption, VerboseOption, Without, from_models, resolve_settings, set_value
 from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
@@ -21,7 +21,12 @@ _TURN_S: Final = 0.05
 
 @from_models
 def run(
-    inputs: Annotated[RunInputs, Without("truth")], choices: Choices, options: RunOptions, *, out: OutOption
+    inputs: Annotated[RunInputs, Without("truth")],
+    choices: Choices,
+    options: RunOptions,
+    *,
+    out: OutOption,
+    verbose: VerboseOption = False,
 ) -> None:
     r"""Positions along the line from receiver logs, navigation files and a track map.
 
@@ -57,7 +62,7 @@ def run(
     sys.setswitchinterval(_TURN_S)
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
-    show_summary(summary)
+    show_summary(summary, verbose=verbose)
 
 
 @from_models

@@ -9,10 +9,19 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.console import Console
 
-from railfix.cli.console import TableConsole, prepare_kernels, progress_bar, show_summary, show_table
-from railfix.cli.options import OverwriteOption, check_set_once, from_models, overwriting, set_value
+from railfix.cli.console import (
+    TableConsole,
+    describe_errors,
+    prepare_kernels,
+    progress_bar,
+    show_budget,
+    show_notes,
+    show_table,
+)
+from railfix.cli.options import OverwriteOption, VerboseOption, check_set_once, from_models, overwriting, set_value
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option
+from railfix.core.tables import plural
 from railfix.evaluate import Evaluation
 from railfix.evaluate.tables import error_tables
 from railfix.pipeline.config import Config
@@ -166,6 +175,7 @@ def demo(
         Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent.")
     ] = Path("railfix-demo"),
     overwrite: OverwriteOption = False,
+    verbose: VerboseOption = False,
 ) -> None:
     """Position the log that comes with railfix, and compare it with its ground truth.
 
@@ -187,16 +197,27 @@ def demo(
     with progress_bar() as progress:
         options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
         summary = run_files(inputs, Config(), out=out, options=options, progress=progress)
-    show_summary(summary)
     # the conventional positions of P1 use ranges that are not screened
     unscreened = Config(filter="off", screens=("elevation",), protection="off")
     run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="skip"))
     runs, evaluation = read_runs([out], [demo_truth()], conventional=[out / "unscreened"])
     page = write_page(runs, evaluation, out / "report.html", title="railfix demonstration: a simulated run")
+    console = TableConsole()
+    for line in summary.verdict.lines():
+        console.print(line)
     if evaluation is not None:
-        show_errors(evaluation)
-    typer.echo(f"the log, its track map, vehicle and ground truth: {inputs.front[0].parent}")
-    typer.echo(f"the report, to open in a browser: {page}")
+        console.print(describe_errors(evaluation))
+    console.print(
+        f"{plural(summary.notes, 'note')} on what this run does not promise: {out / 'run.json'}; --verbose shows all"
+    )
+    console.print(f"the log, its track map, vehicle and ground truth: {inputs.front[0].parent}")
+    console.print(f"the report, to open in a browser: {page}")
+    if verbose:
+        console.print()
+        show_notes(console, summary.notes)
+        show_budget(console, summary)
+        if evaluation is not None:
+            show_errors(evaluation)
 
 
 def show_errors(evaluation: Evaluation) -> None:

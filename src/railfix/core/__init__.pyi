@@ -7,6 +7,7 @@ from .errors import (
     NoPositionError,
     OutputError,
     RailfixError,
+    RailfixWarning,
     SettingsError,
 )
 from .files import FilePath, file_sha256, write_whole
@@ -21,6 +22,7 @@ __all__ = [
     "NoPositionError",
     "OutputError",
     "RailfixError",
+    "RailfixWarning",
     "Reason",
     "Settings",
     "SettingsError",

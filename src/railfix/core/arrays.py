@@ -96,6 +96,15 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
     return replace(parts[0], **{name: np.concatenate([table[name] for table in tables]) for name in tables[0]})
 
 
+def patch_rows(result: Rows, rows: Indices, part: Rows) -> Rows:
+    """Return a dataclass of arrays with some rows replaced, by index; every field has the rows on axis 0."""
+    values = {}
+    for item in fields(result):
+        values[item.name] = array = np.array(getattr(result, item.name))
+        array[rows] = getattr(part, item.name)
+    return copy_with(result, **values)
+
+
 class RowArrays:
     """Base of dataclasses whose arrays have one row for each of the same things."""
 

@@ -31,6 +31,10 @@ class RailfixError(Exception):
     exit_code: ClassVar[int] = 1  #: Of the command line for this class of error.
 
 
+class RailfixWarning(UserWarning):
+    """Something that limits a result and that the caller may not know: what the command line prints as a note."""
+
+
 class InputFileError(RailfixError):
     """An input file is missing, unreadable or malformed.
 

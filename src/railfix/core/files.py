@@ -35,6 +35,8 @@ FilePath = str | PathLike[str]
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
 #: What a reader does with a broken line: stop with an error, or leave it out and count it.
 BrokenLines = Literal["stop", "count"]
+#: Last clause of the error of a broken line: how to go on.
+LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
 _GZIP: Final = b"\x1f\x8b"
 _COMPRESS: Final = b"\x1f\x9d"
@@ -46,6 +48,7 @@ _ARCHIVES: Final = {
     b"7z\xbc\xaf": "a 7-zip archive",
     b"(\xb5/\xfd": "a zstd archive",
 }
+_UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
 
@@ -153,7 +156,9 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             source.seek(0)
         if not head.strip():
             raise InputFileError(path, "is empty")
-        if content == "text" and b"\0" in head:
+        if content == "text" and head.startswith(_UTF16):
+            source = _as_utf8(path, source, held)
+        elif content == "text" and b"\0" in head:
             raise InputFileError(path, "is binary, a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
@@ -272,6 +277,19 @@ def _open_plain(path: FilePath) -> IO[bytes]:
         raise InputFileError(path, "there is no such file; check the name") from error
     except OSError as error:
         raise InputFileError(path, f"cannot be opened ({error.strerror or error})") from error
+
+
+def _as_utf8(path: FilePath, source: IO[bytes], held: ExitStack) -> IO[bytes]:
+    """Return UTF-16 text, as spreadsheets write it, as UTF-8 in a temporary file."""
+    with ByteStream(path, source, ExitStack()) as unpacked:
+        try:
+            text = unpacked.read().decode("utf-16")
+        except UnicodeDecodeError as error:
+            raise InputFileError(path, f"is not UTF-16 text ({error.reason}); save the file as UTF-8") from None
+    converted = _temporary(held)
+    converted.write(text.encode("utf-8"))
+    converted.seek(0)
+    return converted
 
 
 def _temporary(held: ExitStack) -> IO[bytes]:

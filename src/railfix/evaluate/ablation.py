@@ -20,7 +20,8 @@ from railfix.evaluate.place import along_track_error, interpolate_reference
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.processor import AntennaResult, State
+from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.driver import Progress, collect_notes, open_inputs, read_samples_and_units

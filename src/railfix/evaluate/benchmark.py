@@ -30,8 +30,8 @@ from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, has_position
 from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, list_position_tables, read_run
 from railfix.evaluate.integrity import STANFORD_COLUMNS
 from railfix.evaluate.place import TrackFiles, find_trajectory
-from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
+from railfix.io.positions import read_positions
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
 from railfix.run.campaign import CampaignProgress, CampaignRun, position_runs
@@ -261,13 +261,11 @@ def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path],
     notes: list[str] = []
     single = out / "rtklib-single.pos"
     note = write_rtklib_single_point(case.inputs, run.config, single)
-    logs: dict[str, tuple[PositionLog, Antenna]] = (
-        {} if note else {RTKLIB_SINGLE: (read_any_positions(single), "front")}
-    )
+    logs: dict[str, tuple[PositionLog, Antenna]] = {} if note else {RTKLIB_SINGLE: (read_positions(single), "front")}
     notes += [note] if note else []
     for name, other in case.content.positions.items():
         columns = other.columns.names
-        logs[name] = read_any_positions(case.folder.absolute() / other.file, columns=columns), other.antenna
+        logs[name] = read_positions(case.folder.absolute() / other.file, columns=columns), other.antenna
     folders = {name: out / re.sub(r"[^\w.-]+", "_", name) for name in logs}
     for name, (log, antenna) in logs.items():
         write_program_run(log, run.out, folders[name], antenna)

@@ -23,7 +23,7 @@ _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
 
 class OtherPositions(Settings):
-    """Positions of another program: RTKLIB, NMEA, CSV or another kind of `railfix.io.nmea.read_any_positions`."""
+    """Positions of another program: RTKLIB, NMEA, CSV or another kind of `railfix.io.positions.read_positions`."""
 
     file: Path
     antenna: Antenna = "front"

@@ -344,7 +344,7 @@ def read_run_track(run: RunFolder) -> Track:
 
 def _trajectory(run: RunFolder, antenna: str, track: Track, vehicles: Sequence[Path]) -> Trajectory:
     if not vehicles:
-        return Trajectory.from_track(track)
+        return Trajectory.from_antenna_path(track)
     point = run.chainage_of.get(antenna, "antenna")
     name: Literal["front", "rear"] = "rear" if antenna == "rear" else "front"
     return antenna_trajectory(track, read_vehicle(vehicles[0]), name, reference=point)  # type: ignore[arg-type]

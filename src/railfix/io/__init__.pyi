@@ -7,8 +7,9 @@ from .georinex_layout import (
     observations_to_xarray,
 )
 from .logs import read_navigation, read_observations, scan_observations
-from .nmea import read_any_positions, read_nmea
-from .position_log import PositionLog, read_positions
+from .nmea import read_nmea
+from .position_log import PositionLog
+from .positions import read_any_positions, read_positions
 from .reference_log import AntennaReference, read_reference
 from .rinex import write_navigation, write_observations
 from .sp3 import read_sp3

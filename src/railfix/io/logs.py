@@ -17,6 +17,7 @@ from railfix.core.files import BrokenLines, Paths, path_names
 from railfix.core.timescale import gps_time
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.plausible_records import plausible_navigation
 from railfix.io import rinex
 from railfix.io.mate import mate_table, read_mate_observations
 from railfix.io.receiver.framing import is_receiver_log, read_head
@@ -221,6 +222,8 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     ------
     InputFileError
         A file cannot be read or holds no usable record.
+
+    Records that describe no orbit of their constellation are rejected, counted and described in the notes.
     """
     names = path_names(paths)
     receiver = [is_receiver_log(read_head(name)) for name in names]
@@ -233,7 +236,11 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
         logs = [name for name, is_log in zip(names, receiver, strict=True) if is_log]
         parts.append(read_receiver_navigation(logs, date=_instant(date)))
-    return parts[0] if len(parts) == 1 else _join(parts)
+    joined = parts[0] if len(parts) == 1 else _join(parts)
+    navigation = plausible_navigation(joined)
+    if len(joined.kepler) + len(joined.glonass) and not len(navigation.kepler) + len(navigation.glonass):
+        raise InputFileError(", ".join(names), f"has no usable record; {'; '.join(navigation.notes)}")
+    return navigation
 
 
 def _join(parts: list[Navigation]) -> Navigation:

@@ -1,10 +1,10 @@
-"""CSV tables with named columns; comments above the header line may carry ``# key: value``."""
+"""Tables of text with named columns; comments above the header line may carry ``# key: value``."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +15,22 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
 
 _BLOCK: Final = 4096  #: Rows that are read before they become compact.
+_SEPARATORS: Final = (";", "\t", "|")  #: Separators of columns other than the comma.
+#: Usual names of columns of positions and maps, without case, blanks and underscores, by that of railfix. A height
+#: without its unit is in metres.
+_USUAL: Final[dict[str, tuple[str, ...]]] = {
+    "latitude_deg": ("lat", "latitude", "latdeg", "latitudedegrees", "gpslatitude"),
+    "longitude_deg": ("lon", "long", "lng", "longitude", "londeg", "longitudedegrees", "gpslongitude"),
+    "height_m": (
+        "height", "h", "hgt", "alt", "altitude", "altm", "altitudem", "altitudemeters", "heightmeters", "ele", "elev",
+        "elevation", "ellipsoidalheight", "ellipsoidalheightm", "hae",
+    ),
+}  # fmt: skip
+#: Endings of names in another unit than that of railfix, and the unit.
+_OTHER_UNITS: Final = {
+    "ft": "feet", "feet": "feet", "foot": "feet", "usft": "feet", "mm": "millimetres", "cm": "centimetres",
+    "km": "kilometres", "rad": "radians", "gon": "gon", "yd": "yards",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +44,9 @@ class NamedColumns:
     header_line: int
     line: Integers  #: Shape (n,).
     cells: dict[str, pl.Series]  #: Cells of each column, stripped.
+    separator: str = ","  #: Between the columns; numbers may have decimal commas where it is another.
+    #: Names in the file of columns that have got those of railfix (`with_usual_names`).
+    usual: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.line)
@@ -53,6 +72,8 @@ class NamedColumns:
         cells = self.cells[name].to_list()
         if blank is not None:
             cells = [cell or repr(blank) for cell in cells]
+        if self.separator != ",":
+            cells = [cell.replace(",", ".") if cell.count(",") == 1 else cell for cell in cells]
         try:
             values = np.array(cells, dtype=np.float64)
         except ValueError:
@@ -76,8 +97,35 @@ def fails(parse: Callable[[Any], object], text: object) -> bool:
     return False
 
 
+def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
+    """Return the table with usual spellings of some columns ("Latitude", "lon", "alt") under the names of railfix.
+
+    InputFileError: a column of these is in another unit ("height_ft").
+    """
+    cells, usual = dict(table.cells), {}
+    for name in names:
+        if name in cells:
+            continue
+        word, _, unit = name.rpartition("_")
+        for theirs in list(cells):
+            plain = "".join(c for c in theirs.lower() if c.isalnum())
+            if plain in _USUAL.get(name, ()) or theirs.lower() == name:
+                cells[name] = cells.pop(theirs)
+                usual[name] = theirs
+                break
+            stem, other = next(((plain[: -len(u)], u) for u in _OTHER_UNITS if plain.endswith(u)), ("", ""))
+            if stem and (stem in _USUAL.get(name, ()) or stem == word) and other != unit:
+                raise table.header_error(
+                    f"column {theirs!r} is in {_OTHER_UNITS[other]}; convert its numbers, and name the column {name}"
+                )
+    return replace(table, cells=cells, usual={**table.usual, **usual})
+
+
 def read_named_columns(path: FilePath) -> NamedColumns:
-    """Read a comma-separated table with a header line of column names; InputFileError where it is none."""
+    """Read a table with a header line of column names, separated by commas, semicolons, tabs or bars.
+
+    InputFileError: it is none.
+    """
     return parse_named_columns(text_lines(path), path)
 
 
@@ -85,7 +133,7 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
     """Parse the lines of a file as `read_named_columns` does; `path` is for the messages."""
     metadata: dict[str, str] = {}
     header: list[str] = []
-    header_line = 0
+    header_line, separator = 0, ","
     rows: list[list[str]] = []
     blocks: list[pl.DataFrame] = []
     numbers: list[int] = []
@@ -98,11 +146,13 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
                 key, value = key.strip().lower(), value.strip()
                 metadata[key] = f"{metadata[key]}; {value}" if key in metadata else value
             continue
+        if not header and "," not in line:
+            separator = next((mark for mark in _SEPARATORS if mark in line), ",")
         try:
-            row = next(csv.reader([line])) if '"' in line else line.split(",")
+            row = next(csv.reader([line], delimiter=separator)) if '"' in line else line.split(separator)
             cells = [cell.strip() for cell in row]
         except csv.Error as error:
-            raise InputFileError(path, f"is not a row of cells with commas between ({error})", line=number) from None
+            raise InputFileError(path, f"is not a row of cells ({error})", line=number) from None
         if not header:
             header, header_line = cells, number
             continue
@@ -123,6 +173,7 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
         header_line=header_line,
         line=np.array(numbers, dtype=np.int64),
         cells=dict(zip(header, columns, strict=True)),
+        separator=separator,
     )
 
 
@@ -134,11 +185,6 @@ def _compact(rows: list[list[str]], width: int) -> pl.DataFrame:
 def _check_header(path: FilePath, header: list[str], line: int) -> None:
     if not header:
         raise InputFileError(path, "there is no header line with the names of the columns")
-    if len(header) == 1 and (other := next((mark for mark in ";\t|" if mark in header[0]), None)) is not None:
-        shown = "tabs" if other == "\t" else f"'{other}'"
-        raise InputFileError(
-            path, f"has {shown} between its columns; expected commas, and points in numbers", line=line
-        )
     if not any(fails(float, cell) for cell in header):
         raise InputFileError(path, "numbers where a header line with the names of the columns was expected", line=line)
     repeated = sorted({name for name in header if header.count(name) > 1})

@@ -1,4 +1,4 @@
-"""Position logs: RTKLIB ``.pos`` files and CSV with named columns."""
+"""Positions of one antenna; RTKLIB ``.pos`` files and CSV with named columns."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import FilePath, ending, read_text
-from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.files import FilePath, read_text
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.core.settings import misspelt
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, timedelta, utc_to_gpst
-from railfix.io.named_columns import NamedColumns, fails, read_named_columns
+from railfix.io.named_columns import NamedColumns, fails, read_named_columns, with_usual_names
 
 _SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
 #: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds; geodetic or ECEF.
@@ -35,7 +35,7 @@ class PositionLog:
 
     path: str
     time: Datetimes  #: GPS time; NaT where the log has none; shape (n,).
-    ecef_m: Floats  #: NaN where a row has no position, shape (n, 3).
+    ecef_m: Floats  #: NaN where a row has no position or no height, shape (n, 3).
     #: Q of RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; or the number in the log; -1
     #: where it has none; shape (n,).
     quality: Integers
@@ -43,6 +43,16 @@ class PositionLog:
     line: Integers  #: Line number of each row in the file, shape (n,).
     notes: tuple[str, ...] = ()
     ratio: Floats | None = None  #: Ratio of the ambiguity test, where the log has it; shape (n,).
+    #: Latitude and longitude of all rows, where some have no height; shape (n, 2).
+    plan_deg: Floats | None = None
+
+    @property
+    def geodetic(self) -> tuple[Floats, Floats, Floats]:
+        """Latitude, longitude [deg] and ellipsoidal height [m], shape (n,) each; a row without height is NaN there."""
+        latitude, longitude, height = geodetic_from_ecef(self.ecef_m)
+        if self.plan_deg is None:
+            return latitude, longitude, height
+        return self.plan_deg[:, 0], self.plan_deg[:, 1], height
 
     def __len__(self) -> int:
         return len(self.ecef_m)
@@ -53,62 +63,53 @@ class PositionLog:
         return bool((self.quality >= 0).any())
 
 
-def read_positions(path: FilePath, *, columns: Mapping[str, str] | None = None) -> PositionLog:
-    """Read a log of positions: CSV by its ending, else RTKLIB's solution format.
-
-    Parameters
-    ----------
-    path : path
-    columns : mapping of str, optional
-        For CSV with other column names: name in railfix to name in the file, such as ``{"latitude_deg": "Lat"}``.
-
-    Raises
-    ------
-    InputFileError
-        The file is not a log of positions, or a line of it is broken.
-    SettingsError
-        `columns` names a column that railfix does not know.
-    """
-    if ending(path) == ".csv":
-        table = rename_columns(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
-        antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
-        if len(antennas) > 1:
-            raise InputFileError(path, f"has positions of {' and '.join(antennas)}; give those of one antenna")
-        return positions_of_table(table)
-    if columns:
-        raise SettingsError(f"{path}: columns can be renamed in a .csv file only")
-    return read_rtklib_positions(path)
+def read_csv_positions(path: FilePath, *, columns: Mapping[str, str] | None = None) -> PositionLog:
+    """Read positions of one antenna from a table with named columns; see `railfix.io.positions.read_positions`."""
+    table = rename_columns(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
+    antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
+    if len(antennas) > 1:
+        raise InputFileError(path, f"has positions of {' and '.join(antennas)}; give those of one antenna")
+    return positions_of_table(table)
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
-    """Convert a table that has been read to a position log; see `read_positions`."""
+    """Convert a table that has been read to a position log; columns of heights and sigmas may be absent."""
+    cartesian = all(name in table for name in _CARTESIAN)
+    table = table if cartesian else with_usual_names(table, _GEODETIC)
     path = table.path
     close = misspelt(table.cells, CSV_COLUMNS)
     absent = {right: wrong for wrong, right in close.items() if right not in table}
-    geodetic, cartesian = (all(name in table for name in names) for names in (_GEODETIC, _CARTESIAN))
+    geodetic = all(name in table for name in _GEODETIC[:2])
+    for name in _GEODETIC if geodetic else (*_GEODETIC, *_CARTESIAN):
+        if name in absent and not cartesian:
+            raise table.header_error(f"column {absent[name]!r} is unknown; is {name!r} meant?")
     if not geodetic and not cartesian:
-        for name in (*_GEODETIC, *_CARTESIAN):
-            if name in absent:
-                raise table.header_error(f"column {absent[name]!r} is unknown; is {name!r} meant?")
         raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)}"
+            f"{', '.join(table.cells)} (--column latitude_deg=NAME names others)"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")
-    values = np.stack([table.numbers(n, blank=np.nan) for n in (_GEODETIC if geodetic else _CARTESIAN)], axis=-1)
-    if geodetic and (outside := np.abs(values[:, 0]) > 90.0).any():
+    names = _CARTESIAN if cartesian else _GEODETIC
+    values = np.stack([numbers_or_nan(table, name) for name in names], axis=-1)
+    if not cartesian and (outside := np.abs(values[:, 0]) > 90.0).any():
         row = int(np.argmax(outside))
         raise table.error(row, f"latitude_deg {values[row, 0]:g} is over 90; are latitude and longitude swapped?")
+    flat = not cartesian and bool((np.isfinite(values[:, :2]).all(axis=1) & np.isnan(values[:, 2])).any())
     quality = table.numbers("quality", blank=-1.0) if "quality" in table else np.full(len(table), -1.0)
+    notes: tuple[str, ...] = ()
+    if (height := table.usual.get("height_m")) is not None:
+        notes = (f"{path}: the column {height!r} is taken as heights above the ellipsoid, in metres",)
     return PositionLog(
         path=str(path),
         time=positions_times(table),
-        ecef_m=ecef_from_geodetic(*values.T) if geodetic else values,
+        ecef_m=values if cartesian else ecef_from_geodetic(*values.T),
         quality=np.where(np.isfinite(quality), quality, -1.0).astype(np.int64),
         sigma_m=np.stack([numbers_or_nan(table, name) for name in _SIGMAS], axis=-1),
         line=table.line,
+        notes=notes,
         ratio=numbers_or_nan(table, "ratio") if "ratio" in table else None,
+        plan_deg=values[:, :2] if flat else None,
     )
 
 
@@ -256,8 +257,8 @@ def _rtklib_header(path: FilePath, header: list[str]) -> tuple[str, list[str]]:
             return names[0], names[1:]
     raise InputFileError(
         path,
-        "there is no RTKLIB header line such as '%  GPST  latitude(deg) longitude(deg)  height(m)  Q ...'; a .pos file "
-        "written with out-outhead=on, or a .csv was expected",
+        "there is no RTKLIB header line such as '%  GPST  latitude(deg) longitude(deg)  height(m)  Q ...'; write the "
+        ".pos file with out-outhead=on",
     )
 
 

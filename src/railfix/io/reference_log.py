@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending
+from railfix.core.files import FilePath
 from railfix.core.tables import reading_table
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
-from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import (
     CSV_COLUMNS,
     PositionLog,
@@ -32,6 +31,7 @@ from railfix.io.position_log import (
     qualities_in_words,
     rename_columns,
 )
+from railfix.io.positions import position_kind, read_positions
 
 #: Columns of the file, in this order.
 COLUMNS: Final = (
@@ -83,7 +83,7 @@ def read_reference(
     ----------
     path : path
         A reference file or ground truth of the simulator (``.csv``, ``.csv.gz``), or a position log for
-        `railfix.io.nmea.read_any_positions`.
+        `railfix.io.positions.read_positions`.
     antennas : sequence of str
         Antennas to read. A file without the column ``antenna`` holds one antenna.
     quality : collection of int
@@ -103,7 +103,7 @@ def read_reference(
         No positions, no times, an unknown source, or no column ``antenna`` where two are to be read.
     """
     table = _table(Path(path), columns or {})
-    log = read_any_positions(path, columns=columns) if table is None else positions_of_table(table)
+    log = read_positions(path, columns=columns) if table is None else positions_of_table(table)
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
     if log.has_quality:
         usable &= np.isin(log.quality, [*quality])
@@ -125,7 +125,7 @@ def read_reference(
 
 def _table(path: Path, columns: Mapping[str, str]) -> NamedColumns | None:
     """Read the file as a table; None for a file other than CSV."""
-    if ending(path) != ".csv":
+    if position_kind(path) != "csv":
         return None
     return rename_columns(read_named_columns(path), columns, known=dict.fromkeys((*CSV_COLUMNS, *COLUMNS)))
 

@@ -12,6 +12,7 @@ from railfix.core.files import FilePath, Paths, path_names, read_text_lines
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import PreciseEphemeris
 from railfix.gnss.orbits.ephemerides import POINTS
+from railfix.gnss.plausible_records import plausible_radius
 
 #: Time systems that are GPS time up to nanoseconds; SP3-a files name none and are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
@@ -31,7 +32,8 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     Returns
     -------
     PreciseEphemeris
-        Where files overlap, the file given first takes precedence.
+        Where files overlap, the file given first takes precedence. Positions of zero or at a radius that is not one
+        of the constellation, and clocks of zero, are absent.
 
     Raises
     ------
@@ -50,8 +52,8 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     # Assigned in reverse order, so that the first of several values is kept.
     grid[row[::-1], column[::-1]] = np.array(numbers)[::-1]
     position, clock = grid[..., :3], grid[..., 3]
-    position[(position == 0.0).all(axis=-1)] = np.nan
-    clock[np.abs(clock) >= _NO_CLOCK] = np.nan
+    position[~plausible_radius(satellites, position * 1e3)] = np.nan  # zeros, where there is none, among them
+    clock[(np.abs(clock) >= _NO_CLOCK) | (clock == 0.0)] = np.nan
     return PreciseEphemeris(
         time=times.astype("datetime64[ns]"),
         satellite=satellites,

@@ -58,6 +58,14 @@ class SuspectedInterference(IntEnum):
     SPOOFING = 2
 
 
+class Unknown(IntFlag):
+    """What a message cannot say of the train."""
+
+    FACING = 1  #: The direction in which the front end looks: `over_cm` and `under_cm` cover both.
+    FRONT_END = 2  #: Where the front end is: `chainage_cm` is that of the reference point, an antenna or its vehicle.
+    LENGTH = 4  #: The train's length.
+
+
 class TrainMessage(Settings):
     """One position message."""
 
@@ -88,6 +96,11 @@ class TrainMessage(Settings):
     authority: Unsigned | None = None
     authority_end_cm: Signed | None = None  #: Where the authority ends that the train holds, rounded away from it.
     interference: SuspectedInterference | None = None  #: None from trains that do not look for it.
+    #: Safe front and rear end: no part of the train is ahead of the one or behind the other, as `facing` looks. None
+    #: without bounds, or where the end or the direction is unknown.
+    safe_front_cm: Signed | None = None
+    safe_rear_cm: Signed | None = None
+    unknown: Unknown = Unknown(0)  #: What the sender does not know of the train.
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
@@ -167,6 +180,7 @@ def to_json(message: TrainMessage) -> str:
     values = message.model_dump()
     values["status"] = message.status.name.lower()
     values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]
+    values["unknown"] = [what.name.lower() for what in Unknown if what in message.unknown and what.name]
     if message.interference is not None:
         values["interference"] = message.interference.name.lower()
     return json.dumps({"version": VERSION, **values}, separators=(",", ":"))
@@ -186,10 +200,14 @@ def from_json(line: str) -> TrainMessage:
         for name in values["sources"]:
             sources |= Source[str(name).upper()]
         values["sources"] = sources
+        unknown = Unknown(0)
+        for name in values.get("unknown", ()):
+            unknown |= Unknown[str(name).upper()]
+        values["unknown"] = unknown
         if values.get("interference") is not None:
             values["interference"] = SuspectedInterference[str(values["interference"]).upper()]
     except (KeyError, TypeError):
-        raise MessageError("has an unknown status, source or interference") from None
+        raise MessageError("has an unknown status, source, interference or what is unknown") from None
     return validate_message(TrainMessage, values)
 
 
@@ -198,10 +216,12 @@ _LARGEST_LENGTH: Final = 32_766  #: Largest value of a length of packet 0; one m
 
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
     """Return the fields of packet 0 (SUBSET-026 v4, 7.4.2.1) against a reference at `reference_cm` of identity
-    `reference` (NID_BG or NID_LRBG). ValueError: no position, or too far.
+    `reference` (NID_BG or NID_LRBG). ValueError: no position of the front end, or too far.
     """
     if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
         raise ValueError("a message without a position has no packet 0")
+    if Unknown.FRONT_END in message.unknown:
+        raise ValueError("a message without the place of the front end has no packet 0")
     distance = message.chainage_cm - reference_cm
     metres = {"D_LRBG": abs(distance), "L_DOUBTOVER": message.over_cm, "L_DOUBTUNDER": message.under_cm}
     # Whole metres (Q_SCALE 1), tens of metres where these do not reach (Q_SCALE 2); doubts are rounded up, with the

@@ -143,6 +143,8 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
         if inputs.channels == "2":
             engine = TwoChannels(processor, live, tuple(inputs.sensors))
             held.callback(engine.close)
+        for note in engine.frame.notes:
+            log.say(note)
         hooks, streams = _hooks(inputs, live, engine, log, held, full="wait" if replay else "drop")
         metrics = hooks.metrics
         if inputs.metrics is not None:

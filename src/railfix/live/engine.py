@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final, Literal
 
@@ -19,13 +19,15 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.train_message import TrainMessage
 from railfix.kernels import load
-from railfix.live.message import create_message, no_input_message
+from railfix.live.message import TrainPlace, create_message, locate_train, no_input_message
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import FOREVER, Lag, Sensed
+from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import merge_navigation
-from railfix.pipeline.results import Result, State
+from railfix.pipeline.results import Result
+from railfix.pipeline.state import State
 from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].
@@ -42,6 +44,7 @@ class LiveOutput:
 
     message: TrainMessage
     result: Result | None
+    place: TrainPlace | None = None  #: Place that the message was made from; None without input.
     #: What of it goes out: both; the rows of the result alone, because the message of its period has gone out before;
     #: or such a message later, alone.
     part: Literal["both", "rows", "message"] = "both"
@@ -55,6 +58,8 @@ class EngineState:
     done_ns: int  #: Time tag of the last epoch, GPS time since 1980; 0 before the first.
     last_tag: Mapping[str, int]  #: Last time tag of each antenna.
     sequence: int  #: Number of the last message, or one that no message has reached when the next state is saved.
+    #: Direction in which the train's front end looks.
+    running: RunningEnd = field(default_factory=lambda: RunningEnd(direction=0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,6 +108,8 @@ class LiveEngine:
         "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
         "skipped, behind the receivers", "dropped, too many waiting", "tachometer silent" and the like (not heard up to
         the epoch in time).
+    frame : TrainFrame
+        Reference point and ends of the train.
     reports : deque of str
         Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
         restarts, what became of a saved state.
@@ -130,6 +137,8 @@ class LiveEngine:
         self._samples = SensorSamples()
         self._heard_to = dict.fromkeys(sensors, np.datetime64("NaT", "ns"))
         self._sequence = 0
+        self.frame = TrainFrame.of(processor.trajectories, settings)
+        self._running = RunningEnd(direction=self.frame.running)
         self._due_ns: int | None = None
         self._pending: LiveOutput | None = None
         self._silent = False
@@ -182,7 +191,7 @@ class LiveEngine:
             return replace(self._saved, sequence=sequence)
         return EngineState(
             state=State() if self._state is None else self._state, done_ns=self._done_ns if self._state else 0,
-            last_tag=dict(self._last_tag), sequence=sequence,
+            last_tag=dict(self._last_tag), sequence=sequence, running=self._running,
         )  # fmt: skip
 
     def resume(self, saved: EngineState) -> None:
@@ -223,6 +232,7 @@ class LiveEngine:
         age_s = (tag_ns - saved.done_ns) * 1e-9
         if 0.0 < age_s <= self.settings.state_age_s:
             self._state, self._done_ns, self._last_tag = saved.state, saved.done_ns, dict(saved.last_tag)
+            self._running = saved.running
             self._samples = self._samples.between(GPS_EPOCH + np.timedelta64(saved.done_ns, "ns"), FOREVER)
             self.reports.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
         else:
@@ -293,7 +303,7 @@ class LiveEngine:
             self._due_ns += self._patience_ns()
             self._silent = True
             last = max(self._last_tag.values(), default=sent_ns or 0)
-            message = no_input_message(self.settings, last)
+            message = no_input_message(self.settings, self.frame, self._running.direction, last)
             numbered.append(self._send(LiveOutput(message=message, result=None), last if sent_ns is None else sent_ns))
         return numbered
 
@@ -384,7 +394,17 @@ class LiveEngine:
         )
         self._tell_changes((self._state.received or self.processor.received).notes)
         self._check_order(result)
-        return LiveOutput(message=create_message(result, self.settings), result=result)
+        return self._locate(result)
+
+    def _locate(self, result: Result) -> LiveOutput:
+        """Return the message of a result, with the direction of the train's front end up to it."""
+        place = locate_train(result, self.frame)
+        before = self._running
+        self._running = before.after(place.chainage_m, place.bound_m, place.moving)
+        if (sentence := self._running.sentence(before)) is not None:
+            self.reports.append(sentence)
+        message = create_message(result, place, self.settings, self.frame, self._running.direction)
+        return LiveOutput(message=message, result=result, place=place)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
         """Return the samples since the epoch before up to an epoch; later ones wait."""

@@ -17,9 +17,8 @@ import numpy as np
 import polars as pl
 
 from railfix.core.timescale import GPS_EPOCH, gpst_minus_utc
-from railfix.io.train_message import MessageStatus, TrainMessage, encode, etcs_report, to_json
+from railfix.io.train_message import MessageStatus, TrainMessage, Unknown, encode, etcs_report, to_json
 from railfix.live.engine import LiveOutput
-from railfix.live.message import choose_antenna
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.results import Result
 from railfix.pipeline.tables import passing_table, positions_table, train_table
@@ -41,7 +40,7 @@ def cbor_bytes(output: LiveOutput) -> bytes:
 
 
 def nmea_bytes(output: LiveOutput) -> bytes:
-    """Return NMEA 0183 sentences GGA, RMC and GST of the place of the message's antenna; nothing without input."""
+    """Return NMEA 0183 sentences GGA, RMC and GST of the place of the first antenna; nothing without input."""
     place = _geodetic(output)
     if output.result is None:
         return b""
@@ -90,12 +89,14 @@ def tpv_bytes(output: LiveOutput) -> bytes:
 def etcs_form(settings: LiveSettings) -> Form:
     """Position reports of SUBSET-026, packet 0, against the reference location of the settings, a line of JSON each.
 
-    Nothing without a position, and where a doubt is longer than the packet can say (327 km).
+    Nothing without a position of the front end, and where a doubt is longer than the packet can say (327 km).
     """
 
     def etcs_bytes(output: LiveOutput) -> bytes:
         message = output.message
         if message.chainage_cm is None or message.over_cm is None or message.over_cm >= _LONGEST_DOUBT_CM:
+            return b""
+        if Unknown.FRONT_END in message.unknown:
             return b""
         report = etcs_report(message, reference_cm=round(settings.reference_m * 100.0), reference=settings.reference)
         return json.dumps(report, separators=(",", ":")).encode() + b"\n"
@@ -151,18 +152,11 @@ def forms(settings: LiveSettings) -> dict[str, Form]:
 
 
 def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
-    """Return latitude, longitude [deg], ellipsoidal height and along-track sigma [m] of the antenna of the message."""
-    if output.result is None:
+    """Return latitude, longitude [deg], ellipsoidal height and along-track sigma [m] of the first antenna."""
+    place = output.place
+    if place is None or place.geodetic is None or not math.isfinite(place.sigma_m):
         return None
-    name = choose_antenna(output.result)
-    antenna, track = output.result.antennas[name], output.result.fusion.get(name)
-    if track is not None and len(track) and math.isfinite(float(track.chainage_m[-1])):
-        values = (track.latitude_deg[-1], track.longitude_deg[-1], track.height_m[-1], track.tracked.sigma_m[-1])
-    else:
-        values = (antenna.latitude_deg[-1], antenna.longitude_deg[-1], antenna.height_m[-1], antenna.along_sigma_m[-1])
-    if not all(math.isfinite(float(value)) for value in values):
-        return None
-    return float(values[0]), float(values[1]), float(values[2]), float(values[3])
+    return *place.geodetic, place.sigma_m
 
 
 def _utc(message: TrainMessage) -> str:

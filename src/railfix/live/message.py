@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import TypeGuard
+from dataclasses import dataclass
+from typing import Any, Final, TypeGuard
 
 import numpy as np
 
+from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.protection import LevelStatus
-from railfix.io.train_message import MessageStatus, Source, SuspectedInterference, TrainMessage
+from railfix.io.train_message import MessageStatus, Source, SuspectedInterference, TrainMessage, Unknown
 from railfix.live.settings import LiveSettings
+from railfix.live.train_ends import TrainFrame
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
@@ -19,7 +22,8 @@ from railfix.tracking import Kind, TrackStatus
 
 #: Sigmas that the speed's bound stands for: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
 _SPEED_K = 5.33
-_BOUNDS = ("over_cm", "under_cm", "protection_level_cm")
+#: Bounds are wider by this, so that they hold for chainages that are rounded to centimetres [m].
+_ROUNDING_M: Final = 0.01
 _SOURCE_OF_KIND = {
     Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
     Kind.RADAR: Source.RADAR, Kind.FORCE: Source.INERTIAL, Kind.PLACE: Source.FEATURES, Kind.RANGE: Source.RANGING,
@@ -28,7 +32,7 @@ _SOURCE_OF_KIND = {
 _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIVER}
 
 
-def no_input_message(settings: LiveSettings, time_ns: int) -> TrainMessage:
+def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, time_ns: int) -> TrainMessage:
     """Return the message of a period in which nothing was received; the sender numbers it."""
     return TrainMessage(
         train=settings.train,
@@ -36,58 +40,101 @@ def no_input_message(settings: LiveSettings, time_ns: int) -> TrainMessage:
         time_ns=time_ns,
         sent_ns=time_ns,
         line=settings.line,
-        facing=settings.facing,
-        length_cm=_up_cm(settings.length_m),
         status=MessageStatus.NO_INPUT,
+        **_describe_train(frame, running),
     )
 
 
-def create_message(result: Result, settings: LiveSettings) -> TrainMessage:
+@dataclass(frozen=True, kw_only=True)
+class TrainPlace:
+    """Place of the train's reference point at the last epoch of a result."""
+
+    antenna: str  #: Antenna that it is from.
+    #: Chainage of the reference point; NaN without a place.
+    chainage_m: float
+    sigma_m: float
+    #: Bound of its error, and the protection level under it; infinite where none is promised.
+    bound_m: float
+    level_m: float
+    status: MessageStatus
+    moving: int  #: Direction of the speed against chainage, 0 where it does not tell.
+    #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna there; None without a place.
+    geodetic: tuple[float, float, float] | None
+
+
+def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
+    """Return the place of the train: of the antennas, each reduced to the reference point, that with the best bound.
+
+    The place is that of the filter along the track where it runs, else that of the single epoch. The bound is the
+    filter's over- and under-reading amount where it has a level (`tracking.level`); else the protection level of the
+    single epoch, widened by the distance of the filter's place from it, so that it holds for both.
+    """
+    places = [_locate_antenna(name, result, frame) for name in result.antennas]
+    return min(places, key=lambda place: (math.isnan(place.chainage_m), place.level_m))
+
+
+def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
+    """Return the place of the train by one antenna."""
+    antenna, track = result.antennas[name], result.fusion.get(name)
+    place, status = _place_and_status(antenna, track)
+    arc, sigma = float(antenna.arc_m[-1]), float(antenna.along_sigma_m[-1])
+    level, single, amount = _level_m(antenna), float(antenna.chainage_m[-1]), math.nan
+    if _has_place(track):
+        arc, sigma = float(track.tracked.arc_m[-1]), float(track.tracked.sigma_m[-1])
+        amount = float(track.tracked.amount_m[-1])
+    bound = level + abs(place - single) + _ROUNDING_M if math.isfinite(single) else math.inf
+    if math.isfinite(amount) and track is not None:  # the filter has a level of its own
+        bound, level = amount + _ROUNDING_M, float(track.tracked.level_m[-1])
+    chainage, geodetic = math.nan, None
+    if math.isfinite(place):
+        chainage = frame.reference_m(name, arc)
+        geodetic = _geodetic(name, result, frame, arc)
+        if not math.isfinite(chainage):
+            status = MessageStatus.NO_POSITION
+    bounded = math.isfinite(bound)
+    if status is MessageStatus.POSITION and not bounded:
+        status = MessageStatus.DOUBTFUL
+    # The bound of a position that failed a check is none for the place that the sensors carry.
+    if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
+        status = MessageStatus.DOUBTFUL
+    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # no bound is promised, so none is sent
+        bound = math.inf
+    moving = int(track.direction[-1]) if track is not None and len(track) else 0
+    return TrainPlace(
+        antenna=name, chainage_m=chainage, sigma_m=sigma, bound_m=bound, level_m=level, status=status, moving=moving,
+        geodetic=geodetic,
+    )  # fmt: skip
+
+
+def _geodetic(name: str, result: Result, frame: TrainFrame, arc_m: float) -> tuple[float, float, float] | None:
+    """Return latitude, longitude [deg] and ellipsoidal height [m] of the first antenna for a place of an antenna."""
+    source = result.fusion[name] if _has_place(result.fusion.get(name)) else result.antennas[name]
+    values = np.array([source.latitude_deg[-1], source.longitude_deg[-1], source.height_m[-1]])
+    if name != frame.first:
+        values = np.array(geodetic_from_ecef(frame.first_antenna_ecef_m(name, arc_m)[None])).ravel()
+    return None if not np.isfinite(values).all() else (float(values[0]), float(values[1]), float(values[2]))
+
+
+def create_message(
+    result: Result, place: TrainPlace, settings: LiveSettings, frame: TrainFrame, running: int
+) -> TrainMessage:
     """Return the message of one processed epoch; the sender numbers it.
 
-    The place is that of the filter along the track where it runs, else that of the single epoch, of the antenna that
-    `choose_antenna` names. The bounds are the filter's over- and under-reading amounts where it has a level
-    (`tracking.level`); else the protection level of the single epoch, widened by the distance of the filter's place
-    from it, so that they hold for both. A doubtful place has none.
+    `running` is the direction in which the train's front end looks. The chainage is that of the front end, its bounds
+    are those of the place, wider where either end of the train may be ahead. Where the front end is unknown they are
+    those of the reference point. A doubtful place has no bounds.
     """
-    name = choose_antenna(result)
-    antenna = result.antennas[name]
-    track = result.fusion.get(name)
+    antenna, track = result.antennas[place.antenna], result.fusion.get(place.antenna)
     sources = Source(0)
     for used, other in result.antennas.items():
         if other.n_used[-1] > 0:
             sources |= _SOURCE_OF_ANTENNA.get(used, Source(0))
-    place, status = _place_and_status(antenna, track)
-    sigma_m = float(antenna.along_sigma_m[-1] if not _has_place(track) else track.tracked.sigma_m[-1])
-    values: dict[str, object] = {}
-    level = _level_m(antenna)
-    single = float(antenna.chainage_m[-1])
-    amount = math.nan if track is None or not len(track) else float(track.tracked.amount_m[-1])
-    if math.isfinite(place):
-        front = place + settings.facing * settings.front_offset_m
-        values["chainage_cm"] = round(front * 100.0)
-        if math.isfinite(sigma_m):
-            values["sigma_cm"] = _up_cm(sigma_m)
-        bound = level + abs(place - single) + 0.01 if math.isfinite(single) else math.inf
-        if math.isfinite(amount):  # the filter has a level of its own
-            bound, level = amount + 0.01, float(track.tracked.level_m[-1]) if track is not None else level
-        if math.isfinite(bound):
-            values["over_cm"] = values["under_cm"] = _up_cm(bound)
-            values["protection_level_cm"] = _up_cm(level)
-        elif status is MessageStatus.POSITION:
-            status = MessageStatus.DOUBTFUL
-    # The bound of a position that failed a check is none for the place that the sensors carry.
-    if status is MessageStatus.COASTING and not (
-        "over_cm" in values and (math.isfinite(amount) or _has_passed(antenna))
-    ):
-        status = MessageStatus.DOUBTFUL
-    if status is MessageStatus.DOUBTFUL:  # no bound is promised, so none is sent
-        values = {key: value for key, value in values.items() if key not in _BOUNDS}
+    values = _describe_place(place, frame, running)
     if track is not None and len(track):
         speed, sigma = float(track.tracked.speed_mps[-1]), float(track.tracked.speed_sigma_mps[-1])
         if math.isfinite(speed):
             values["speed_cmps"], values["speed_bound_cmps"] = round(speed * 100.0), _up_cm(_SPEED_K * sigma)
-        values["direction"], values["standstill"] = int(track.direction[-1]), bool(track.standstill[-1])
+        values["direction"], values["standstill"] = place.moving, bool(track.standstill[-1])
         sources |= _name_sources(track)
         probability = float(track.tracked.probability[-1])
         if math.isfinite(probability):
@@ -98,13 +145,46 @@ def create_message(result: Result, settings: LiveSettings) -> TrainMessage:
         time_ns=int((antenna.time[-1] - GPS_EPOCH).astype(np.int64)),
         sent_ns=0,
         line=settings.line,
-        facing=settings.facing,
-        length_cm=_up_cm(settings.length_m),
-        status=status,
+        status=place.status,
         sources=sources,
         interference=_find_suspicion(result),
-        **values,  # type: ignore[arg-type]
+        **_describe_train(frame, running),
+        **values,
     )
+
+
+def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
+    """Return the fields that say which train it is, and what is not known of it."""
+    length, front = frame.length_m, frame.ends(running).front_m
+    unknown = Unknown(0)
+    for what, known in (
+        (Unknown.FACING, running), (Unknown.FRONT_END, math.isfinite(front)), (Unknown.LENGTH, math.isfinite(length)),
+    ):  # fmt: skip
+        unknown |= Unknown(0) if known else what
+    return {"facing": running, "length_cm": _up_cm(length) if math.isfinite(length) else 0, "unknown": unknown}
+
+
+def _describe_place(place: TrainPlace, frame: TrainFrame, running: int) -> dict[str, Any]:
+    """Return chainage, bounds and safe ends of a place, rounded so that the bounds hold."""
+    values: dict[str, Any] = {}
+    if not math.isfinite(place.chainage_m):
+        return values
+    ends, front = frame.ends(running), place.chainage_m
+    spread = 0.0
+    if math.isfinite(ends.front_m):
+        front, spread = front + running * ends.front_m, ends.spread_m
+    values["chainage_cm"] = round(front * 100.0)
+    if math.isfinite(place.sigma_m):
+        values["sigma_cm"] = _up_cm(place.sigma_m)
+    if math.isfinite(place.bound_m):
+        values["over_cm"] = values["under_cm"] = _up_cm(place.bound_m + spread)
+        values["protection_level_cm"] = _up_cm(place.level_m)
+        for name, end_m in (("safe_front_cm", ends.foremost_m), ("safe_rear_cm", -ends.rearmost_m)):
+            if running and math.isfinite(end_m):
+                side = running if name == "safe_front_cm" else -running
+                safe_m = side * (place.chainage_m + running * end_m) + place.bound_m
+                values[name] = side * math.ceil(safe_m * 100.0)
+    return values
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
@@ -121,19 +201,6 @@ def _name_sources(track: AlongTrack) -> Source:
     if track.sensed.state[-1] in CARRIED and Source.TACHOMETER in sources:
         sources = sources & ~Source.TACHOMETER | Source.INERTIAL
     return sources
-
-
-def choose_antenna(result: Result) -> str:
-    """Return the antenna to report: one that has a place, of two the one with the smaller protection level."""
-
-    def worth(name: str) -> tuple[bool, float]:
-        antenna, track = result.antennas[name], result.fusion.get(name)
-        if not _has_place(track):
-            return not math.isfinite(float(antenna.chainage_m[-1])), _level_m(antenna)
-        level = float(track.tracked.level_m[-1])
-        return False, level if math.isfinite(level) else _level_m(antenna)
-
-    return min(result.antennas, key=worth)
 
 
 def _has_place(track: AlongTrack | None) -> TypeGuard[AlongTrack]:

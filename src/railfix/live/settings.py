@@ -53,12 +53,12 @@ class LiveSettings(Settings):
     #: Identities for the message.
     train: int = Field(default=0, ge=0)
     line: int = Field(default=0, ge=0)
-    #: Direction in which the train's front end looks against rising chainage; 0 where unknown: then the chainage of the
-    #: message is that of the reference point, not of the front end.
-    facing: Literal[-1, 0, 1] = 0
-    #: Front end of the train ahead of the point whose chainage is computed.
-    front_offset_m: float = Field(default=0.0, ge=0.0)
-    length_m: float = Field(default=0.0, ge=0.0)  #: Train length.
+    #: Direction in which the end of the train looks that runs ahead at the start, against rising chainage; 0 where
+    #: unknown. None: that of the vehicle file. A train that runs the other way for 50 m has changed ends.
+    facing: Literal[-1, 0, 1] | None = None
+    #: Front end of the train ahead of the front antenna. None: that of the vehicle file, by its length.
+    front_offset_m: float | None = Field(default=None, ge=0.0)
+    length_m: float | None = Field(default=None, gt=0.0)  #: Train length. None: that of the vehicle file.
     #: Identity of the reference location of ETCS position reports (NID_LRBG).
     reference: int = Field(default=0, ge=0, lt=1 << 24)
     reference_m: float = 0.0  #: Its chainage.

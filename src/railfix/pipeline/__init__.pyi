@@ -4,7 +4,8 @@ from .base_station import Stations
 from .config import Config, load_config
 from .corrected_ranges import Models
 from .processor import EpochProcessor
-from .results import AntennaResult, AntennaState, Result, State
+from .results import AntennaResult, Result
+from .state import AntennaState, State
 from .tables import observations_table, positions_table, to_xarray, train_table
 
 __all__ = [

@@ -19,19 +19,11 @@ from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balises import BaliseLimits, find_passings
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.filter_result import (
-    COORDINATES,
-    AlongTrack,
-    FilterFix,
-    FilterState,
-    Replay,
-    ReturnState,
-    SingleEpochs,
-    SmoothedTrack,
-    gated_codes,
-)
+from railfix.pipeline.filter_result import COORDINATES, AlongTrack, FilterFix, FilterState, SingleEpochs
+from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
+from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.screens import Screened
 from railfix.track.track import interpolate_kilometrage

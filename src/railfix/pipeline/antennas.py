@@ -8,6 +8,7 @@ it should be ahead.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
@@ -15,15 +16,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Datetimes, Floats, Masks, copy_with, read_only
+from railfix.core.epoch_rows import join_epochs
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
+from railfix.integrity.interference import Sign, Suspicion
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.filter_result import COORDINATES
+from railfix.pipeline.filter_result import COORDINATES, AlongTrack, SingleEpochs
+from railfix.pipeline.interference_stage import with_statuses
 from railfix.pipeline.level_stage import apply_verdicts
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
-from railfix.positioning.antenna_rows import AntennaRows, join_epochs
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.map_offset import MapOffsetLimits, beyond_threshold
 from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.screens.base import on_pairs, pair_epochs
 from railfix.track.track import interpolate_kilometrage
@@ -160,6 +165,37 @@ def filter_verdicts(
         for name, rows in epochs.items():
             checks[name] = on_pairs(verdict, filtered[name].chainage_m.shape, rows, rows)
     return checks
+
+
+def filter_inputs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits) -> SingleEpochs:
+    """Return what the filter uses of the results of single epochs; `off_map` as in `SingleEpochs`."""
+    return SingleEpochs(
+        noise_scale=result.noise_scale,
+        arc_m=result.arc_m,
+        sigma_m=result.own_sigma_m,
+        near_ecef_m=result.conventional_ecef_m,
+        off_map=off_map,
+        map_offset=beyond_threshold(result.map_offset, limits),
+        spoofed=np.zeros(len(result), dtype=bool)
+        if result.interference is None
+        else result.interference.suspicion == Suspicion.SPOOFING_SUSPECTED,
+    )
+
+
+def apply_wheel_sign(
+    results: Mapping[str, AntennaResult], fusion: Mapping[str, AlongTrack]
+) -> dict[str, AntennaResult]:
+    """Return the results of single epochs with the sign of the wheel, which the filter along the track gives."""
+    after = dict(results)
+    for name, tracked in fusion.items():
+        result, wheel = results[name], tracked.wheel
+        found = result.interference
+        if wheel is None or found is None or not wheel.parted.any():
+            continue
+        found = replace(found, causes=np.where(wheel.parted, found.causes | int(Sign.WHEEL_PARTS), found.causes))
+        status = with_statuses(result.status, [found.suspicion])
+        after[name] = copy_with(result, interference=found, status=status)
+    return after
 
 
 #: Pairs of positions within so much of the line share their reflections, and count as one sample [m].

@@ -103,7 +103,7 @@ class BaseStation:
         if self._antenna is None or np.any(self._antenna[0] != ecef_m):
             latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
             ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
-            index = SearchIndex(Trajectory.from_track(Track.from_ecef(ends)))
+            index = SearchIndex(Trajectory.from_antenna_path(Track.from_ecef(ends)))
             self._antenna = ecef_m, AntennaRows.of(index)
         return self._antenna[1]
 

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, copy_with, kernel_array
+from railfix.core.epoch_rows import OnDemand
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
@@ -17,7 +18,7 @@ from railfix.integrity.protection.araim import IntegritySupport
 from railfix.pipeline.channels import Channels, second_codes
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
-from railfix.positioning.antenna_rows import AntennaRows, OnDemand
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges, SinglePointLimits, single_point
 from railfix.positioning.section_search import SearchIndex, search

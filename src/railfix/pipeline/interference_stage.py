@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, copy_with, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.epoch_rows import join_epochs, take_epochs
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.interference import (
@@ -29,13 +30,9 @@ from railfix.integrity.interference import (
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
-from railfix.positioning.antenna_rows import AntennaRows, join_epochs, take_epochs
-
-if TYPE_CHECKING:
-    from railfix.pipeline.corrected_ranges import CorrectedRanges
-    from railfix.pipeline.filter_result import AlongTrack
-    from railfix.pipeline.results import AntennaResult
-    from railfix.pipeline.solution import Solution
+from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.normal_equations import ClockTies
 
 #: Reasons given because ranges contradict others: those of a spoofer do.
 _CONTRADICTED: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.ALONE_ON_ITS_CLOCK)
@@ -79,12 +76,20 @@ class Interference:
         return suspicion(self.causes)
 
 
+class PositionEpochs(NamedTuple):
+    """Results of single epochs that the signs are looked for in, T epochs."""
+
+    near_ecef_m: Floats  #: 3-D positions without the map, shape (T, 3).
+    noise_scale: Floats  #: Shape (T,).
+    ties: ClockTies  #: Inter-system biases known before each epoch.
+
+
 def _motion_inputs(
-    corrected: CorrectedRanges, solution: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
+    corrected: CorrectedRanges, single: PositionEpochs, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
     """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
-    near, off_line = solution.point.ecef_m[rows], np.empty(len(rows))
+    near, off_line = single.near_ecef_m[rows], np.empty(len(rows))
     first = 0
     for index, own in antennas.split(rows):
         part = slice(first, first := first + len(own))
@@ -98,8 +103,8 @@ def _motion_inputs(
         code_m=np.where((reason & _NOT_ITS_SIGNAL) == 0, code, np.nan),
         rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz[rows],
         corrected_code_m=corrected.corrected_code_m[rows], sigma_m=corrected.sigma_m[rows],
-        used=(reason & ~_CONTRADICTED) == 0, noise_scale=solution.noise_scale[rows],
-        clock_offset_m=solution.ties.offset_m[rows], clock_sigma_m=solution.ties.sigma_m[rows], off_line_m=off_line,
+        used=(reason & ~_CONTRADICTED) == 0, noise_scale=single.noise_scale[rows],
+        clock_offset_m=single.ties.offset_m[rows], clock_sigma_m=single.ties.sigma_m[rows], off_line_m=off_line,
     )  # fmt: skip
 
 
@@ -144,7 +149,7 @@ def _signs(alarm: Bytes, power: PowerSigns, motion: MotionSigns, limits: Interfe
         Sign.POSITION_JUMP: (motion.position_jump_m >= limits.position_jump_m)
         & (motion.position_jump_sigmas >= sigmas),
         Sign.CONSTELLATIONS_PART: motion.part_sigmas >= limits.part_sigmas,
-        Sign.WHEEL_PARTS: np.zeros(len(alarm), dtype=np.bool_),  # `with_wheel`, after the filter
+        Sign.WHEEL_PARTS: np.zeros(len(alarm), dtype=np.bool_),  # by the filter along the track
         Sign.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
     }
     return np.array([by_cause[cause] for cause in CAUSES]).T
@@ -213,48 +218,40 @@ def _on_all_epochs(
     return every, after
 
 
-def with_statuses(status: Codes, kind: Codes) -> Codes:
-    """Return the statuses of positions with those of interference where they outrank, shape (T,)."""
+def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
+    """Return the statuses of positions (T,) with those of interference, where they outrank.
+
+    `suspected`: `Suspicion` of the epochs of each antenna, one after the other; empty where that is off.
+    """
+    if not suspected:
+        return status
+    kind = np.concatenate(suspected)
     jammed = (kind == int(Suspicion.JAMMING_SUSPECTED)) & (status == int(Status.OK))
     spoofed = (kind == int(Suspicion.SPOOFING_SUSPECTED)) & _UNDER_SPOOFING[status]
     status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
     return np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
 
 
-def with_wheel(results: Mapping[str, AntennaResult], fusion: Mapping[str, AlongTrack]) -> dict[str, AntennaResult]:
-    """Return the results of single epochs with the sign of the wheel, which the filter along the track gives."""
-    after = dict(results)
-    for name, tracked in fusion.items():
-        result, wheel = results[name], tracked.wheel
-        found = result.interference
-        if wheel is None or found is None or not wheel.parted.any():
-            continue
-        found = replace(found, causes=np.where(wheel.parted, found.causes | int(Sign.WHEEL_PARTS), found.causes))
-        status = with_statuses(result.status, found.suspicion)
-        after[name] = copy_with(result, interference=found, status=status)
-    return after
-
-
 def judge_interference(
     corrected: CorrectedRanges,
-    solution: Solution,
+    single: PositionEpochs,
     antennas: AntennaRows,
     states: list[InterferenceState],
     limits: InterferenceLimits,
-) -> tuple[Solution, Sequence[Interference | None], list[InterferenceState]]:
-    """Return positions with the statuses of interference, and interference and new state of each antenna.
+) -> tuple[Sequence[Interference | None], list[InterferenceState]]:
+    """Return interference and new state of each antenna; None where `InterferenceLimits.use` is off.
 
     It is looked for at the first epoch of each second; the others have what was found there. A break or an alarm
     between counts at the next one.
     """
     if limits.use == "off":
-        return solution, [None] * len(states), states
+        return [None] * len(states), states
     second = (corrected.time.astype(np.int64) - _FIRST_NS) // _SECOND_NS
     due = antennas.apart(lambda _, rows, state: _due(corrected, second, rows, state), states)
     rows = np.concatenate([own.rows for own in due])
     broken = np.concatenate([own.broken[:-1] for own in due])
     if any(len(own.rows) or not len(own.group) for own in due):
-        inputs = _motion_inputs(corrected, solution, antennas, rows, broken)
+        inputs = _motion_inputs(corrected, single, antennas, rows, broken)
         fitted = fit_motion(inputs, limits)
     found: list[Interference] = []
     after: list[InterferenceState] = []
@@ -270,5 +267,4 @@ def judge_interference(
         assert new is not None, "an epoch without one before it is due"
         found.append(new)
         after.append(state)
-    kind = suspicion(np.concatenate([own.causes for own in found]))
-    return copy_with(solution, status=with_statuses(solution.status, kind)), found, after
+    return found, after

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Floats, Masks, copy_with
+from railfix.core.arrays import Codes, Floats, Indices, Masks, copy_with
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, Status
@@ -26,16 +26,22 @@ from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.results import ProtectionResult, RaimResult
-from railfix.pipeline.solve import Place, line_model
+from railfix.pipeline.solve import Place, RaimResult, line_model
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import Ranges
 
-if TYPE_CHECKING:
-    from railfix.pipeline.config import Config
-    from railfix.pipeline.corrected_ranges import CorrectedRanges
-    from railfix.pipeline.solution import Solution
+
+@dataclass(frozen=True, kw_only=True)
+class ProtectionResult:
+    """Protection levels of T epochs."""
+
+    #: NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
+    level: ProtectionLevel
+    status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
+    kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
+    basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
+
 
 #: Basis of a level: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
 #: satellites' own faults as well (ARAIM).
@@ -213,25 +219,27 @@ def _where_it_holds(level: ProtectionLevel, has: Masks, chainage_m: Floats, conf
 _SPACE: Final = 3
 
 
-def with_araim(
+def compute_araim(
     corrected: CorrectedRanges,
-    solution: Solution,
+    arc_m: Floats,
+    noise_scale: Floats,
+    section: Indices,
     antennas: AntennaRows,
     support: IntegritySupport | None,
     config: Config,
-) -> Solution:
-    """Return the positions with ARAIM levels, where there is an integrity support message.
+) -> AraimResult | None:
+    """Return ARAIM levels of positions on the line, shape (T,); None without an integrity support message.
 
     Integrity: URA of the message, atmosphere of `Config.nominal` and the noise of the ranges by its scale; accuracy and
     thresholds: URE in place of URA. The ranges have all reasons.
     """
     if support is None:
-        return solution
-    place = np.where(np.isfinite(solution.arc_m)[:, None], antennas.at_arc(solution.arc_m), np.nan)
+        return None
+    place = np.where(np.isfinite(arc_m)[:, None], antennas.at_arc(arc_m), np.nan)
     sight, clocks, channels = _sight(corrected, place)
     stated = support.arrays(corrected.satellite[channels].tolist())
     air = config.nominal.replaced(satellite_sigma_m=0.0).sigma_m(corrected.elevation_deg[:, channels])
-    noise = level_scale(solution.noise_scale, config)[:, None] * corrected.sigma_m[:, channels]
+    noise = level_scale(noise_scale, config)[:, None] * corrected.sigma_m[:, channels]
     if config.error_model is not None:
         noise = np.fmax(noise, corrected.bound_sigma_m[:, channels])
     used = (corrected.reason[:, channels] == 0) & np.isfinite(place[:, :1]) & support.holds(corrected.time)[:, None]
@@ -250,19 +258,16 @@ def with_araim(
     )  # fmt: skip
     budget = config.araim
     near = np.nan_to_num(place, nan=1e6)
-    axes = antennas.get_axes(np.maximum(solution.place.constrained.section, 0))
+    axes = antennas.get_axes(np.maximum(section, 0))
     on_line = with_map(_rotate_geometry(ranges, axes), antennas.sigma_plan_m, antennas.sigma_height_m, budget.map_prior)
     horizontal = budget.phmi_horizontal / 2.0, budget.false_alarm_horizontal / 2.0
-    return copy_with(
-        solution,
-        araim=AraimResult(
-            along=araim_levels(on_line, [budget.phmi_along], [budget.false_alarm_along], budget),
-            space=araim_levels(
-                _rotate_geometry(ranges, enu_axes(*geodetic_from_ecef(near)[:2])),
-                [horizontal[0], horizontal[0], budget.phmi_vertical],
-                [horizontal[1], horizontal[1], budget.false_alarm_vertical],
-                budget,
-            ),
+    return AraimResult(
+        along=araim_levels(on_line, [budget.phmi_along], [budget.false_alarm_along], budget),
+        space=araim_levels(
+            _rotate_geometry(ranges, enu_axes(*geodetic_from_ecef(near)[:2])),
+            [horizontal[0], horizontal[0], budget.phmi_vertical],
+            [horizontal[1], horizontal[1], budget.false_alarm_vertical],
+            budget,
         ),
     )
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, join_rows
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
@@ -19,15 +20,55 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
+from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
 from railfix.positioning.noise_scale import robust_fit
-from railfix.positioning.normal_equations import Ranges, single_point
+from railfix.positioning.normal_equations import Ranges, SinglePoint, single_point
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
-#: Degrees of freedom from which residuals scale the standard deviation of an epoch.
-_LEAST_REDUNDANCY: Final = 2
+#: Ellipsoidal heights of receivers on land and in aircraft [m]: a position beyond them is wrong.
+_HEIGHTS_M: Final = (-500.0, 10_000.0)
+#: Heights for which the tropospheric model has values [m].
+_MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
+#: Root mean square of raw residuals, the atmosphere's delays among them, from which on gross errors are looked for [m].
+_QUIET_M: Final = 10.0
+
+
+class NoPosition(IntEnum):
+    """Reason why an epoch has no position."""
+
+    #: The epoch has a position.
+    NONE = 0
+    #: No pseudorange was observed.
+    NO_CODE = 1
+    #: The navigation files have no valid and healthy record of enough of the satellites.
+    NO_RECORD = 2
+    #: Fewer usable satellites than unknowns: three coordinates and one clock per constellation.
+    TOO_FEW_SATELLITES = 3
+    #: The ranges do not determine a position, or the iteration did not converge.
+    NO_CONVERGENCE = 4
+    #: The ranges contradict each other by more than 100 m, and no exclusion restores consistency.
+    INCONSISTENT = 5
+    #: The position is below -500 m or above 10 km.
+    IMPLAUSIBLE_HEIGHT = 6
+
+    @property
+    def text(self) -> str:
+        """Reason in words."""
+        return _TEXTS[self]
+
+
+_TEXTS: Final = {
+    NoPosition.NONE: "position",
+    NoPosition.NO_CODE: "no pseudorange observed",
+    NoPosition.NO_RECORD: "no valid and healthy navigation record of enough satellites",
+    NoPosition.TOO_FEW_SATELLITES: "too few usable satellites",
+    NoPosition.NO_CONVERGENCE: "satellite geometry without a solution",
+    NoPosition.INCONSISTENT: "ranges contradict each other by over 100 m",
+    NoPosition.IMPLAUSIBLE_HEIGHT: "height below -500 m or above 10 km",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +81,7 @@ class Located:
     #: where the residuals are; shape (T, 3).
     sigma_m: Floats
     n_used: Integers  #: Shape (T,).
+    no_position: Codes  #: `NoPosition` of each epoch, shape (T,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +95,7 @@ class UncorrectedRanges:
     elevation_deg: Floats
     azimuth_deg: Floats
     place_ecef_m: Floats  #: The approximate place; NaN where the codes give none; shape (T, 3).
+    no_position: Codes  #: `NoPosition` by the number of codes, records and satellites; shape (T,).
 
 
 def uncorrected_ranges(obs: Observations, received: Received, config: Config, book: ChannelBook) -> UncorrectedRanges:
@@ -61,16 +104,21 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
     satellite, columns = channels.satellite, channels.columns
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
     plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
-    usable = plausible & first_available(satellite, plausible)
+    observed = plausible & first_available(satellite, plausible)
     states = satellite_states(
         obs.time, satellite, channels.signal, code, received.navigation, max_age_s=config.max_ephemeris_age_s
     )
-    usable &= ~(states.no_record | states.too_old | states.unhealthy)
+    usable = observed & ~(states.no_record | states.too_old | states.unhealthy)
     clean = code + states.clock_m - states.group_delay_m
-    reason = np.where(usable, 0, 1)
-    raw = usable_ranges(states, clean, np.array(1.0 / ANCHOR_SIGMA_M**2), reason, channels.groups)
-    place = single_point(raw, _below(raw), limits=config.single_point).ecef_m
-    seen = SeenFrom.of(np.where(np.isnan(place), _below(raw), place), states.position_ecef_m)
+    raw = usable_ranges(states, clean, np.array(1.0 / ANCHOR_SIGMA_M**2), np.where(usable, 0, 1), channels.groups)
+    lacking = np.where(_solvable(raw), int(NoPosition.NONE), int(NoPosition.NO_RECORD))
+    enough = _solvable(replace(raw, weight=observed.astype(np.float64)))
+    lacking = np.where(enough, lacking, int(NoPosition.TOO_FEW_SATELLITES))
+    lacking = np.where(plausible.any(axis=1), lacking, int(NoPosition.NO_CODE))
+    place, gross, apart = _approximate_place(raw, config)
+    usable &= ~gross
+    near = _at_surface(np.where(np.isnan(place), _below(raw), place))
+    seen = SeenFrom.of(near, states.position_ecef_m)
     delays = model_delays(
         obs.time,
         seen,
@@ -83,8 +131,18 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)
     sigma = np.hypot(sigma, config.nominal.sigma_m(seen.elevation_deg))
     sigma = np.hypot(sigma, config.nominal.unusual_sigma_m(states.accuracy_m))
+    weight = 1.0 / sigma**2
+    # those below the mask help to find which ones are wrong
+    usable &= ~disagreeing(usable_ranges(states, clean, weight, np.where(usable, 0, 1), channels.groups), near)
     usable &= seen.elevation_deg >= config.elevation.mask_deg
-    ranges = usable_ranges(states, clean, 1.0 / sigma**2, np.where(usable, 0, 1), channels.groups)
+    ranges = usable_ranges(states, clean, weight, np.where(usable, 0, 1), channels.groups)
+    elsewhere = np.isfinite(place[:, 0]) & ~_plausible_height(place)
+    for failed, cause in (
+        (apart, NoPosition.INCONSISTENT),
+        (elsewhere, NoPosition.IMPLAUSIBLE_HEIGHT),
+        (~_solvable(ranges), NoPosition.TOO_FEW_SATELLITES),
+    ):
+        lacking = np.where(failed & (lacking == int(NoPosition.NONE)), int(cause), lacking)
     return UncorrectedRanges(
         channels=channels,
         ranges=ranges,
@@ -92,7 +150,49 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
         elevation_deg=seen.elevation_deg,
         azimuth_deg=seen.azimuth_deg,
         place_ecef_m=place,
+        no_position=lacking.astype(np.int8),
     )
+
+
+def _solvable(ranges: Ranges) -> Masks:
+    """Return the epochs with at least as many satellites as unknowns, shape (T,)."""
+    return np.asarray(ranges.n_used - ranges.n_clocks >= 3)
+
+
+def _approximate_place(raw: Ranges, config: Config) -> tuple[Floats, Masks, Masks]:
+    """Return positions from raw ranges, NaN without, shape (T, 3); grossly wrong ranges, (T, M); epochs whose other
+    ranges contradict each other, (T,).
+    """
+    start = _below(raw)
+    point = single_point(raw, start, limits=config.single_point)
+    place, gross, rms = point.ecef_m.copy(), np.zeros(raw.weight.shape, dtype=np.bool_), _rms_m(raw, point)
+    suspect = np.flatnonzero(~(rms < _QUIET_M) | ~_plausible_height(place))
+    if len(suspect):
+        part = raw.take(suspect)
+        gross[suspect] = gross_in_space(part, start[suspect])
+        part = without(part, gross[suspect])
+        again = single_point(part, start[suspect], limits=config.single_point)
+        place[suspect], rms[suspect] = again.ecef_m, _rms_m(part, again)
+    return place, gross, rms > GROSS_M
+
+
+def _rms_m(ranges: Ranges, point: SinglePoint) -> Floats:
+    """Return the root mean square of the residuals by degrees of freedom, shape (T,) [m]; 0 without any."""
+    freedom = ranges.n_used - ranges.n_clocks - 3
+    square = np.where(ranges.weight > 0, point.residual_m, 0.0) ** 2
+    return np.asarray(np.where(freedom >= 1, np.sqrt(square.sum(axis=1) / np.maximum(freedom, 1)), 0.0))
+
+
+def _plausible_height(ecef_m: Floats) -> Masks:
+    """Return the positions at heights where receivers are; false for NaN; shape (T,)."""
+    height = geodetic_from_ecef(ecef_m)[2]
+    return np.asarray((height >= _HEIGHTS_M[0]) & (height <= _HEIGHTS_M[1]))
+
+
+def _at_surface(ecef_m: Floats) -> Floats:
+    """Return positions moved up or down to heights where the model of the troposphere is valid, shape (T, 3) [m]."""
+    latitude, longitude, height = geodetic_from_ecef(ecef_m)
+    return ecef_from_geodetic(latitude, longitude, np.clip(height, *_MODELLED_HEIGHTS_M))
 
 
 def locate(obs: Observations, received: Received, config: Config, book: ChannelBook) -> Located:
@@ -105,18 +205,29 @@ def locate_ranges(time: Datetimes, seen: UncorrectedRanges, config: Config) -> L
     ranges = seen.ranges
     start = np.where(np.isnan(seen.place_ecef_m), _below(ranges), seen.place_ecef_m)
     fit = robust_fit(ranges, start, limits=config.robust_fit)
-    ranges = without(ranges, (ranges.weight > 0) & ~fit.kept)
+    rest = without(ranges, (ranges.weight > 0) & ~fit.kept)
+    checked = rest.n_used - rest.n_clocks > 3  # one range too many at least, or nothing shows which ones are wrong
+    ranges = without(ranges, (ranges.weight > 0) & ~fit.kept & checked[:, None])
     point = single_point(ranges, start, limits=config.single_point)
     freedom = ranges.n_used - ranges.n_clocks - 3
-    scale = np.where(freedom >= _LEAST_REDUNDANCY, point.wsse / np.maximum(freedom, 1), 1.0)
+    scale = np.where(freedom >= 1, point.wsse / np.maximum(freedom, 1), 1.0)
+    no_position = seen.no_position
+    for failed, reason in (
+        (np.isnan(point.ecef_m[:, 0]), NoPosition.NO_CONVERGENCE),
+        (_rms_m(ranges, point) > GROSS_M, NoPosition.INCONSISTENT),
+        (~_plausible_height(point.ecef_m), NoPosition.IMPLAUSIBLE_HEIGHT),
+    ):
+        no_position = np.where(failed & (no_position == 0), np.int8(reason), no_position)
+    ecef = np.where((no_position == 0)[:, None], point.ecef_m, np.nan)
     sigma = np.full((len(time), 3), np.nan)
-    known = np.flatnonzero(np.isfinite(point.ecef_m[:, 0]))
+    known = np.flatnonzero(no_position == 0)
     if len(known):
-        latitude, longitude, _ = geodetic_from_ecef(point.ecef_m[known[0]])
+        latitude, longitude, _ = geodetic_from_ecef(ecef[known[0]])
         axes = enu_axes(latitude, longitude)[[1, 0, 2]]
         variance = np.einsum("ai,tij,aj->ta", axes, point.covariance_m2, axes)
         sigma = np.sqrt(variance * np.maximum(scale, 1.0)[:, None])
-    return Located(time=time, ecef_m=point.ecef_m, sigma_m=sigma, n_used=ranges.n_used)
+        sigma[no_position != 0] = np.nan
+    return Located(time=time, ecef_m=ecef, sigma_m=sigma, n_used=ranges.n_used, no_position=no_position)
 
 
 def _below(ranges: Ranges) -> Floats:

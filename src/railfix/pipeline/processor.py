@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Masks, copy_with
+from railfix.core.epoch_rows import take_epochs
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
@@ -24,6 +25,8 @@ from railfix.pipeline.along_track import along_track, apply_spacing_verdict, wit
 from railfix.pipeline.antennas import (
     AntennaOrder,
     antenna_results,
+    apply_wheel_sign,
+    filter_inputs,
     filter_verdicts,
     judge_pairs,
     position_verdicts,
@@ -32,18 +35,20 @@ from railfix.pipeline.antennas import (
 )
 from railfix.pipeline.base_station import BaseStation, Stations, check_base
 from railfix.pipeline.carrier_stage import CarrierState, smooth_ranges, with_slips
-from railfix.pipeline.channels import ChannelBook, combine_frequencies, missing_notes
+from railfix.pipeline.channels import ChannelBook, missing_notes
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, collect_conditions, correct_ranges
-from railfix.pipeline.filter_result import AlongTrack, FilterState, single_epochs
-from railfix.pipeline.interference_stage import Interference, judge_interference, with_wheel
-from railfix.pipeline.level_stage import with_araim
+from railfix.pipeline.filter_result import AlongTrack, FilterState
+from railfix.pipeline.frequency_stage import combine_frequencies
+from railfix.pipeline.interference_stage import Interference, PositionEpochs, judge_interference, with_statuses
+from railfix.pipeline.level_stage import compute_araim
 from railfix.pipeline.received import Received, known_from_start, receive
-from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
+from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import LineFeatures
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.solution import Solution, solve
-from railfix.positioning.antenna_rows import AntennaRows, stack_observations, take_epochs
+from railfix.pipeline.state import AntennaState, State
+from railfix.positioning.antenna_rows import AntennaRows, stack_observations
 from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
@@ -60,8 +65,6 @@ from railfix.screens import (
 from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
-
-__all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "ScreenedChunk", "SolvedChunk", "State"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +175,7 @@ class EpochProcessor:
         )
         self._track, self.units, self.balises = track, stations.units, stations.balises
         self._features: dict[str, LineFeatures] = {}
-        self._before_filter, self._lacking = FilterState(), self._inactive_notes()
+        self._lacking = self._inactive_notes()
 
     @cached_property
     def _threads(self) -> ThreadPoolExecutor:
@@ -309,11 +312,17 @@ class EpochProcessor:
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         own_states = [state.antennas.get(name) or AntennaState() for name in names]
         corrected, solution, own_states = solve(screened.corrected, antennas, self.config, own_states)
-        solution, interference, signs = judge_interference(
-            corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
+        single = PositionEpochs(solution.point.ecef_m, solution.noise_scale, solution.ties)
+        interference, signs = judge_interference(
+            corrected, single, antennas, [own.interference for own in own_states], self.config.interference
         )
+        status = with_statuses(solution.status, [own.suspicion for own in interference if own is not None])
         own_states = [copy_with(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
-        solution = with_araim(corrected, solution, antennas, self._support, self.config)
+        araim = compute_araim(
+            corrected, solution.arc_m, solution.noise_scale, solution.place.constrained.section, antennas,
+            self._support, self.config,
+        )  # fmt: skip
+        solution = copy_with(solution, status=status, araim=araim)
         results = self._results(antennas, corrected, solution, interference, screened)
         solved = SolvedChunk(screened=screened, results=results, ranges=corrected, off_map=solution.off_map)
         return solved, copy_with(state, antennas={**state.antennas, **dict(zip(names, own_states, strict=True))})
@@ -340,7 +349,7 @@ class EpochProcessor:
                 tracked, own = apply_spacing_verdict(tracked, spacing.get(name), own, held_s)
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
-        result = Result(antennas=with_wheel(solved.results, fusion), notes=solved.screened.notes, fusion=fusion)
+        result = Result(antennas=apply_wheel_sign(solved.results, fusion), notes=solved.screened.notes, fusion=fusion)
         return result, copy_with(state, fusion=filter_states)
 
     def _screen_antennas(
@@ -398,8 +407,8 @@ class EpochProcessor:
             rows, sensors = solved.screened.rows[name], solved.screened.sensors
             return along_track(
                 take_epochs(solved.ranges, rows),
-                single_epochs(solved.results[name], solved.off_map[rows], self.config.map_offset),
-                self.trajectories[name], self.config, state.fusion.get(name) or self._before_filter,
+                filter_inputs(solved.results[name], solved.off_map[rows], self.config.map_offset),
+                self.trajectories[name], self.config, state.fusion.get(name) or FilterState(),
                 samples=sensors, references=self._line_references(name, sensors),
             )  # fmt: skip
 

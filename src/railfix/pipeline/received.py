@@ -12,6 +12,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.orbits.prepared_records import VALIDITY_S, validity_s
+from railfix.gnss.plausible_records import plausible_navigation
 from railfix.pipeline.config import Config
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR
 from railfix.ranges.base_station import BaseErrors
@@ -111,7 +112,8 @@ def receive(
         return before
     after = before
     if navigation is not None:
-        after = replace(before, navigation=_current(merge_navigation(before.navigation, navigation), time))
+        merged = merge_navigation(before.navigation, plausible_navigation(navigation))
+        after = replace(before, navigation=_current(merged, time))
     if messages is not None:
         state = before.messages
         if state is None:

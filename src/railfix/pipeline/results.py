@@ -1,107 +1,28 @@
-"""Results of the pipeline with every intermediate value, and the state carried from one chunk to the next."""
+"""Results of the pipeline with every intermediate value."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings, copy_with
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Strings
+from railfix.core.epoch_rows import OnDemand
 from railfix.core.reasons import Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.gnss.orbits import SatelliteStates
-from railfix.integrity.protection import ProtectionLevel
 from railfix.integrity.protection.araim import AraimResult
-from railfix.integrity.raim import Outcome
-from railfix.pipeline.base_station import BaseState
-from railfix.pipeline.carrier_stage import CarrierState
-from railfix.pipeline.filter_result import AlongTrack, FilterState, OffMapState
-from railfix.pipeline.interference_stage import Interference, InterferenceState
-from railfix.pipeline.received import Received
-from railfix.positioning.antenna_rows import OnDemand
+from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.interference_stage import Interference
+from railfix.pipeline.level_stage import ProtectionResult
+from railfix.pipeline.solve import RaimResult
 from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.map_offset import MapOffset, MapOffsetState
-from railfix.positioning.noise_scale import LastingErrorState, NoiseState, OffsetState
+from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import Constrained, SinglePoint
 from railfix.positioning.section_search import Section
-from railfix.positioning.two_frequencies import Combined, SecondCodes, TwoFrequencyState
+from railfix.positioning.two_frequencies import Combined, SecondCodes
 from railfix.screens import Screened
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Rows = TypeVar("Rows", bound="DataclassInstance")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RaimResult:
-    """Detection and exclusion of T epochs."""
-
-    outcome: Codes  #: `raim.Outcome`, shape (T,).
-    #: Before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
-    statistic: Floats
-    threshold: Floats
-    excluded: Masks  #: Shape (T, K).
-    own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
-    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN where
-    #: there is no position, where a fault is left in it, or where the level or RAIM is off; shape (T,).
-    protection_level_m: Floats
-
-    @property
-    def faulty(self) -> Masks:
-        """Epochs with a fault left in the position, shape (T,)."""
-        return np.asarray((self.outcome == int(Outcome.INSEPARABLE)) | (self.outcome == int(Outcome.UNRESOLVED)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProtectionResult:
-    """Protection levels of T epochs."""
-
-    #: NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
-    level: ProtectionLevel
-    status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
-    kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
-    basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
-
-
-@dataclass(frozen=True, kw_only=True)
-class AntennaState(NotebookTable):
-    """State of one antenna after a chunk."""
-
-    noise: NoiseState = field(default_factory=NoiseState)  #: Sums behind the noise scales.
-    map_offset: MapOffsetState = field(default_factory=MapOffsetState)  #: Sums behind the test of the map.
-    lasting: LastingErrorState = field(default_factory=LastingErrorState)  #: Means of the residuals of each satellite.
-    off_map: OffMapState = field(default_factory=OffMapState)  #: Whether the train was away from the line.
-    offsets: OffsetState = field(default_factory=OffsetState)  #: Inter-system biases estimated so far.
-    screens: Mapping[str, Any] = field(default_factory=dict)  #: State of each screen that has one, by its name.
-    carrier: CarrierState | None = None  #: State of the carrier-phase stages, where they are used.
-    #: Last epoch; NaT before the first.
-    ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    #: Mean differences of the two codes of satellites.
-    two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
-
-    interference: InterferenceState = field(default_factory=InterferenceState)
-
-    def __repr__(self) -> str:
-        screens = ", ".join(sorted(self.screens)) or "none"
-        return f"<AntennaState: screens with a state: {screens}>"
-
-
-@dataclass(frozen=True, kw_only=True)
-class State(NotebookTable):
-    """State after a chunk: everything that the next one needs."""
-
-    antennas: Mapping[str, AntennaState] = field(default_factory=dict)
-    #: Navigation records and SBAS messages so far; None: those that the processor was made with.
-    received: Received | None = None
-    base: BaseState | None = None  #: State of the base station.
-    fusion: Mapping[str, FilterState] = field(default_factory=dict)  #: State of the filter along the track, by antenna.
-
-    def __repr__(self) -> str:
-        antennas = ", ".join(self.antennas) or "before the first epoch"
-        return f"<State: {antennas}{'; with the filter' if self.fusion else ''}>"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,12 +146,3 @@ class Result(NotebookTable):
             if shown is not None
         ]
         return html_table(rows, caption=time_span_text(next(iter(self.antennas.values())).time)) + html_list(self.notes)
-
-
-def patch(result: Rows, epochs: Indices, part: Rows) -> Rows:
-    """Return a result with some epochs replaced, by index; every field has the epochs on axis 0."""
-    values = {}
-    for item in fields(result):
-        values[item.name] = array = np.array(getattr(result, item.name))
-        array[epochs] = getattr(part, item.name)
-    return copy_with(result, **values)

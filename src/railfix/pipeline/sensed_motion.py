@@ -59,7 +59,7 @@ class LineFeatures:
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
         """Return the features of a track for the body that carries an antenna."""
-        line = Trajectory.from_track(track)
+        line = Trajectory.from_antenna_path(track)
         series = line_series(line)
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])

@@ -9,19 +9,26 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
+from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.protection.araim import AraimResult
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
-from railfix.pipeline.filter_result import OffMapState, off_map_epochs
-from railfix.pipeline.level_stage import bounding_model, low_sides, protection_levels, unresolved_alternatives
-from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patch
+from railfix.pipeline.level_stage import (
+    ProtectionResult,
+    bounding_model,
+    low_sides,
+    protection_levels,
+    unresolved_alternatives,
+)
+from railfix.pipeline.off_map import OffMapState, off_map_epochs
 from railfix.pipeline.solve import (
     Place,
+    RaimResult,
     count_redundancy,
     fault_free,
     lasting_errors,
@@ -30,7 +37,8 @@ from railfix.pipeline.solve import (
     validate_point,
     with_p4_level,
 )
-from railfix.positioning.antenna_rows import AntennaRows, take_epochs
+from railfix.pipeline.state import AntennaState
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
@@ -106,7 +114,7 @@ class Solution:
     phase: PhasePositions | None
     protection: ProtectionResult | None
     map_offset: MapOffset
-    off_map: Masks  #: The train is away from the line: `railfix.pipeline.filter_result`; shape (T,).
+    off_map: Masks  #: The train is away from the line: `railfix.pipeline.off_map`; shape (T,).
     #: Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
     araim: AraimResult | None = None
 
@@ -236,7 +244,7 @@ def _tie(ranges: Ranges, ties: ClockTies, point: SinglePoint, anchor_ecef_m: Flo
     start = np.where(np.isnan(point.ecef_m), anchor_ecef_m, point.ecef_m)
     if len(rows) == len(ranges):
         return single_point(ranges, start, limits=config.single_point)
-    return patch(point, rows, single_point(ranges.take(rows), start[rows], limits=config.single_point))
+    return patch_rows(point, rows, single_point(ranges.take(rows), start[rows], limits=config.single_point))
 
 
 def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> tuple[Ranges, SinglePoint]:
@@ -249,7 +257,7 @@ def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config:
         return ranges, point
     agreeing = without(ranges, dropped)
     again = single_point(agreeing.take(changed), place[changed], limits=config.single_point)
-    return agreeing, patch(point, changed, again)
+    return agreeing, patch_rows(point, changed, again)
 
 
 def _fit_on_line(

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, copy_with, kernel_array
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, copy_with, kernel_array, patch_rows
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,
@@ -31,7 +31,6 @@ from railfix.integrity.raim import (
 from railfix.integrity.raim.model import model_on_line
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
-from railfix.pipeline.results import RaimResult, patch
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.noise_scale import LastingErrorState
 from railfix.positioning.normal_equations import (
@@ -44,6 +43,26 @@ from railfix.positioning.normal_equations import (
 )
 from railfix.positioning.section_search import SearchIndex, Section, search_lines
 from railfix.positioning.windows import Windows
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaimResult:
+    """Detection and exclusion of T epochs."""
+
+    outcome: Codes  #: `raim.Outcome`, shape (T,).
+    #: Before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
+    statistic: Floats
+    threshold: Floats
+    excluded: Masks  #: Shape (T, K).
+    own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
+    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN where
+    #: there is no position, where a fault is left in it, or where the level or RAIM is off; shape (T,).
+    protection_level_m: Floats
+
+    @property
+    def faulty(self) -> Masks:
+        """Epochs with a fault left in the position, shape (T,)."""
+        return np.asarray((self.outcome == int(Outcome.INSEPARABLE)) | (self.outcome == int(Outcome.UNRESOLVED)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,9 +94,9 @@ def solve_again(ranges: Ranges, index: SearchIndex, place: Place, epochs: Indice
     point = single_point(part, place.point.ecef_m[epochs], limits=config.single_point)
     solved = place_on_line(part, index, point, config)
     return Place(
-        point=patch(place.point, epochs, solved.point),
-        section=patch(place.section, epochs, solved.section),
-        constrained=patch(place.constrained, epochs, solved.constrained),
+        point=patch_rows(place.point, epochs, solved.point),
+        section=patch_rows(place.section, epochs, solved.section),
+        constrained=patch_rows(place.constrained, epochs, solved.constrained),
     )
 
 

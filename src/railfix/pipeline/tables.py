@@ -18,7 +18,7 @@ from railfix.core.reasons import Reason, reason_text
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.balises import VERDICTS, Passing
-from railfix.pipeline.filter_result import AlongTrack, SmoothedTrack
+from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.result_columns import (
     CHANNEL_COLUMNS,
     EPOCH,
@@ -35,6 +35,7 @@ from railfix.pipeline.result_columns import (
 )
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
+from railfix.pipeline.smoothing import SmoothedTrack
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind, TrackStatus
 

@@ -6,46 +6,22 @@ each antenna, and what they return is joined.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from functools import cache, cached_property, lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
+from railfix.core.epoch_rows import EVERY, join_epochs
 from railfix.gnss.observations import Observations, stack_parts
 from railfix.positioning.section_search import SearchIndex
 from railfix.track.trajectory import between_points
 
 Value = TypeVar("Value")
 State = TypeVar("State")
-#: Members that are the same for all rows: of the channels alone.
-_OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
-EVERY: Final = slice(None)  #: All rows.
-
-
-class OnDemand:
-    """Base of dataclasses with fields that are computed when they are first asked for: most are not, epoch by epoch."""
-
-    @classmethod
-    def create(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
-        """Return an instance with some fields; `later` returns another by its name, and those made with it."""
-        return cast(Value, _make(cls, {**members, "_later": later}))
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            own = self.__dict__
-            if "_later" not in own or name not in _members(self.__class__):
-                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            own.update(own["_later"](name))
-            return own[name]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return all fields, for another process."""
-        return {name: getattr(self, name) for name in _members(cast(Any, type(self)))}
 
 
 @dataclass(frozen=True)
@@ -175,72 +151,3 @@ def _has_same_channels(first: Observations, other: Observations) -> bool:
         and first.signal.tobytes() == other.signal.tobytes()
         and first.header.glonass_channel == other.header.glonass_channel
     )
-
-
-@cache
-def _members(kind: Any) -> dict[str, bool]:
-    """Return whether each member of a dataclass has rows, or may have; none for other types."""
-    return {f.name: f.name not in _OF_CHANNELS for f in fields(kind)} if is_dataclass(kind) else {}
-
-
-@cache
-def _defaults(kind: Any) -> tuple[str, ...]:
-    """Return the members of a dataclass that have a default."""
-    return tuple(name for name in _members(kind) if hasattr(kind, name))
-
-
-def join_epochs(values: Sequence[Value]) -> Value:
-    """Join arrays row after row, or those of dataclasses or of tuples; what is neither is that of the first."""
-    first: Any = values[0]
-    if len(values) == 1:
-        return values[0]
-    if type(first) is tuple:
-        return cast(Value, tuple(_join(column) for column in zip(*cast(Any, values), strict=True)))
-    return cast(Value, _join(values))
-
-
-def _join(values: Sequence[Any]) -> Any:
-    first = values[0]
-    if first.__class__ is np.ndarray:
-        return np.concatenate(values)
-    if not (has_rows := _members(first.__class__)):
-        return first
-    return _make(
-        type(first),
-        {n: _join([getattr(v, n) for v in values]) if rows else getattr(first, n) for n, rows in has_rows.items()},
-    )
-
-
-def take_epochs(value: Value, rows: slice | Indices) -> Value:
-    """Return some rows of an array, or of the arrays of a dataclass and of those within it."""
-    return value if rows is EVERY else cast(Value, _take_epochs(value, rows))
-
-
-def _take_epochs(value: Any, rows: slice | Indices) -> Any:
-    if value.__class__ is np.ndarray:
-        return value[rows]
-    if not (has_rows := _members(value.__class__)):
-        return value
-    own, members = value.__dict__, {}
-    if isinstance(value, OnDemand):
-        for name, item in own.items():
-            if item.__class__ is np.ndarray and has_rows[name]:
-                members[name] = item[rows]
-        for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field is to be taken
-            members[name] = _take_epochs(own[name], rows)
-        return value.create(
-            lambda n: {n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
-        )
-    for name, of_rows in has_rows.items():
-        item = own[name]
-        if of_rows and item is not None:
-            item = item[rows] if item.__class__ is np.ndarray else _take_epochs(item, rows)
-        members[name] = item
-    return _make(type(value), members)
-
-
-def _make(kind: Any, members: dict[str, Any]) -> Any:
-    """Return a dataclass with given members, which have been checked before."""
-    instance = object.__new__(kind)
-    instance.__dict__.update(members)
-    return instance

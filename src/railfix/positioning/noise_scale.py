@@ -25,8 +25,8 @@ from scipy.special import ndtri, stdtrit
 
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, kernel_array
+from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
-from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint
 from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory

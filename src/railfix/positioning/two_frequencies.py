@@ -20,8 +20,8 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
-from railfix.positioning.antenna_rows import EVERY
 from railfix.positioning.windows import correlated_sums
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.

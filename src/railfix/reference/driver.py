@@ -22,8 +22,8 @@ from railfix.core.files import BrokenLines
 from railfix.core.settings import Settings, option
 from railfix.gnss.observations import concatenate
 from railfix.io.logs import read_navigation
-from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
+from railfix.io.positions import read_positions
 from railfix.io.reference_log import read_acceleration, read_pulses, reference_table
 from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
 from railfix.ranges.corrected import DEFAULT_SIGNALS
@@ -230,7 +230,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
     """Read all files except those of the line."""
     day = None if options.date is None else np.datetime64(options.date, "D")
     logs: dict[str, PositionLog] = {
-        name: read_any_positions(path, broken_lines=options.broken_lines, date=day, columns=options.columns.names)
+        name: read_positions(path, broken_lines=options.broken_lines, date=day, columns=options.columns.names)
         for name, path in inputs.positions.items()
     }
     notes = [note for log in logs.values() for note in log.notes]

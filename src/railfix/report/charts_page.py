@@ -11,7 +11,7 @@ from functools import partial
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
@@ -29,10 +29,6 @@ from railfix.report.plots.network import network_plan
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
 from railfix.track.network_read import NetworkQuality
-
-if TYPE_CHECKING:
-    from railfix.report.figures import Group
-
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 #: Unknown value of an unsigned 16-bit number.
@@ -264,6 +260,16 @@ def render(template: str, title: str, **content: Any) -> str:
 
 def _resource(name: str) -> Markup:
     return Markup(files("railfix.report").joinpath("templates", name).read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """Charts under one heading, and reasons for missing ones; `start` is the origin of `Points.epoch_s`."""
+
+    title: str
+    charts: tuple[Chart | SkyEpochs, ...]
+    start: np.datetime64
+    absent: tuple[str, ...] = ()
 
 
 def figure(

@@ -133,7 +133,7 @@ def _nearest(times: Any, at: str) -> int:
 
 def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
     """Return the unit vectors along, across and above the line at the position, in ECEF, from the nearest section."""
-    line = Trajectory.from_track(read_track(folder.tracks))
+    line = Trajectory.from_antenna_path(read_track(folder.tracks))
     arc, _ = line.nearest(np.array([[single[name] for name in ("x_m", "y_m", "z_m")]]))
     along, across, _ = line.get_axes(line.segment_at(arc)[0])[0]
     return np.stack([along, across, np.cross(across, along)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,9 +17,9 @@ from railfix.evaluate.inputs import floats
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name, positions_diagram
 from railfix.evaluate.tables import level_tables, select_evaluation
 from railfix.pipeline.level_stage import prior_basis_text
-from railfix.report.charts_page import Absent, Block
+from railfix.report.charts_page import Absent, Block, Group
 from railfix.report.plots.campaign import processing_time
-from railfix.report.plots.chart import Chart, SkyEpochs, find_start
+from railfix.report.plots.chart import Chart, find_start
 from railfix.report.plots.errors import (
     error_over_chainage,
     error_over_time,
@@ -142,16 +142,6 @@ NO_OBSERVATIONS: Final = (
     "the screens."
 )
 NO_TIMES: Final = "run.json has no processing times, so there is no chart of them."
-
-
-@dataclass(frozen=True, kw_only=True)
-class Group:
-    """Charts under one heading, and reasons for missing ones; `start` is the origin of `Points.epoch_s`."""
-
-    title: str
-    charts: tuple[Chart | SkyEpochs, ...]
-    start: np.datetime64
-    absent: tuple[str, ...] = ()
 
 
 def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:

@@ -16,6 +16,7 @@ from railfix.evaluate.figures import PASSED
 from railfix.evaluate.inputs import floats
 from railfix.report.runs import ReportedRun, get_figures
 from railfix.run.record import level_basis
+from railfix.run.verdict import judge_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,49 +222,23 @@ def _describe_marked(compared: _Compared) -> list[str]:
 
 
 def _without_errors(run: ReportedRun, antenna: str) -> Headline:
-    facts: Mapping[str, Any] = (run.record.get("antennas") or {}).get(antenna) or {}
-    positions = run.get_positions(antenna)
-    observed = positions.filter("observed")
-    has = np.isfinite(floats(observed, "chainage_m"))
-    passed = has & observed["status"].is_in(PASSED).to_numpy()
-    sigma = floats(observed, "along_sigma_m")[has]
-    middle, wide = np.percentile(sigma, [50.0, 95.0]) if len(sigma) else (np.nan, np.nan)
-    level = floats(observed, "protection_level_m")
-    level = level[np.isfinite(level)]
-    rate = float(has.mean()) if len(has) else np.nan
-    train = run.get_train(antenna)
-    tracked = np.empty(0) if train is None else floats(train, "along_sigma_m")
-    placed = tracked[np.isfinite(tracked)]
-    shown, of_what = (rate, "of the epochs with satellite signals") if not len(tracked) else (
-        len(placed) / len(tracked), "of all epochs, those without satellites included,"
-    )  # fmt: skip
-    stated = float(np.percentile(placed, 95.0)) if len(placed) else float(wide)
-    verdict = "No epoch has a position on the line."
-    if np.isfinite(stated):
-        verdict = (
-            f"At {share(shown, 1)} {of_what} the train has a position on its line; railfix states a standard deviation "
-            f"of at most {number(stated, 1)} m for 95 % of these."
+    found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
+    if found is None or not found.leading.positions or found.leading.sigma_p95_m is None:
+        text = "No epoch has a position on the line."
+    else:
+        rate = share(found.leading.positions / found.leading.epochs, 1)
+        epochs = "epochs, including those without satellites," if found.filter else "epochs with observations"
+        text = (
+            f"The train has a position on its line in {rate} of {epochs}; the stated standard deviation is at most "
+            f"{number(found.leading.sigma_p95_m, 1)} m for 95 % of these."
         )
+    figures = () if found is None else tuple(
+        KeyFigure(name=name, value=single or value, filtered=value if single else "")
+        for name, value, single in found.figures()
+    )  # fmt: skip
     return Headline(
-        verdict=verdict,
-        figures=(
-            KeyFigure(
-                name="epochs with a position",
-                value=share(rate, 1),
-                filtered=f"{share(len(placed) / len(tracked), 1)} of all" if len(tracked) else "",
-            ),
-            KeyFigure(name="passed every check", value=share(float(passed.mean()) if len(passed) else np.nan, 1)),
-            KeyFigure(
-                name="stated sigma, median",
-                value=number(float(middle), 2, " m"),
-                filtered=number(float(np.median(placed)), 2, " m") if len(placed) else "",
-            ),
-            KeyFigure(
-                name=f"{level_basis(run.record)} level, median",
-                value=number(float(np.median(level)) if len(level) else np.nan, 1, " m"),
-            ),
-            KeyFigure(name="epochs", value=number(facts.get("epochs", len(positions)), 0)),
-        ),
-        compared="Without a reference (--reference) errors are not known.",
+        verdict=text,
+        figures=figures,
+        compared="Errors are not known without a reference (--reference).",
         remarks=(),
     )

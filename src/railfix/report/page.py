@@ -20,6 +20,7 @@ from railfix.report.charts_page import (
     Absent,
     Block,
     Folded,
+    Group,
     Notes,
     PagePart,
     ReportedCommand,
@@ -28,7 +29,7 @@ from railfix.report.charts_page import (
     read_background,
     render,
 )
-from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, overview, protection, run_group
+from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, antenna_groups, overview, protection, run_group
 from railfix.report.headline import headline
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS

@@ -17,7 +17,7 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io import read_any_positions
+from railfix.io import read_positions
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
@@ -310,7 +310,7 @@ def _track(path: Path) -> FileFinding:
 
 
 def _positions(path: Path) -> FileFinding:
-    log = read_any_positions(path)
+    log = read_positions(path)
     known = log.time[~np.isnat(log.time)]
     if not len(known):
         raise InputFileError(path, "its positions have no time")

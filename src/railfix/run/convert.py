@@ -188,11 +188,6 @@ def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
     }
 
 
-#: Inputs of a run by the table that gives them; of the two tables of the track the first that is there.
-_INPUTS: Final = {
-    "S_GNSS_SAT": "front", "S_DM_TRACKPOINT": "track", "S_DM_TRACK_SEGMENT_POSITION": "track", "S_IMU": "inertial",
-    "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "balise_list",
-}  # fmt: skip
 #: Columns of a table of sensors by those of the schema.
 _COLUMNS: Final[dict[str, dict[str, str]]] = {
     "S_IMU": {
@@ -201,26 +196,6 @@ _COLUMNS: Final[dict[str, dict[str, str]]] = {
     },
     "S_SPEEDOMETER": {"SPEED": "speed_mps"},
 }  # fmt: skip
-
-
-def find_inputs(folder: Path) -> dict[str, Any]:
-    """Return the inputs of a run that the tables in a folder give, by the names of `railfix.run.inputs.RunInputs`.
-
-    InputFileError: the folder has no S_GNSS_SAT, or no table of the track.
-    """
-    if not folder.is_dir():
-        raise InputFileError(folder, "--mate expects a folder with tables of EGNSS MATE")
-    tables = {name: path for path in sorted(folder.iterdir()) if (name := mate_table(path))}
-    given: dict[str, Any] = {}
-    for table, name in _INPUTS.items():
-        if table in tables and name not in given:
-            given[name] = (tables[table],) if name in ("front", "track") else tables[table]
-    for name, needed in (("front", "S_GNSS_SAT"), ("track", "S_DM_TRACK_SEGMENT_POSITION or S_DM_TRACKPOINT")):
-        if name not in given:
-            raise InputFileError(folder, f"has no table {needed} (.parquet or .csv) of EGNSS MATE; add it")
-    if not {"balises", "balise_list"} <= given.keys():  # one does not serve without the other
-        given = {name: path for name, path in given.items() if not name.startswith("balise")}
-    return given
 
 
 def sensor_table(path: Path, kind: str) -> pl.DataFrame:

@@ -7,7 +7,7 @@ import time as clock
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
@@ -21,7 +21,8 @@ from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
-from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk, State
+from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk
+from railfix.pipeline.state import State
 from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
@@ -32,6 +33,7 @@ from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges
 from railfix.run.sources import TRACK_FILE, Log, OpenedLine, align_logs, open_line, read_ahead, without_beside
 from railfix.run.tally import Replays, ResultRows, Tally, add_smoothed, shorten_notes
+from railfix.run.verdict import Verdict, judge_run
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
@@ -53,11 +55,14 @@ class RunSummary:
 
     tally: Tally
     record: Mapping[str, Any]  #: Content of ``run.json``.
-    notes: tuple[str, ...]
+    verdict: Verdict  #: What the terminal, the report and JSON state of the run.
     files: Mapping[str, Path]
     wall_s: float
-    #: Likely cause where no position is on the line, by antenna.
-    causes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the run, one sentence each."""
+        return self.verdict.notes
 
 
 def run_files(
@@ -123,11 +128,12 @@ def run_files(
             line=line.facts, navigation=navigation,
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
+        record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
-    return RunSummary(tally=tally, record=record, notes=notes, files=files, wall_s=wall, causes=causes)
+    return RunSummary(tally=tally, record=record, verdict=judge_run(record), files=files, wall_s=wall)
 
 
 def open_inputs(

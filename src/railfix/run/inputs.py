@@ -18,6 +18,7 @@ from railfix.core.settings import INPUTS, Settings, option
 from railfix.io.position_log import column_names
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
+from railfix.run.mate_folder import find_inputs
 from railfix.run.output import Overwrite
 from railfix.track.frames import MapMotion
 from railfix.track.route import MapReading
@@ -151,8 +152,6 @@ class RunInputs(InputFiles):
         """Return the inputs that a folder of tables gives, beside those that are given themselves."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
-        from railfix.run.convert import find_inputs
-
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
         return {**find_inputs(Path(values["mate"])), **given}
 

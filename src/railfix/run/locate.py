@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, join_rows, take_rows
+from railfix.core.arrays import Floats, join_rows
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, ending, write_whole
 from railfix.core.geodesy import geodetic_from_ecef
@@ -18,12 +19,12 @@ from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
-from railfix.io.nmea import read_any_positions
+from railfix.io.positions import read_positions
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import Located, locate, survey_run
+from railfix.pipeline.locate import Located, NoPosition, locate, survey_run
 from railfix.pipeline.received import Received, known_from_start
 from railfix.run.inputs import InputFiles, LogReading, input_option
 from railfix.run.sources import Log
@@ -56,15 +57,18 @@ def locate_files(
     """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single)."""
     inputs.check_files()
     date = (reading or LogReading()).instant
-    received = known_from_start(config, navigation=read_navigation(inputs.nav, date=date))
+    navigation = read_navigation(inputs.nav, date=date)
+    received = known_from_start(config, navigation=navigation)
     log = Log(paths=inputs.log, chunk_epochs=_CHUNK_EPOCHS, date=date)
     book = ChannelBook(config)
     parts = [locate(part, received, config, book) for part in log.parts()]
-    if not any(np.isfinite(part.ecef_m).any() for part in parts):
-        raise NoPositionError(
-            f"{inputs.log[0]}: no epoch has a position; are the navigation files of the day of the log?"
-        )
     located = join_rows(parts)
+    reasons = reasons_text(located)
+    if not np.isfinite(located.ecef_m).any():
+        if (located.no_position == int(NoPosition.NO_RECORD)).any():
+            reasons += "; are the navigation files of the day of the log?"
+        message = f"{inputs.log[0]}: no epoch has a position: {reasons}"
+        raise NoPositionError("; ".join([message, *navigation.notes]))
     write_whole(out, solution_text(located))
     known = np.isfinite(located.ecef_m[:, 0])
     north, east, up = np.median(located.sigma_m[known], axis=0).tolist()
@@ -72,23 +76,38 @@ def locate_files(
         epochs=len(known),
         positions=int(known.sum()),
         sigma_m=(north, east, up),
-        notes=(*received.notes, *log.problems),
-    )
+        notes=(
+            *navigation.notes, *received.notes, *log.problems,
+            *([f"epochs without a position: {reasons}"] if reasons else []),
+        ),
+    )  # fmt: skip
+
+
+def reasons_text(located: Located) -> str:
+    """Return how many epochs have no position for each reason; "" where every epoch has one."""
+    found = Counter(located.no_position.tolist())
+    return ", ".join(f"{count} {NoPosition(reason).text}" for reason, count in sorted(found.items()) if reason)
 
 
 def solution_text(located: Located) -> str:
-    """Return positions as RTKLIB's solution format (GPST, latitude, longitude, ellipsoidal height, sigmas)."""
+    """Return positions as RTKLIB's solution format (GPST, latitude, longitude, ellipsoidal height, sigmas).
+
+    An epoch without a position is a comment line with its time and the reason.
+    """
     lines = [
         "% program   : railfix locate",
         "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp,ns=# of satellites)",
         "%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  "
         "sdeu(m)  sdun(m) age(s)  ratio",
     ]
-    known = take_rows(located, np.isfinite(located.ecef_m[:, 0]))
-    stamps = np.datetime_as_string(known.time, unit="ms")
-    rows: Any = zip(stamps, *geodetic_from_ecef(known.ecef_m), known.n_used, known.sigma_m, strict=True)
-    for stamp, lat, lon, up, count, (north, east, vertical) in rows:
+    stamps = np.datetime_as_string(located.time, unit="ms")
+    columns = (located.n_used, located.no_position, located.sigma_m)
+    rows: Any = zip(stamps, *geodetic_from_ecef(located.ecef_m), *columns, strict=True)
+    for stamp, lat, lon, up, count, reason, (north, east, vertical) in rows:
         day, clock = str(stamp).replace("-", "/").split("T")
+        if reason:
+            lines.append(f"% {day} {clock} no position: {NoPosition(int(reason)).text}")
+            continue
         lines.append(
             f"{day} {clock} {lat:14.9f} {lon:14.9f} {up:10.4f} {5:3d} {count:3d} {north:8.4f} {east:8.4f} "
             f"{vertical:8.4f} {0.0:8.4f} {0.0:8.4f} {0.0:8.4f} {0.0:6.2f} {0.0:6.1f}"
@@ -216,7 +235,7 @@ def survey_files(
         try:
             if ending(path) in POSITION_ENDINGS:
                 of_file = columns if ending(path) == ".csv" else None
-                log = read_any_positions(path, broken_lines=broken_lines, date=date, columns=of_file)
+                log = read_positions(path, broken_lines=broken_lines, date=date, columns=of_file)
                 notes += log.notes
                 runs.append(run_of_log(log, limits))
                 continue

@@ -35,7 +35,7 @@ PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka",
 
 
 #: Figures of an antenna without rows.
-NO_FIGURES: Final = {"along_sigma_m": None, "protection_level": None, "filter": None}
+NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
 
 
 def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
@@ -47,6 +47,7 @@ def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[
     return {
         name: {
             "along_sigma_m": _along_sigma(_rows(folder, "positions", name)),
+            "chainage_m": _chainage(_rows(folder, "positions", name)),
             "protection_level": _level(_rows(folder, "positions", name), antenna) if antenna.level_status else None,
             "filter": _filter_figures(_rows(folder, "train", name))
             if config.filter == "track" and antenna.epochs
@@ -60,6 +61,11 @@ def _along_sigma(rows: pl.LazyFrame) -> dict[str, float] | None:
     sigma = pl.col("along_sigma_m")
     found = _figures(rows, {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()})
     return None if found["max_m"] is None else found
+
+
+def _chainage(rows: pl.LazyFrame) -> dict[str, Any]:
+    chainage = pl.col("chainage_m")
+    return _figures(rows, {"positions": chainage.count(), "first": chainage.min(), "last": chainage.max()})
 
 
 def _level(rows: pl.LazyFrame, antenna: AntennaTally) -> dict[str, Any]:
@@ -78,7 +84,12 @@ def _filter_figures(rows: pl.LazyFrame) -> dict[str, Any]:
     counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
     figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95), "finite": finite.len()}
     bound = _figures(rows, figures) if counts.pop("levels") else None
-    return {"status": counts, "along_sigma_m": _along_sigma(rows), "level": bound}
+    return {
+        "status": counts,
+        "along_sigma_m": _along_sigma(rows),
+        "chainage_m": _chainage(rows),
+        "level": bound,
+    }
 
 
 def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:

@@ -200,7 +200,7 @@ def _paths(
             raise SettingsError(
                 f"the chainage of {reading.reference} was asked for, which only a vehicle file can give; name one"
             )
-        return None, dict.fromkeys(antennas, Trajectory.from_track(track))
+        return None, dict.fromkeys(antennas, Trajectory.from_antenna_path(track))
     body = read_vehicle(vehicle)
     of_track = track_key(track)
     paths: dict[str, Trajectory] = {}

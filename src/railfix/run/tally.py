@@ -17,9 +17,9 @@ from railfix.integrity.interference import CAUSES
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antennas import AntennaOrder
 from railfix.pipeline.balises import balise_notes
-from railfix.pipeline.filter_result import Replay, smooth
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, Result
+from railfix.pipeline.smoothing import Replay, smooth
 from railfix.pipeline.tables import (
     antenna_positions,
     antenna_train,

@@ -2,7 +2,7 @@
 
 from .alignment import Alignment, build_alignment
 from .constellation import simulate_navigation
-from .demonstration import DEMO_FILES, demo_files, demo_folder
+from .demonstration import DEMO_FILES, demo, demo_files, demo_folder
 from .environment.settings import Disturbance, Disturbances, SightGeometry
 from .line_file import Element, GeneratedLine, Gradient, LineFile, LineSettings, MapError, Terrain
 from .motion import AntennaTruth, Motion, antenna_truth, build_motion, run_curve, shuttle
@@ -53,6 +53,7 @@ __all__ = [
     "antenna_truth",
     "build_alignment",
     "build_motion",
+    "demo",
     "demo_files",
     "demo_folder",
     "list_scenarios",

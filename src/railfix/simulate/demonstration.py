@@ -6,7 +6,10 @@ from pathlib import Path
 from typing import Final
 
 from railfix.core.errors import InputFileError
+from railfix.io import read_navigation, read_observations
+from railfix.pipeline import Config, EpochProcessor, Result
 from railfix.run import RunInputs
+from railfix.track import antenna_trajectory, read_track, read_vehicle
 
 #: Files of the demonstration run by what they are, as `railfix.simulate.write_run` names them.
 DEMO_FILES: Final = {
@@ -57,3 +60,16 @@ def demo_inputs() -> RunInputs:
 def demo_truth() -> Path:
     """File of the reference trajectory of the demonstration run, for `railfix.evaluate`; InputFileError without."""
     return demo_files()["truth"]
+
+
+def demo() -> Result:
+    """Positions of the demonstration run, both antennas: the filter along the track and each epoch by itself.
+
+    A notebook shows the result as a table; `railfix.train_table` and `railfix.positions_table` return its rows.
+    """
+    files = demo_files()
+    track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
+    trajectories = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
+    processor = EpochProcessor(Config(), trajectories, navigation=read_navigation(files["nav"]))
+    result, _ = processor.process({name: read_observations(files[name]) for name in trajectories})
+    return result

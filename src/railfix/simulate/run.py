@@ -289,7 +289,7 @@ def vehicle_table(vehicle: VehicleSettings) -> dict[str, Any]:
     antennas = {
         name: dict(zip(("along_m", "across_m", "up_m"), getattr(vehicle, name), strict=True)) for name in ANTENNAS
     }
-    known = {name: getattr(vehicle, name) for name in ("name", "bogie_distance_m", "gauge_m")}
+    known = {name: getattr(vehicle, name) for name in ("name", "bogie_distance_m", "gauge_m", "length_m")}
     return {**known, "facing": "rising", "antennas": antennas}
 
 

@@ -15,8 +15,8 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import NamedColumns, read_named_columns
-from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
+from railfix.io.positions import read_positions
 from railfix.track.frames import GEOIDS, ellipsoidal_heights, own_height_datum
 from railfix.track.from_positions import SIGMA_OF_QUALITY
 from railfix.track.track import SIGMA_HEIGHT_M, Track
@@ -76,7 +76,7 @@ def with_heights(
         by_place = {"chainage_m", "kilometrage_m"} & set(table.cells)
         if by_place and not {"latitude_deg", "x_m"} & set(table.cells):
             return _from_profile(track, table, geoid, sigma_m)
-    return _from_positions(track, read_any_positions(source), sigma_m, reach_m=_REACH_M)
+    return _from_positions(track, read_positions(source), sigma_m, reach_m=_REACH_M)
 
 
 def _dense(track: Track) -> Track:

@@ -10,12 +10,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, RowArrays, take_rows
-from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import FilePath, ending
+from railfix.core.errors import MismatchError
+from railfix.core.files import BrokenLines, FilePath
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.io.named_columns import read_named_columns
-from railfix.io.nmea import read_any_positions
-from railfix.io.position_log import CSV_COLUMNS, positions_times, rename_columns
+from railfix.io.positions import read_positions
 from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
 from railfix.track.network import Candidates, Network
@@ -56,6 +54,7 @@ class PlanLog(RowArrays):
     sigma_m: Floats
     height_m: Floats | None = None
     sigma_up_m: Floats | None = None
+    notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """Return the positions, in the frame of the satellites, in that of the network; else MismatchError."""
@@ -67,11 +66,12 @@ class PlanLog(RowArrays):
                 "frame of the map (--same-frame)"
             )
         time = np.sort(times)[len(times) // 2] if len(times) else np.datetime64("now", "ns")
-        height = np.zeros(len(self.latitude_deg)) if self.height_m is None else self.height_m
+        known = np.zeros(len(self.latitude_deg)) if self.height_m is None else self.height_m
+        height = np.nan_to_num(known)
         ecef = ecef_from_geodetic(self.latitude_deg, self.longitude_deg, height)
         moved, shift = in_map_frame(ecef, network.frame, time, named=network.named, **motion)
         latitude, longitude, up = geodetic_from_ecef(moved)
-        height_m = None if self.height_m is None else up
+        height_m = None if self.height_m is None else np.where(np.isfinite(self.height_m), up, np.nan)
         return replace(self, latitude_deg=latitude, longitude_deg=longitude, height_m=height_m), shift
 
 
@@ -112,22 +112,22 @@ class Matched:
         return replace(take_rows(self, rows), candidates=self.candidates.take(rows))
 
 
-def read_plan_positions(path: FilePath, *, columns: Mapping[str, str] | None = None) -> PlanLog:
-    """Read positions in plan: any log of positions, or a CSV (`columns` renamed) without heights."""
-    if ending(path) == ".csv":
-        table = rename_columns(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
-        if "latitude_deg" in table and "longitude_deg" in table:
-            return PlanLog(
-                path=str(path),
-                time=positions_times(table),
-                latitude_deg=table.numbers("latitude_deg", blank=np.nan),
-                longitude_deg=table.numbers("longitude_deg", blank=np.nan),
-                sigma_m=np.full(len(table), np.nan),
-            )
-    elif columns:
-        raise InputFileError(path, "columns can be renamed in a .csv file only")
-    log = read_any_positions(path)
-    return plan_log(str(path), log.time, log.ecef_m, log.sigma_m)
+def read_plan_positions(
+    path: FilePath, *, columns: Mapping[str, str] | None = None, broken_lines: BrokenLines = "stop"
+) -> PlanLog:
+    """Read positions in plan from any log of positions (`railfix.io.read_positions`), with its heights and sigmas."""
+    log = read_positions(path, broken_lines=broken_lines, columns=columns, heights="optional")
+    latitude, longitude, height = log.geodetic
+    return PlanLog(
+        path=str(path),
+        time=log.time,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.sqrt((log.sigma_m[:, :2] ** 2).mean(axis=1)),
+        height_m=height if np.isfinite(height).any() else None,
+        sigma_up_m=log.sigma_m[:, 2],
+        notes=log.notes,
+    )
 
 
 def plan_log(path: str, time: Datetimes, ecef_m: Floats, sigma_m: Floats) -> PlanLog:

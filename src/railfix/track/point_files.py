@@ -15,7 +15,7 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, read_text, write_whole
 from railfix.core.settings import misspelt
 from railfix.core.tables import plural
-from railfix.io.named_columns import NamedColumns, read_named_columns
+from railfix.io.named_columns import NamedColumns, read_named_columns, with_usual_names
 from railfix.track.crs import choose_crs, find_crs, frame_degrees, unit_of_heights
 from railfix.track.frames import HEIGHT_DATUMS, check_height_datum, ellipsoidal_heights, own_height_datum
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment, make_segment
@@ -284,7 +284,7 @@ def attributes(read: Callable[[str, float], Floats | None]) -> dict[str, Floats]
 def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
     """Read a CSV track map as one segment of a route; its CRS is geographic."""
     check_height_datum(reading.height_datum)
-    table = read_named_columns(path)
+    table = _with_map_names(read_named_columns(path), reading.height_datum)
     notes = _check_columns(table)
     if "note" in table.metadata:
         notes += tuple(table.metadata["note"].split("; "))
@@ -322,6 +322,23 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
         notes=notes,
         attributes=attributes(lambda column, blank: table.numbers(column, blank=blank) if column in table else None),
     )
+
+
+def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColumns:
+    """Return the table with usual spellings of its columns under the names of railfix; the datum names the height."""
+    places = with_usual_names(table, ("latitude_deg", "longitude_deg"))
+    named = with_usual_names(places, ("height_m",))
+    theirs = named.usual.get("height_m")
+    if theirs is None or "elevation_m" in places:
+        return places
+    if height_datum is None:
+        raise table.header_error(
+            f"the column {theirs!r} does not say above what its heights are; give --height-datum ellipsoidal or "
+            "orthometric, or name it height_m (ellipsoidal) or elevation_m (orthometric)"
+        )
+    cells = {("elevation_m" if height_datum == "orthometric" and name == "height_m" else name): column
+             for name, column in named.cells.items()}  # fmt: skip
+    return replace(named, cells=cells)
 
 
 def _check_columns(table: NamedColumns) -> tuple[str, ...]:

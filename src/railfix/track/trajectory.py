@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, places_in_groups, read_only
+from railfix.core.errors import RailfixWarning
 from railfix.core.geodesy import axes_at
 from railfix.core.tables import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
@@ -139,6 +141,10 @@ class Trajectory(FrozenArrays, NotebookTable):
     #: positions of two antennas of one vehicle. None without a vehicle; shape (V,).
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
+    antenna_ahead_m: float = 0.0  #: Antenna ahead of the middle between the bogies, toward the vehicle's front.
+    #: Front end of the vehicle ahead of the middle between its bogies, and its rear end behind it; None where unknown.
+    front_end_m: float | None = None
+    rear_end_m: float | None = None
     #: Distance of the contact points of the wheels of an axle, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
     sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviations of the map, included in the solution.
@@ -165,7 +171,17 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @classmethod
     def from_track(cls, track: Track) -> Trajectory:
-        """Create a trajectory that uses the track as the antenna's path; `notes` records it."""
+        """Create a trajectory that takes the track for the antenna's path, with a `RailfixWarning`.
+
+        The antenna of a train is above the track and swings out in curves: `antenna_trajectory` computes its path from
+        the vehicle file. `from_antenna_path` is for a map that is the antenna's own path.
+        """
+        warnings.warn(f"{TRACK_AS_PATH}; railfix.antenna_trajectory uses one", RailfixWarning, stacklevel=2)
+        return cls.from_antenna_path(track)
+
+    @classmethod
+    def from_antenna_path(cls, track: Track) -> Trajectory:
+        """Create a trajectory from a map of the antenna's own path, as of a survey; `notes` records it."""
         return cls(
             name=track.name, ecef_m=track.ecef_m, chainage_m=track.chainage_m, kilometrage_m=track.kilometrage_m,
             cant_m=track.cant_m, roll_deg=read_only(np.zeros(len(track))), sigma_plan_m=track.sigma_plan_m,

@@ -7,10 +7,10 @@ Axes: origin midway between the bogie centres at the height of the rail tops; ``
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
@@ -50,12 +50,33 @@ class Vehicle(Settings):
     #: Track gauge; cant is measured over the gauge plus `RAIL_HEAD_M`.
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the chainage.
+    #: Length over the ends (buffers or couplers); None where unknown.
+    length_m: float | None = Field(default=None, gt=0.0, le=1000.0)
+    #: Front end ahead of the middle between the bogies; None: half of `length_m`.
+    front_end_m: float | None = Field(default=None, ge=0.0, le=1000.0)
     antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)  #: Offsets by name.
 
     @property
     def contact_spacing_m(self) -> float:
         """Distance between the contact points of the two wheels of an axle [m]."""
         return self.gauge_m + RAIL_HEAD_M
+
+    @property
+    def ends_m(self) -> tuple[float | None, float | None]:
+        """Distances of the front end ahead of the middle between the bogies, and of the rear end behind it [m].
+
+        None where they are unknown.
+        """
+        if self.length_m is None:
+            return self.front_end_m, None
+        front = self.length_m / 2.0 if self.front_end_m is None else self.front_end_m
+        return front, self.length_m - front
+
+    @model_validator(mode="after")
+    def _front_end_on_vehicle(self) -> Self:
+        if self.length_m is not None and self.front_end_m is not None and self.front_end_m > self.length_m:
+            raise ValueError("front_end_m is at most length_m: both ends are not on the same side of the bogies")
+        return self
 
 
 def read_vehicle(path: FilePath) -> Vehicle:
@@ -337,6 +358,9 @@ def antenna_trajectory(
         reference=reference,
         body_chainage_m=middle,
         facing=vehicle.facing,
+        antenna_ahead_m=offset.along_m,
+        front_end_m=vehicle.ends_m[0],
+        rear_end_m=vehicle.ends_m[1],
         contact_m=vehicle.contact_spacing_m,
         sigma_plan_m=track.sigma_plan_m,
         sigma_height_m=track.sigma_height_m,

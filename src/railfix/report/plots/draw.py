@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from inspect import signature
+from inspect import Parameter, signature
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, cast
@@ -38,26 +38,35 @@ _MARKERS: Final = {"dot": "o", "square": "s", "cross": "x", "ring": "o"}
 _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
 
 
-def plotter(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
-    """Return a function that draws the charts of another function as figures, with its parameters."""
+def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
+    """Return a function that draws the charts of another function, with its parameters and `ax`."""
 
     @wraps(chart_of)
-    def draw(*args: P.args, **kwargs: P.kwargs) -> Figure:
-        return draw_figure(chart_of(*args, **kwargs))
+    def draw(*args: Any, ax: Axes | None = None, **kwargs: Any) -> Axes:
+        return draw_chart(chart_of(*args, **kwargs), ax)
 
     draw.__name__ = draw.__qualname__ = f"plot_{chart_of.__name__}"
-    draw.__annotations__ = {**chart_of.__annotations__, "return": "Figure"}
-    del draw.__wrapped__
-    draw.__signature__ = signature(chart_of).replace(return_annotation="Figure")  # type: ignore[attr-defined]
+    draw.__annotations__ = {**chart_of.__annotations__, "ax": "Axes | None", "return": "Axes"}
+    draw.__doc__ = (
+        f"{chart_of.__doc__}\n\n    Drawn into the axes `ax`, or into a new figure; the axes are returned.\n    "
+    )
+    del draw.__wrapped__  # type: ignore[attr-defined]
+    own = signature(chart_of)
+    ax = Parameter("ax", Parameter.KEYWORD_ONLY, default=None, annotation="Axes | None")
+    draw.__signature__ = own.replace(parameters=[*own.parameters.values(), ax], return_annotation="Axes")  # type: ignore[attr-defined]
     return draw
 
 
+def _size(chart: Chart) -> tuple[float, float]:
+    """Return the width and height of the figure of a chart [inch]."""
+    return (10.0, 7.0) if chart.equal else (10.0 if chart.width == "wide" else 6.0, 4.2)
+
+
 def draw_figure(chart: Chart) -> Figure:
-    """Return a chart as a matplotlib figure: ``figure.savefig("error.png")`` writes it, a notebook shows it."""
+    """Return a chart as a figure of its own, outside matplotlib.pyplot; ``figure.savefig("error.png")`` writes it."""
     from matplotlib.figure import Figure
 
-    size = (10.0, 7.0) if chart.equal else (10.0 if chart.width == "wide" else 6.0, 4.2)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=_size(chart), layout="constrained")
     draw_chart(chart, figure.subplots())
     return figure
 
@@ -69,8 +78,9 @@ def save_figure(figure: Figure, path: str | PathLike[str]) -> Path:
     return Path(path)
 
 
-def draw_chart(chart: Chart, axes: Axes) -> Axes:
-    """Draw a chart into matplotlib axes, which are returned."""
+def draw_chart(chart: Chart, ax: Axes | None = None) -> Axes:
+    """Draw a chart into matplotlib axes, or into a new figure of matplotlib.pyplot; the axes are returned."""
+    axes = new_axes(_size(chart)) if ax is None else ax
     for layer in chart.layers:
         _draw(layer, axes, chart)
     axes.set_title(chart.title, fontsize="medium")
@@ -84,13 +94,21 @@ def draw_chart(chart: Chart, axes: Axes) -> Axes:
     return axes
 
 
-def draw_sky(sky: SkyEpochs, time: np.datetime64) -> Axes:
-    """Draw the satellites at the epoch nearest to a GPS time; ValueError: there is no epoch."""
-    from matplotlib.figure import Figure
+def new_axes(size: tuple[float, float], **axes: Any) -> Axes:
+    """Return axes of a new figure of matplotlib.pyplot, which a notebook shows; `size` in inches."""
+    from matplotlib import pyplot
 
+    _, made = pyplot.subplots(figsize=size, layout="constrained", subplot_kw=axes)
+    return cast("Axes", made)
+
+
+def draw_sky(sky: SkyEpochs, time: np.datetime64, *, ax: Axes | None = None) -> Axes:
+    """Draw the satellites at the epoch nearest to a GPS time into polar axes; ValueError: there is no epoch."""
     if sky.empty:
         raise ValueError("there are no satellites to draw")
-    polar: Any = Figure(figsize=(6, 6), layout="constrained").subplots(subplot_kw={"projection": "polar"})
+    polar: Any = new_axes((6.0, 6.0), projection="polar") if ax is None else ax
+    if polar.name != "polar":
+        raise ValueError("the sky needs polar axes; make them with subplot_kw={'projection': 'polar'}")
     k = int(np.argmin(np.abs(sky.start + timedelta(sky.epoch_s) - time)))
     rows = slice(int(sky.first[k]), int(sky.first[k + 1]))
     polar.set_theta_zero_location("N")

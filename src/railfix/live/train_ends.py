@@ -1,0 +1,169 @@
+"""One reference point of a train: reduction of its antennas to it, its two ends, and the end that runs ahead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import SettingsError
+from railfix.live.settings import LiveSettings
+from railfix.track.trajectory import Trajectory
+
+#: Distance against the end that runs ahead after which the train has changed ends: further than it rolls back [m].
+CHANGED_ENDS_M: Final = 50.0
+
+
+class Ends(NamedTuple):
+    """Ends of a train along the line, from its reference point in the running direction [m]; NaN where unknown.
+
+    Without a running direction they are on either side.
+    """
+
+    front_m: float  #: Middle of the possible places of the front end.
+    spread_m: float  #: Largest distance of the front end from it.
+    foremost_m: float  #: No part of the train is further ahead.
+    rearmost_m: float  #: No part of the train is further behind.
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainFrame:
+    """Reference point of a train, and its ends.
+
+    The reference point is the middle between the bogies of the vehicle that carries the antennas. Without a vehicle
+    file it is the first antenna itself; the position of another antenna says nothing of it then.
+    """
+
+    trajectories: Mapping[str, Trajectory]
+    facing: int  #: Direction of the vehicle's front along the line, 0 where unknown.
+    running: int  #: Direction in which the end that runs ahead looks at the start, 0 where unknown.
+    #: Front end of the train ahead of the reference point, its rear end behind it, and its length [m]; NaN where
+    #: unknown.
+    front_m: float
+    rear_m: float
+    length_m: float
+
+    @classmethod
+    def of(cls, trajectories: Mapping[str, Trajectory], settings: LiveSettings) -> Self:
+        """Return the frame of a train by its vehicle file and the settings, which outrank it.
+
+        SettingsError: the train is shorter than its front end is ahead of the reference point.
+        """
+        first = next(iter(trajectories.values()))
+        on_vehicle = first.body_chainage_m is not None
+        running = settings.facing
+        facing = int(first.front_sign) if on_vehicle else running or 0
+        front = first.front_end_m
+        if settings.front_offset_m is not None:
+            front = settings.front_offset_m + first.antenna_ahead_m
+        length = settings.length_m
+        if length is None and first.front_end_m is not None and first.rear_end_m is not None:
+            length = first.front_end_m + first.rear_end_m
+        rear = None if length is None or front is None else length - front
+        if rear is not None and rear < 0.0:
+            raise SettingsError(
+                f"--live length_m={length:g}: the train's front end is {front:.2f} m ahead of its reference "
+                "point (front_offset_m, or the vehicle file), further than the train is long; correct one of them"
+            )
+        return cls(
+            trajectories=trajectories,
+            facing=facing,
+            running=facing if running is None else running,
+            front_m=math.nan if front is None else front,
+            rear_m=math.nan if rear is None else rear,
+            length_m=math.nan if length is None else length,
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what is not known of the train, and what to give."""
+        notes = []
+        if not self.running:
+            notes.append("the direction in which the train's front end looks is unknown until it has run 50 m: give a "
+                         "vehicle file, or --live facing")  # fmt: skip
+        if not math.isfinite(self.front_m):
+            notes.append("where the train's front end is is unknown, messages have the place of the antenna or its "
+                         "vehicle: give length_m in the vehicle file, or --live front_offset_m")  # fmt: skip
+        if not math.isfinite(self.length_m):
+            notes.append("the train's length is unknown, messages have no safe rear end: give length_m in the vehicle "
+                         "file, or --live length_m")  # fmt: skip
+        if len(self.trajectories) > 1 and self.trajectories[self.first].body_chainage_m is None:
+            notes.append("there is no vehicle file: messages have places of the first antenna alone")
+        return tuple(notes)
+
+    def reference_m(self, name: str, arc_m: float) -> float:
+        """Return the chainage of the reference point for a place of an antenna [m]; NaN where it is not known."""
+        trajectory = self.trajectories[name]
+        if trajectory.body_chainage_m is not None:
+            return float(trajectory.body_at(arc_m))
+        return float(trajectory.chainage_at(arc_m)) if name == self.first else math.nan
+
+    @property
+    def first(self) -> str:
+        """Name of the first antenna."""
+        return next(iter(self.trajectories))
+
+    def first_antenna_ecef_m(self, name: str, arc_m: float) -> Floats:
+        """Return the place of the first antenna for a place of any antenna, shape (3,) [m]; NaN where unknown."""
+        first, trajectory = self.trajectories[self.first], self.trajectories[name]
+        if name != self.first:
+            arc_m = float(first.arc_of_body(trajectory.body_at(arc_m)))
+        return first.at_arc(np.float64(arc_m))
+
+    def ends(self, running: int) -> Ends:
+        """Return the ends where the train runs in a direction, 0 where unknown: then each end may be on either side."""
+        front, rear = self.front_m, self.rear_m
+        if running and self.facing:
+            front, rear = (front, rear) if running == self.facing else (rear, front)
+            return Ends(front, 0.0, front, rear)
+        longest, shortest = max(front, rear), min(front, rear)
+        if not math.isfinite(front + rear):
+            longest = shortest = math.nan
+        if running:  # which end of the vehicle is ahead is not known
+            return Ends((longest + shortest) / 2.0, (longest - shortest) / 2.0, longest, longest)
+        return Ends(0.0 if math.isfinite(longest) else math.nan, longest, longest, longest)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunningEnd:
+    """Direction in which the end of the train that runs ahead looks, from the vehicle file and from motion.
+
+    The train has changed ends, or runs with an end ahead that was not known before, once its reference point lies
+    `CHANGED_ENDS_M` and both bounds beyond the furthest place in the other direction, while it moves that way.
+    """
+
+    direction: int  #: 1 toward rising chainage, -1 toward falling, 0 where unknown.
+    #: Chainage of the reference point since the last change: the lowest at most, the highest at least, by the bounds;
+    #: infinite before the first place.
+    low_m: float = math.inf
+    high_m: float = -math.inf
+    last_m: float = math.inf  #: Last chainage; infinite before the first.
+
+    def after(self, reference_m: float, bound_m: float, moving: int) -> RunningEnd:
+        """Return the direction after an epoch with a place and its bound; `moving` is the direction of its speed."""
+        if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
+            return self
+        low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
+        if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:  # a gap, or once round a closed line
+            low, high = reference_m + bound_m, reference_m - bound_m
+        direction = self.direction
+        if moving > 0 and direction != 1 and reference_m - bound_m - low > CHANGED_ENDS_M:
+            direction = 1
+        if moving < 0 and direction != -1 and high - reference_m - bound_m > CHANGED_ENDS_M:
+            direction = -1
+        if direction != self.direction:
+            low, high = reference_m + bound_m, reference_m - bound_m
+        return replace(self, direction=direction, low_m=low, high_m=high, last_m=reference_m)
+
+    def sentence(self, before: RunningEnd) -> str | None:
+        """Return a sentence for the log where the direction is another one than before."""
+        if self.direction == before.direction:
+            return None
+        side = "rising" if self.direction > 0 else "falling"
+        if not before.direction:
+            return f"the train runs toward {side} chainage: its front end is taken to look there"
+        return f"the train has changed ends: it has run {CHANGED_ENDS_M:g} m toward {side} chainage"

@@ -1,0 +1,84 @@
+"""Codes after an outage: they count again once single epochs agree with the place that the sensors carried."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.timescale import seconds
+from railfix.pipeline.sensor_epochs import SensorLimits
+from railfix.tracking import Line
+
+#: Without codes for so long the place is that of the sensors [s].
+_OUTAGE_S: Final = 2.0
+#: Positions that must agree before codes count again.
+_AGREEING: Final = 3
+#: Standard deviation of a distance by the sensors since the beginning of a stretch, as a share.
+_DISTANCE_SHARE: Final = 0.01
+#: Least standard deviation of a single epoch at the end of a tunnel [m]: multipath of the portal.
+_LEAST_SIGMA_M: Final = 2.0
+_NEVER: Final = np.datetime64("NaT", "ns")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReturnState:
+    """What one chunk leaves to the next."""
+
+    time: np.datetime64 = _NEVER  #: Last epoch whose codes counted; NaT before the first.
+    #: Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a distance.
+    place_m: float = float("nan")
+    sigma_m: float = float("nan")
+    distance_m: float = 0.0  #: Since the filter's own place.
+    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without.
+    agreeing: int = 0  #: Positions in a row that agreed since.
+
+
+def gated_codes(
+    time: Datetimes,
+    observed: Masks,
+    distance_m: Floats,
+    place_m: Floats,
+    sigma_m: Floats,
+    state: ReturnState,
+    line: Line,
+    limits: SensorLimits,
+) -> tuple[Masks, ReturnState]:
+    """Return the epochs whose codes do not count yet, shape (T,), and the state to pass on.
+
+    After an outage the position of each epoch by itself is compared with the place coasted on the sensors: codes count
+    again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
+    and after `SensorLimits.return_s` in any case. Where no sensor gives a distance nothing is refused.
+
+    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the epoch before; `place_m`, `sigma_m`
+    of each epoch by itself; NaN where there is none. `state` has the place of the filter at the epoch before the first.
+    """
+    refused = np.zeros(len(time), dtype=np.bool_)
+    distances = state.distance_m + np.cumsum(distance_m)
+    coasted = state.place_m + np.cumsum(distance_m)
+    spread = np.sqrt(state.sigma_m**2 + (_DISTANCE_SHARE * distances) ** 2 + np.maximum(sigma_m, _LEAST_SIGMA_M) ** 2)
+    fits = np.abs(line.nearest_m(place_m, coasted) - coasted) <= limits.return_sigmas * spread
+    last, returned, agreeing = state.time, state.returned, state.agreeing
+    steps = seconds(np.diff(time, prepend=last if not np.isnat(last) else time[:1]))
+    if np.isnat(returned) and observed.all() and steps.max(initial=0.0) < _OUTAGE_S:
+        last, observed = time[-1] if len(time) else last, observed[:0]
+    for k in observed.nonzero()[0].tolist():
+        out = not np.isnat(last) and (not np.isnat(returned) or float(seconds(time[k] - last)) >= _OUTAGE_S)
+        if out and np.isfinite(coasted[k]):
+            returned = time[k] if np.isnat(returned) else returned
+            agreeing = agreeing + 1 if fits[k] else 0
+            refused[k] = agreeing < _AGREEING and float(seconds(time[k] - returned)) <= limits.return_s
+        if not refused[k]:
+            last, returned, agreeing = time[k], _NEVER, 0
+    if not len(time):
+        return refused, state
+    return refused, replace(
+        state,
+        time=last,
+        place_m=float(coasted[-1]),
+        distance_m=float(distances[-1]),
+        returned=returned,
+        agreeing=agreeing,
+    )

@@ -1,0 +1,75 @@
+"""Smoothed positions of a run: the filter run again over what it was given, then backward."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, join_rows
+from railfix.tracking import (
+    BackwardInformation,
+    GnssEpochs,
+    Line,
+    SensorEpochs,
+    Step,
+    TrackingLimits,
+    TrackState,
+    smooth_steps,
+    track,
+)
+
+#: Epochs whose covariances are in memory at a time.
+_EPOCHS: Final = 300
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """What the filter was given for some epochs."""
+
+    epochs: GnssEpochs
+    sensors: SensorEpochs
+    before: TrackState | None  #: State before them.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothedTrack:
+    """Places of T epochs by everything measured before and after them."""
+
+    time: Datetimes  #: Shape (T,).
+    #: Shape (T,).
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats  #: Shape (T,).
+
+
+def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
+    """Return the places of all epochs from what the filter was given, the last first."""
+    parts: list[SmoothedTrack] = []
+    later: BackwardInformation | None = None
+    for replay in backward:
+        for epochs, before in reversed(_pieces(replay, line, limits)):
+            trace: list[Step] = []
+            track(epochs, line, before, limits=limits, sensors=replay.sensors, trace=trace)
+            found, later = smooth_steps(trace, before or TrackState.empty(), later, limits)
+            arc = found.arc_m + line.round_m(found.arc_m)
+            parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
+    nothing = np.empty(0)
+    empty = SmoothedTrack(time=nothing.astype("M8[ns]"), arc_m=nothing, sigma_m=nothing, speed_mps=nothing)
+    return join_rows([*reversed(parts), empty])
+
+
+def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
+    """Short pieces and the states before them; those with sensors are short already."""
+    size = len(replay.epochs)
+    sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
+    if size <= _EPOCHS or sensed:
+        return [(replay.epochs, replay.before)] if size else []
+    state, pieces = replay.before, []
+    for first in range(0, size, _EPOCHS):
+        epochs = replay.epochs.take(slice(first, first + _EPOCHS))
+        pieces.append((epochs, state))
+        _, state = track(epochs, line, state, limits=limits)
+    return pieces

@@ -1,0 +1,58 @@
+"""State carried from one chunk to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from railfix.core.tables import NotebookTable
+from railfix.pipeline.base_station import BaseState
+from railfix.pipeline.carrier_stage import CarrierState
+from railfix.pipeline.filter_result import FilterState
+from railfix.pipeline.interference_stage import InterferenceState
+from railfix.pipeline.off_map import OffMapState
+from railfix.pipeline.received import Received
+from railfix.positioning.map_offset import MapOffsetState
+from railfix.positioning.noise_scale import LastingErrorState, NoiseState, OffsetState
+from railfix.positioning.two_frequencies import TwoFrequencyState
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaState(NotebookTable):
+    """State of one antenna after a chunk."""
+
+    noise: NoiseState = field(default_factory=NoiseState)  #: Sums behind the noise scales.
+    map_offset: MapOffsetState = field(default_factory=MapOffsetState)  #: Sums behind the test of the map.
+    lasting: LastingErrorState = field(default_factory=LastingErrorState)  #: Means of the residuals of each satellite.
+    off_map: OffMapState = field(default_factory=OffMapState)  #: Whether the train was away from the line.
+    offsets: OffsetState = field(default_factory=OffsetState)  #: Inter-system biases estimated so far.
+    screens: Mapping[str, Any] = field(default_factory=dict)  #: State of each screen that has one, by its name.
+    carrier: CarrierState | None = None  #: State of the carrier-phase stages, where they are used.
+    #: Last epoch; NaT before the first.
+    ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    #: Mean differences of the two codes of satellites.
+    two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
+
+    interference: InterferenceState = field(default_factory=InterferenceState)
+
+    def __repr__(self) -> str:
+        screens = ", ".join(sorted(self.screens)) or "none"
+        return f"<AntennaState: screens with a state: {screens}>"
+
+
+@dataclass(frozen=True, kw_only=True)
+class State(NotebookTable):
+    """State after a chunk: everything that the next one needs."""
+
+    antennas: Mapping[str, AntennaState] = field(default_factory=dict)
+    #: Navigation records and SBAS messages so far; None: those that the processor was made with.
+    received: Received | None = None
+    base: BaseState | None = None  #: State of the base station.
+    fusion: Mapping[str, FilterState] = field(default_factory=dict)  #: State of the filter along the track, by antenna.
+
+    def __repr__(self) -> str:
+        antennas = ", ".join(self.antennas) or "before the first epoch"
+        return f"<State: {antennas}{'; with the filter' if self.fusion else ''}>"

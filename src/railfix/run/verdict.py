@@ -1,0 +1,160 @@
+"""Verdict of a run: the figures that the terminal, the report, JSON and Python show under the same names.
+
+`judge_run` takes them from the record of the run (``run.json``), so that each figure has one source.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+from railfix.core.reasons import Status
+from railfix.core.tables import count, number
+from railfix.run.record import level_basis
+
+#: Names of the figures, the same on the terminal, on the cards of the report and in JSON.
+POSITIONS: Final = "epochs with a position"
+PASSED: Final = "epochs that passed every check"
+SIGMA: Final = "sigma along the line, median"
+#: Statuses of the filter whose positions are promised.
+_PROMISED: Final = ("tracking", "coasting")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionFigures:
+    """Figures of one kind of positions of an antenna; None where there are none."""
+
+    epochs: int  #: All epochs for the filter along the track, those with observations for single epochs.
+    positions: int  #: Epochs with a position.
+    passed: int  #: Epochs of status `ok`, or `tracking` and `coasting` for the filter.
+    statuses: Mapping[str, int]  #: Epochs by status, those that occur, the most frequent first.
+    chainage_first_m: float | None  #: Least and largest chainage [m].
+    chainage_last_m: float | None
+    sigma_p50_m: float | None  #: Median, 95th percentile and largest standard deviation along the line [m].
+    sigma_p95_m: float | None
+    sigma_max_m: float | None
+    level_p50_m: float | None  #: Median and 95th percentile of the finite protection levels [m].
+    level_p95_m: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaVerdict:
+    """Verdict on one antenna: the filter along the track, where it is on, and single epochs."""
+
+    antenna: str
+    level_name: str  #: "protection level", or "indicative protection level" where the priors of faults are assumed.
+    filter: PositionFigures | None
+    single_epochs: PositionFigures
+
+    @property
+    def leading(self) -> PositionFigures:
+        """Return the figures that stand first: those of the filter, or of single epochs without it."""
+        return self.filter or self.single_epochs
+
+    def figures(self) -> Iterator[tuple[str, str, str]]:
+        """Yield the name of each figure, its leading value, and that of single epochs where the filter leads."""
+        texts: dict[str, Callable[[PositionFigures], str]] = {
+            POSITIONS: lambda of: f"{count(of.positions)} of {count(of.epochs)}",
+            PASSED: lambda of: f"{count(of.passed)} of {count(of.epochs)}",
+            SIGMA: lambda of: number(of.sigma_p50_m, 2, " m"),
+            f"{self.level_name}, median": lambda of: number(of.level_p50_m, 1, " m"),
+        }
+        for name, text in texts.items():
+            yield name, text(self.leading), "" if self.filter is None else text(self.single_epochs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Verdict on a run."""
+
+    antennas: tuple[AntennaVerdict, ...]
+    causes: tuple[str, ...]  #: Likely causes where positions are off the line.
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the plain values for JSON."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the verdict in sentences: one for each antenna, one on the checks of all, and the likely cause."""
+        lines = [_describe(antenna) for antenna in self.antennas]
+        lines.append(_describe_checks([antenna.single_epochs for antenna in self.antennas]))
+        filtered = [antenna.filter for antenna in self.antennas if antenna.filter is not None]
+        if filtered:
+            lines.append(_describe_filter(filtered))
+        return [*lines, *(f"likely cause: {cause}" for cause in self.causes[:1])]
+
+
+def judge_run(record: Mapping[str, Any]) -> Verdict:
+    """Return the verdict on a run from its record; figures that a record of an earlier version lacks are None."""
+    level_name = f"{level_basis(record)} level"
+    antennas = []
+    for name, facts in (record.get("antennas") or {}).items():
+        filtered = facts.get("filter")
+        single = {**facts, "level": facts.get("protection_level")}
+        single["status"] = {word: n for word, n in facts["status"].items() if word != Status.NO_OBSERVATION.text}
+        antennas.append(
+            AntennaVerdict(
+                antenna=name,
+                level_name=level_name,
+                filter=None if filtered is None else _figures(filtered, _PROMISED),
+                single_epochs=_figures(single, (Status.OK.text,)),
+            )
+        )
+    causes, notes = (tuple(record.get(name) or ()) for name in ("likely_causes", "notes"))
+    return Verdict(antennas=tuple(antennas), causes=causes, notes=notes)
+
+
+def _figures(facts: Mapping[str, Any], promised: Sequence[str]) -> PositionFigures:
+    """Return the figures in the facts of an antenna or its filter."""
+    statuses = Counter({word: epochs for word, epochs in facts["status"].items() if epochs})
+    chainage, sigma, level = (facts.get(name) or {} for name in ("chainage_m", "along_sigma_m", "level"))
+    return PositionFigures(
+        epochs=statuses.total(),
+        positions=chainage.get("positions", 0),
+        passed=sum(statuses[word] for word in promised),
+        statuses=dict(statuses.most_common()),
+        chainage_first_m=chainage.get("first"),
+        chainage_last_m=chainage.get("last"),
+        sigma_p50_m=sigma.get("p50_m"),
+        sigma_p95_m=sigma.get("p95_m"),
+        sigma_max_m=sigma.get("max_m"),
+        level_p50_m=level.get("p50_m"),
+        level_p95_m=level.get("p95_m"),
+    )
+
+
+def _describe(antenna: AntennaVerdict) -> str:
+    of = antenna.leading
+    by = "filter along the track" if antenna.filter is not None else "single epochs"
+    text = f"{antenna.antenna}: a position in {of.positions:,} of {of.epochs:,} epochs ({by})"
+    if of.positions:
+        text += f", chainage {of.chainage_first_m:.0f} to {of.chainage_last_m:.0f} m"
+    if of.sigma_p50_m is not None:
+        text += f"; sigma {of.sigma_p50_m:.1f} m at the median, {of.sigma_max_m:.1f} m at most"
+    if of.level_p50_m is not None:
+        text += f"; {antenna.level_name} {of.level_p50_m:.1f} m at the median"
+    return text
+
+
+def _describe_checks(figures: Sequence[PositionFigures]) -> str:
+    """Return how many single epochs passed every check, and what most of the others are."""
+    passed, epochs = sum(of.passed for of in figures), sum(of.epochs for of in figures)
+    failed = _count_statuses(figures)
+    del failed[Status.OK.text]
+    text = f"single epochs: {passed:,} of {epochs:,} with observations passed every check"
+    return f"{text}; most of the others are {failed.most_common(1)[0][0]}" if failed else text
+
+
+def _describe_filter(figures: Sequence[PositionFigures]) -> str:
+    counts = _count_statuses(figures).most_common()
+    return "filter along the track: " + ", ".join(f"{epochs:,} epochs {word}" for word, epochs in counts)
+
+
+def _count_statuses(figures: Sequence[PositionFigures]) -> Counter[str]:
+    statuses = Counter[str]()
+    for of in figures:
+        statuses.update(of.statuses)
+    return statuses
