@@ -344,7 +344,7 @@ def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None
     shutil.copy(room.parent / "core" / "constants.py", tmp_path / "railfix" / "core")
     before = {name: stamp(copied, name) for name in (recursion, "search")}
     assert before == {name: stamp(room, name) for name in before}
-    for changed, names in {"kernels/tracking/algebra": {recursion}, "core/constants": {recursion, "search"}}.items():
+    for changed, names in {"kernels/tracking/update": {recursion}, "core/constants": {recursion, "search"}}.items():
         with (tmp_path / "railfix" / f"{changed}.py").open("a") as file:
             file.write("# changed\n")
         stamp.cache_clear()

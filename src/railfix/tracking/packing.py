@@ -110,8 +110,8 @@ def compute_start_variance(state: TrackState, line: Line, limits: TrackingLimits
     return np.diagonal(covariance[0]).copy()
 
 
-def unpack_state(state: TrackState, packed: layout.State, origin: np.datetime64) -> None:
-    """Put what the recursion leaves into the state."""
+def unpack_state(state: TrackState, packed: layout.State, origin: Any) -> None:
+    """Put what the recursion leaves into the state; `origin` is the first time of the chunk."""
     monitors: Any = packed.monitors[0]
     first, count = len(packed.hypothesis), int(monitors["hypotheses"])
     state.mean, state.covariance = packed.x[:count].copy(), packed.P[:count].copy()
