@@ -9,12 +9,10 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, cast
 
-import numba
 import numpy as np
 import pytest
 
 from railfix import kernels
-from railfix.kernels import compiling
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
 from railfix.tracking.bank import OTHERS, SourceKind, classify_source
@@ -32,8 +30,7 @@ def _compiled_modules() -> list[str]:
 def plain(name: str) -> ModuleType:
     """A module of `railfix.kernels` that the compiler has left alone."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numba.config, "DISABLE_JIT", True)
-        patch.setattr(compiling, "by_reference", compiling._as_it_is)
+        patch.setenv("NUMBA_DISABLE_JIT", "1")
         for attribute, value in list(vars(kernels).items()):
             if isinstance(value, ModuleType):
                 patch.setattr(kernels, attribute, value)  # an import sets it

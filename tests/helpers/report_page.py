@@ -7,9 +7,16 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+from plotly.offline import get_plotlyjs
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page as BrowserPage
 
 #: Elements without an end.
 _VOID: Final = ("meta", "input", "br", "img", "link", "hr")
@@ -44,6 +51,27 @@ def run_browser(page: Path, *options: str, timeout_s: float = 180.0) -> str:
     return done.stdout
 
 
+@contextmanager
+def visited(page: Path, **options: Any) -> Iterator[BrowserPage]:
+    """A page in a window of the browser, for real clicks and keys; `options` are those of a page of Playwright.
+
+    An error of a script of the page fails the test.
+    """
+    from playwright.sync_api import sync_playwright
+
+    errors: list[str] = []
+    with sync_playwright() as started:
+        window = started.chromium.launch(executable_path=browser(), args=["--no-sandbox"])
+        shown = window.new_page(**options)
+        shown.on("pageerror", lambda error: errors.append(str(error)))
+        shown.goto(page.resolve().as_uri())
+        shown.wait_for_function("document.getElementById('railfix-timing').dataset.load !== undefined")
+        yield shown
+        errors.append(shown.inner_text("#railfix-errors"))
+        window.close()
+    assert [error for error in errors if error] == []
+
+
 def opened(page: Path, *, height: int = 1000) -> str:
     """The page's document after it was loaded in a window of that height."""
     return run_browser(page, f"--window-size=1250,{height}", "--dump-dom")
@@ -57,7 +85,7 @@ class Page(HTMLParser):
         self.elements: list[tuple[str, dict[str, str]]] = []
         self.text: dict[str, str] = {}
         self._in: list[str] = []
-        self.feed(document)
+        self.feed(document.replace(get_plotlyjs(), ""))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Note the element."""
@@ -92,7 +120,8 @@ def timing_ms(document: str) -> dict[str, float]:
 
 
 def fetched(document: str) -> list[str]:
-    """Addresses that a document would fetch something from."""
+    """Addresses that a document would fetch something from; links in the library of the charts are not followed."""
+    document = document.replace(get_plotlyjs(), "")
     wanted = re.findall(r"""(?:src|href|action|data|poster)\s*=\s*["']?([^"'\s>]+)""", document)
     wanted += re.findall(r"""url\(\s*["']?([^"')]+)""", document)
     wanted += re.findall(r"""@import\s+["']([^"']+)""", document)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import operator
 import os
 import pickle
 import shutil
@@ -11,14 +10,11 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numba
 import numpy as np
 import pytest
-from numba.core.types.functions import BaseFunction
 
 import raim_oracle
 import separation_oracle
@@ -30,7 +26,7 @@ from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import constrained_model
 from railfix.io import read_navigation, read_observations
 from railfix.kernels import compiling
-from railfix.kernels.compiling import by_reference
+from railfix.kernels.compiling import compute_stamp
 from railfix.kernels.tracking.recursion import advance
 from railfix.kernels.tracking.velocity import fitted_velocities
 from railfix.pipeline.config import Config
@@ -181,49 +177,6 @@ def test_velocities_are_those_of_reweighted_least_squares() -> None:
     assert found > 15
 
 
-class Numbers(NamedTuple):
-    """Arrays of several types and layouts, and numbers, as those of the filter."""
-
-    turned: np.ndarray
-    marked: np.ndarray
-    degrees: tuple[float, float]
-    doubled: bool
-    count: int
-
-
-class Given(NamedTuple):
-    """A tuple within a tuple, before and behind other fields."""
-
-    cube: np.ndarray
-    numbers: Numbers
-    sums: np.ndarray
-
-
-@compiling.borrowing
-def write_sums(numbers: Numbers, given: Given) -> int:
-    for i in range(numbers.count):
-        for k in range(given.cube.shape[1]):
-            if numbers.marked[i, k]:
-                given.sums[i] += given.cube[i, k, 0] * numbers.turned[k, i] + numbers.degrees[1]
-        given.sums[i] *= 2.0 if numbers.doubled else 1.0
-    return len(given.sums)
-
-
-@numba.njit(**compiling._OPTIONS, **compiling._UNCOUNTED)
-def compute_sums(given: Given) -> int:
-    return write_sums(by_reference(given.numbers), by_reference(given))
-
-
-@numba.njit(**compiling._OPTIONS, **compiling._UNCOUNTED)
-def compute_nested_sums(given: Given) -> int:
-    return write_nested_sums(by_reference(given))
-
-
-@compiling.borrowing
-def write_nested_sums(given: Given) -> int:
-    return write_sums(given.numbers, given)
-
-
 def test_arrays_of_any_caller_are_of_one_type_for_kernels() -> None:
     """Writable, read-only and strided arrays: nothing is compiled for them beyond what the first call compiles."""
     frozen, line = raim_oracle.made(np.full(4, 731.0), "GGGGGEEE", seed=1), raim_oracle.LINE
@@ -242,18 +195,6 @@ def test_arrays_of_any_caller_are_of_one_type_for_kernels() -> None:
         robust_fit(ranges, near)
         compiled.append([len(kernel.signatures) for kernel in used])
     assert compiled[0] == compiled[1] == compiled[2]
-
-
-@pytest.mark.requirement("A8")
-@pytest.mark.parametrize("function", [compute_sums, compute_nested_sums])
-def test_tuples_by_reference_have_the_fields_that_they_have(function: Callable[..., int]) -> None:
-    rng = np.random.default_rng(2)
-    cube, turned, marked = rng.normal(size=(4, 3, 2)), rng.normal(size=(4, 6))[:, ::2].T, rng.random((4, 3)) > 0.4
-    for doubled in (False, True):
-        given = Given(cube, Numbers(turned, marked, (1.0, 5.0), doubled, 3), np.zeros(4))
-        assert function(given) == 4
-        expected = ((cube[..., 0] * turned.T + 5.0) * marked).sum(axis=1) * (1 + doubled)
-        np.testing.assert_allclose(given.sums, np.append(expected[:3], 0.0), rtol=1e-13)
 
 
 @pytest.mark.requirement("C2")
@@ -299,58 +240,72 @@ def test_levels_of_every_kind_of_hypothesis_are_those_of_all_sets_side_by_side(
             np.testing.assert_array_equal(given, expected, err_msg=name)
 
 
-@pytest.mark.requirement("A8")
-def test_all_kernels_are_loaded_before_a_live_session_needs_them(calls: dict[str, list[tuple[Any, ...]]]) -> None:
-    for module, name in NAMES:
-        getattr(getattr(kernels, module), name)(*copied(calls[name][0]))  # on disk from here on
-    program = """
-from railfix import kernels
-loaded = kernels.load()
-from railfix.kernels.compiling import COMPILED
-print(loaded, *[function.py_func.__name__ for function in COMPILED if function.signatures])
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    loaded, *names = done.stdout.split()
-    assert int(loaded) >= len(names)
-    assert set(names) >= {name for _, name in NAMES}
-
-
 @pytest.mark.slow
 @pytest.mark.requirement("A8")
-def test_a_session_on_a_new_machine_compiles_all_kernels_before_it_begins(tmp_path: Path) -> None:
-    """Twice in processes of their own: the second finds all of them on disk."""
+def test_a_new_machine_compiles_all_kernels_once_and_loads_them_from_then_on(tmp_path: Path) -> None:
+    """A live session loads them before it begins; nothing is compiled then."""
     program = """
 from railfix import kernels
 from railfix.live.warm_up import prepare_kernels
-print(prepare_kernels(), *kernels.missing())
+prepared = prepare_kernels()
+kernels.load()
+from railfix.kernels.compiling import COMPILED
+loaded = sum(len(f.signatures) for f in COMPILED)
+compiled = sum(sum(function.stats.cache_misses.values()) for function in COMPILED)
+print(prepared, compiled, loaded, *[f.py_func.__name__ for f in COMPILED if f.signatures])
 """
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    environment, before = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, 0
     for expected in ("True", "False"):
-        done = subprocess.run(
-            [sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True
-        )
-        assert done.stdout.split() == [expected]
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+        prepared, compiled, loaded, *names = done.stdout.split()
+        assert prepared == expected
+        assert set(names) >= {name for _, name in NAMES}
+        assert int(loaded) >= len(names)
+        assert int(compiled) == (0 if before else int(loaded))
+        before = int(loaded)
 
 
 def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None:
     """numba looks at the file of the function alone; here a change of what it calls compiles again."""
-    room = Path(kernels.__file__).parent
-    recursion, stamp = "tracking.recursion", import_module("railfix.kernels.compiling").stamp
-    advance = import_module(f"railfix.kernels.{recursion}").advance
-    assert advance._cache._cache_file._source_stamp == stamp(room, recursion)
+    room, names = Path(kernels.__file__).parent, ("tracking.recursion", "search")
     copied = tmp_path / "railfix" / "kernels"
     shutil.copytree(room, copied, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "railfix" / "core").mkdir()
     shutil.copy(room.parent / "core" / "constants.py", tmp_path / "railfix" / "core")
-    before = {name: stamp(copied, name) for name in (recursion, "search")}
-    assert before == {name: stamp(room, name) for name in before}
-    for changed, names in {"kernels/tracking/update": {recursion}, "core/constants": {recursion, "search"}}.items():
+    before = {name: compute_stamp(copied, name) for name in names}
+    assert before == {name: compute_stamp(room, name) for name in names}
+    for changed, of in {"kernels/tracking/constants": {"tracking.recursion"}, "core/constants": set(names)}.items():
         with (tmp_path / "railfix" / f"{changed}.py").open("a") as file:
             file.write("# changed\n")
-        stamp.cache_clear()
-        after = {name: stamp(copied, name) for name in before}
-        assert {name for name in before if after[name] != before[name]} == names
+        compute_stamp.cache_clear()
+        after = {name: compute_stamp(copied, name) for name in names}
+        assert {name for name in names if after[name] != before[name]} == of
         before = after
+
+
+def test_code_of_other_sources_is_removed_from_disk(tmp_path: Path) -> None:
+    """What was compiled before a function changed that it calls; the code of other modules stays."""
+    program = """
+import numpy as np
+from railfix import kernels
+from railfix.kernels.compiling import COMPILED
+kernels.windows.decayed_sums(np.ones((1, 1)), np.ones(1), np.ones(1), np.ones((1, 1)), np.ones(1, dtype=np.intp))
+print(*[sum(f.stats.cache_misses.values()) for f in COMPILED if f.signatures])
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def misses() -> str:
+        command = [sys.executable, "-c", program]
+        return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout.strip()
+
+    assert [misses(), misses()] == ["1", "0"]
+    (stamp,) = tmp_path.rglob("windows.sha256")
+    others = stamp.with_name("search.points.py311.nbi")
+    others.touch()
+    stamp.write_text("of other sources")
+    assert [misses(), misses()] == ["1", "0"]
+    assert others.exists()
 
 
 @pytest.mark.requirement("A8")
@@ -370,45 +325,14 @@ def test_arrays_of_a_trajectory_and_records_stay_read_only_in_another_process() 
             np.testing.assert_array_equal(vars(got)[name], value)
 
 
-def test_code_on_disk_with_types_of_an_older_version_is_compiled_anew(tmp_path: Path) -> None:
-    """A table of arguments was renamed since: numba cannot read the index of the code on disk."""
-    (tmp_path / "tables.py").write_text("from typing import NamedTuple\nclass Old(NamedTuple):\n    x: float\n")
-    program = """
-import sys
-import railfix.kernels.search
-from railfix.kernels import compiling
-function = compiling.COMPILED[0]
-index = function._cache._cache_file
-if len(sys.argv) > 1:
-    sys.path.insert(0, sys.argv[1])
-    from tables import Old
-    index._save_index({Old: "x.nbc"})
-    assert index._load_index()
-else:
-    assert index._load_index() == {}, "an index that names what is gone"
-    index.save("now", b"code")
-    assert index.load("now") == b"code"
-"""
-    for arguments in ([str(tmp_path)], []):
-        subprocess.run(
-            [sys.executable, "-c", program, *arguments],
-            check=True, env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-        )  # fmt: skip
-
-
 @pytest.mark.parametrize("terminal", [True, False])
 @pytest.mark.every(2)
-def test_a_terminal_is_told_of_compilation_once(terminal: bool) -> None:
-    program = """
-import numba
-import railfix.kernels.compiling
-for value in (1, 2):
-    function = numba.njit(eval(f"lambda: {value}", {"__name__": "railfix.kernels.made"}))
-    function()
-"""
+def test_a_terminal_is_told_of_compilation_once(tmp_path: Path, terminal: bool) -> None:
+    program = "import railfix.kernels.windows, railfix.kernels.search"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     pipe = os.openpty() if terminal else os.pipe()
     reader, writer = pipe
-    subprocess.run([sys.executable, "-c", program], stderr=writer, check=True)
+    subprocess.run([sys.executable, "-c", program], stderr=writer, check=True, env=environment)
     os.write(writer, b"end\n")
     told = ""
     while not told.endswith("end\n"):
@@ -416,27 +340,6 @@ for value in (1, 2):
     assert told == ("compiling for this processor, once: about a minute\n" if terminal else "") + "end\n"
     for end in pipe:
         os.close(end)
-
-
-@pytest.mark.requirement("A8")
-def test_what_the_compiler_has_found_for_types_is_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[object] = []
-    resolve = BaseFunction.get_call_type
-
-    def count(self: BaseFunction, context: object, args: object, kws: object) -> object:
-        asked.append((self.typing_key, args))
-        return resolve(self, context, args, kws)
-
-    def used_thrice(number: float) -> float:
-        return (number + 1.5) * (number + 2.5) * (number + 3.5)
-
-    monkeypatch.setattr(BaseFunction, "get_call_type", count)
-    with compiling.keep_resolutions():
-        once = numba.njit(used_thrice)
-        assert once(2.0) == 3.5 * 4.5 * 5.5
-    assert BaseFunction.get_call_type is count
-    additions = [args for function, args in asked if function is operator.add]
-    assert len(additions) == len(set(additions)) > 0
 
 
 def test_plain_kernels_do_not_warn_of_integers_that_wrap_around() -> None:

@@ -155,7 +155,7 @@ def test_inconsistent():
     """Half of the satellites are wrong, each otherwise: no exclusion of two mends that."""
     wrong = np.zeros(len(front().satellite))
     for i, name in enumerate(highest("G", 4) + highest("E", 2)):
-        wrong[channel(front(), name)] = 40.0 * (-1) ** i * (i + 1)
+        wrong[channel(front(), name)] = (40.0 + 9.0 * i) * (-1) ** i
     found = front_alone(with_code(front(), wrong), {"screens": ["elevation", "raim"]})
     refused = found.status == Status.INCONSISTENT
     assert refused.mean() > 0.8
@@ -270,6 +270,7 @@ CASES: dict[Reason, Callable[[], tuple[AntennaResult, int, int]]] = {
         top_channel(),
         20,
     ),
+    Reason.GROSS_ERROR: lambda: (front_alone(one_wrong(1e3), MASK_ONLY), top_channel(), 0),
     Reason.FAULT_EXCLUDED: lambda: (front_alone(one_wrong(80.0), {"screens": ["elevation", "raim"]}), top_channel(), 0),
 }
 #: Reasons of screens that need more than one log and the settings; tested beside those screens, or below.

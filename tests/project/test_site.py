@@ -73,7 +73,7 @@ def test_the_site_reaches_every_page() -> None:
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     trees = re.findall(r"^```\{toctree\}\n(.*?)^```$", index, flags=re.MULTILINE | re.DOTALL)
     listed = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
-    pages = [*DOCS.glob("*.md"), *(DOCS / "notebooks").glob("*.md")]
+    pages = [page for folder in (".", "notebooks", "maintain") for page in (DOCS / folder).glob("*.md")]
     names = sorted(page.relative_to(DOCS).with_suffix("").as_posix() for page in pages)
     assert sorted([*listed, "index"]) == names
 

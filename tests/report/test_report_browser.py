@@ -8,6 +8,7 @@ import subprocess
 from collections import Counter
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
@@ -16,110 +17,19 @@ from railfix.evaluate import EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.report import read_runs, report_page, write_report
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
-from report_page import Page, browser, opened, run_browser, timing_ms
+from report_page import Page, browser, opened, run_browser, timing_ms, visited
 
 pytestmark = [
     pytest.mark.requirement("D3"),
     pytest.mark.skipif(browser() is None, reason="no chromium is installed"),
 ]
 
-#: Goes through every picture: draws it, points at it, enlarges it, shows all again, hides a layer and clicks.
-EXERCISE = """
-<script>
-(function () {
-  const said = document.createElement("div");
-  said.id = "exercise";
-  document.body.append(said);
-  let tips = 0, skies = 0, zooms = 0;
-  const fire = (canvas, kind, x, y) => {
-    const place = canvas.getBoundingClientRect();
-    canvas.dispatchEvent(new PointerEvent(kind, { clientX: place.left + x, clientY: place.top + y, button: 0,
-      pointerType: "mouse", pointerId: 1, bubbles: true }));
-  };
-  for (const figure of document.querySelectorAll("figure[data-chart]")) {
-    const plot = figure.plot, canvas = figure.querySelector("canvas");
-    plot.draw();
-    if (figure.classList.contains("skyplot")) {
-      const slider = figure.querySelector("input");
-      slider.value = slider.max;
-      slider.dispatchEvent(new Event("input"));
-      continue;
-    }
-    const layer = plot.chart.layers.filter(l => l.kind === "points" && l.x.length).pop();
-    const i = layer ? Math.floor(layer.x.length / 2) : 0;
-    const x = layer ? plot.box.px(layer.x[i]) : 200, y = layer ? plot.box.py(layer.y[i]) : 100;
-    fire(canvas, "pointermove", x, y);
-    if (!figure.querySelector(".tip").hidden) tips++;
-    const sky = document.getElementById(figure.dataset.sky || "none");
-    const before = sky ? sky.querySelector("output").textContent : "";
-    fire(canvas, "pointerdown", x, y);
-    fire(canvas, "pointerup", x, y);
-    if (sky && sky.querySelector("output").textContent !== before) skies++;
-    const whole = plot.box.x.slice();
-    const left = plot.box.left + 30, top = plot.box.top + 20;
-    fire(canvas, "pointerdown", left, top);
-    fire(canvas, "pointermove", left + 80, top + 50);
-    fire(canvas, "pointerup", left + 80, top + 50);
-    if (plot.box.x[0] > whole[0] && plot.box.x[1] < whole[1]) zooms++;
-    canvas.dispatchEvent(new MouseEvent("dblclick"));
-    if (plot.box.x[0] !== whole[0]) zooms -= 1000;
-    for (const key of ["+", "ArrowRight", "-", "0"]) canvas.dispatchEvent(new KeyboardEvent("keydown", { key }));
-    const button = figure.querySelector(".legend button");
-    button.click();
-    button.click();
-  }
-  said.dataset.tips = tips;
-  said.dataset.skies = skies;
-  said.dataset.zooms = zooms;
-})();
-</script></body>"""
-
-#: Zooms one chart and notes which others follow; takes the CSV of every table.
-TOGETHER = """
-<script>
-(function () {
-  const said = document.createElement("div");
-  said.id = "together";
-  document.body.append(said);
-  const start = figure => figure.plot.chart.start || 0;
-  const span = figure => figure.plot.box.x.map(v => (v + start(figure)).toFixed(2)).join(" ");
-  for (const figure of document.querySelectorAll("figure[data-chart]")) figure.plot.draw();
-  const timed = [...document.querySelectorAll('figure[data-zoom="run0-time"]')], first = timed[1].plot;
-  const middle = (first.box.x[0] + first.box.x[1]) / 2;
-  first.zoom({ x: [middle, middle + 5], y: first.box.y });
-  said.dataset.timed = timed.length;
-  said.dataset.spans = new Set(timed.map(span)).size;
-  first.zoom(null);
-  said.dataset.back = timed.filter(figure => figure.plot.view).length;
-  // The text is taken where the file is made: to read it back takes a promise, which may come after the page is dumped.
-  const texts = [], taken = [], Made = Blob;
-  window.Blob = function (parts, options) { texts.push(parts.join("")); return new Made(parts, options); };
-  URL.createObjectURL = () => "#";
-  HTMLAnchorElement.prototype.click = function () { taken.push(this.download); };
-  document.querySelectorAll("button.download").forEach(button => button.click());
-  said.dataset.files = taken.join(" ");
-  const at = taken.indexOf("figures-of-merit.csv");
-  said.dataset.csv = texts[at];
-})();
-</script></body>"""
-
-#: Shows a page in a frame as wide as a telephone and notes what is wider.
-NARROW = """<!DOCTYPE html><html><body>
-<iframe id="phone" style="width:390px;height:3000px;border:0" src="PAGE"></iframe><script>
-document.getElementById("phone").addEventListener("load", function () {
-  const inner = this.contentDocument, said = document.createElement("div");
-  inner.querySelectorAll("details").forEach(part => { part.open = true; });
-  for (const figure of inner.querySelectorAll("figure[data-chart]")) figure.plot.draw();
-  said.id = "narrow";
-  said.dataset.window = this.contentWindow.innerWidth;
-  said.dataset.page = inner.documentElement.scrollWidth;
-  const wide = e => !e.closest(".scroll") && e.getBoundingClientRect().right > 391;
-  said.dataset.over = [...inner.querySelectorAll("body *")].filter(wide)
-    .map(e => e.tagName + "." + e.className).join(" ");
-  said.dataset.errors = inner.getElementById("railfix-errors").textContent;
-  document.body.append(said);
-});
-</script></body></html>"""
+#: Charts whose points belong to epochs, drawn so far, and the ranges of their axes.
+RANGES = """() => Object.fromEntries([...document.querySelectorAll("figure[data-drawn]")].filter(f => f.plot.div).map(
+    (f, k) => [f.dataset.name + k, [f.plot.range("xaxis"), f.plot.range("yaxis")]]))"""
+#: Opens the folded parts and draws every chart.
+DRAW_ALL = """() => { document.querySelectorAll("details").forEach(part => { part.open = true; });
+    document.querySelectorAll("figure[data-chart]").forEach(figure => figure.plot.draw()); }"""
 
 #: Opens what is folded and says which tables are wider than the page.
 WIDE = """
@@ -170,67 +80,124 @@ def test_every_picture_is_drawn_in_a_window_that_holds_them_all(page: Path) -> N
     assert len(read.figures) > 30
 
 
-@pytest.mark.slow
-def test_pictures_can_be_pointed_at_enlarged_and_clicked(page: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "exercise.html"
-    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", EXERCISE), encoding="utf-8")
-    read = Page(opened(copy))
-    assert read.text.get("railfix-errors", "") == ""
-    said = read.by_id("exercise")
-    charts = [figure for figure in read.figures if "skyplot" not in figure["class"]]
-    linked = [figure for figure in charts if "data-sky" in figure]
-    with_points = [figure for figure in charts if figure["data-name"] not in ("error-ranges", "stanford")]
-    with_points = [f for f in with_points if f["data-name"] != "interval-distribution"]
-    assert int(said["data-tips"]) >= len(with_points) > 20
-    assert int(said["data-zooms"]) == len(charts)
-    # the first click on each antenna's sky leaves its first epoch, later ones may meet the one that is shown
-    assert 2 <= int(said["data-skies"]) <= len(linked)
+def centre_of(shown: Any, name: str, x: float, y: float) -> tuple[float, float]:
+    """Pixel of a point of a chart, from the ranges of its axes and the margins of its drawing."""
+    place = shown.evaluate(
+        """([name, x, y]) => { const f = document.querySelector(`figure[data-name=${name}]`), p = f.plot, d = p.div;
+        const r = d.getBoundingClientRect(), m = d.layout.margin;
+        const [x0, x1] = p.range("xaxis"), [y0, y1] = p.range("yaxis");
+        return [r.left + m.l + (x - x0) / (x1 - x0) * (r.width - m.l - m.r),
+            r.bottom - m.b - (y - y0) / (y1 - y0) * (r.height - m.t - m.b)]; }""",
+        [name, x, y],
+    )
+    return place[0], place[1]
+
+
+def test_a_click_shows_the_satellites_beside_the_chart_and_keys_go_on(page: Path) -> None:
+    with visited(page, viewport={"width": 1400, "height": 900}) as shown:
+        chart = shown.locator("figure[data-name=error-chainage]").first
+        where = shown.evaluate(
+            """() => { const p = document.querySelector("figure[data-name=error-chainage]").plot;
+            const l = p.chart.layers.filter(l => l.label === "filtered along the track")[0], i = 40;
+            return [l.x[i], p.chart.y_scale === "symlog" ? NaN : l.y[i], p.chart.epoch0 + l.epoch[i]]; }"""
+        )
+        shown.mouse.click(*centre_of(shown, "error-chainage", where[0], where[1]))
+        panel = shown.locator(".skyplot.docked")
+        panel.wait_for(state="visible")
+        # the chart stays in sight beside the panel
+        boxes = chart.bounding_box(), panel.bounding_box()
+        assert boxes[0] is not None
+        assert boxes[1] is not None
+        assert boxes[0]["x"] + boxes[0]["width"] <= boxes[1]["x"]
+        assert boxes[0]["y"] < 900
+        first = panel.locator("output").inner_text()
+        assert "signals used" in first
+        assert panel.locator("tbody tr").count() > 5
+        panel.locator(".after").click()
+        second = panel.locator("output").inner_text()
+        assert second != first
+        assert panel.locator("output").get_attribute("aria-live") == "polite"
+        chart.locator(".plot").focus()
+        shown.keyboard.press("ArrowLeft")
+        assert panel.locator("output").inner_text() == first
+        shown.keyboard.press("Escape")
+        assert shown.locator(".skyplot.docked").count() == 0
+        shown.keyboard.press("Enter")
+        panel.wait_for(state="visible")
+
+
+def test_zooming_a_chart_restricts_the_plan_and_the_other_charts(page: Path) -> None:
+    with visited(page, viewport={"width": 1400, "height": 900}) as shown:
+        before = shown.evaluate(RANGES)
+        plan, chart = (next(key for key in before if key.startswith(name)) for name in ("plan", "error-chainage"))
+        (low, high), (bottom, top) = before[chart]
+        third = (high - low) / 3.0
+        start = centre_of(shown, "error-chainage", low + third, bottom + 0.2 * (top - bottom))
+        end = centre_of(shown, "error-chainage", high - third, bottom + 0.8 * (top - bottom))
+        shown.mouse.move(*start)
+        shown.mouse.down()
+        shown.mouse.move(*end, steps=4)
+        shown.mouse.up()
+        shown.wait_for_function("document.querySelector('figure[data-name=plan]').plot.zoomed")
+        after = shown.evaluate(RANGES)
+        assert after[chart][0] == pytest.approx([low + third, high - third], abs=0.03 * (high - low))
+        # the plan shows the stretch whose chainage was chosen: by a length near it, and no more
+        width = max(after[plan][k][1] - after[plan][k][0] for k in (0, 1))
+        assert width < 0.75 * max(before[plan][k][1] - before[plan][k][0] for k in (0, 1))
+        shown.locator("figure[data-name=error-chainage] .plot").first.focus()
+        shown.keyboard.press("0")
+        shown.wait_for_function("!document.querySelector('figure[data-name=plan]').plot.zoomed")
+        whole = shown.evaluate(RANGES)
+        assert whole[plan] == [pytest.approx(axis, rel=1e-3, abs=1e-3) for axis in before[plan]]
 
 
 @pytest.mark.slow
-def test_charts_zoom_together_and_tables_can_be_downloaded(page: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "together.html"
-    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", TOGETHER), encoding="utf-8")
-    read = Page(opened(copy))
-    assert read.text.get("railfix-errors", "") == ""
-    said = read.by_id("together")
-    assert int(said["data-timed"]) > 10
-    assert (said["data-spans"], said["data-back"]) == ("1", "0")
-    assert {"summary.csv", "settings.csv", "inputs.csv", "epochs.csv"} <= set(said["data-files"].split())
-    rows = pl.read_csv(said["data-csv"].encode(), infer_schema_length=0)
+def test_every_chart_shows_its_numbers_and_zooms_by_keys(page: Path) -> None:
+    with visited(page, viewport={"width": 1400, "height": 900}) as shown:
+        shown.evaluate(DRAW_ALL)
+        spans = shown.evaluate(
+            """() => [...document.querySelectorAll("figure[data-chart]")].filter(f => f.plot.div).map(f => {
+            const before = f.plot.range("xaxis"); f.plot.following = true;
+            f.plot.scale(0.5, 0); const after = f.plot.range("xaxis");
+            return [f.dataset.name, Number(f.dataset.drawn), (after[1] - after[0]) / (before[1] - before[0])]; })"""
+        )
+        assert len(spans) > 25
+        assert all(drawn > 0 for _, drawn, _ in spans)
+        assert all(ratio == pytest.approx(0.5, abs=0.01) for _, _, ratio in spans)
+
+
+@pytest.mark.slow
+def test_tables_can_be_downloaded(page: Path, tmp_path: Path) -> None:
+    with visited(page, accept_downloads=True) as shown:
+        shown.evaluate("() => document.querySelectorAll('details').forEach(part => { part.open = true; })")
+        button = shown.locator("div.table:has(table[data-name=figures-of-merit]) button.download").first
+        with shown.expect_download() as waiting:
+            button.click()
+        waiting.value.save_as(tmp_path / "table.csv")
+    rows = pl.read_csv(tmp_path / "table.csv", infer_schema_length=0)
     assert rows["antenna"].unique(maintain_order=True).to_list()[:2] == ["front", "rear"]
     assert rows["max"].cast(pl.Float64).min() > 0.0
 
 
-@pytest.mark.slow
-def test_nothing_is_wider_than_a_telephone(page: Path) -> None:
-    frame = page.with_name("frame.html")
-    frame.write_text(NARROW.replace("PAGE", page.name), encoding="utf-8")
-    said = Page(run_browser(frame, "--window-size=1000,3000", "--allow-file-access-from-files", "--dump-dom")).by_id(
-        "narrow"
-    )
-    assert (said["data-window"], said["data-page"]) == ("390", "390")
-    assert (said["data-over"], said["data-errors"]) == ("", "")
+@pytest.mark.parametrize("width", [390, 1400])
+def test_nothing_is_wider_than_the_window(page: Path, width: int) -> None:
+    wide = """width => [...document.querySelectorAll("body *")].filter(e => !e.closest(".scroll, svg, .modebar") &&
+        e.getBoundingClientRect().right > width + 1).map(e => e.tagName + "." + e.className).join(" ")"""
+    with visited(page, viewport={"width": width, "height": 844}) as shown:
+        shown.evaluate(DRAW_ALL)
+        shown.wait_for_timeout(300)
+        assert shown.evaluate("document.documentElement.scrollWidth") == width
+        assert shown.evaluate(wide, width) == ""
 
 
-@pytest.mark.slow
-def test_a_dark_page_is_dark(page: Path, tmp_path: Path) -> None:
-    """The charts follow the preference of the reader, and print stays light."""
-    probe = """<script>
-    const said = document.createElement("div"), figure = document.querySelector("figure[data-chart]");
-    figure.plot.draw();
-    said.id = "dark";
-    said.dataset.chart = figure.querySelector("canvas").getContext("2d").getImageData(2, 2, 1, 1).data.join(" ");
-    said.dataset.page = getComputedStyle(document.body).backgroundColor;
-    document.body.append(said);</script></body>"""
-    copy = tmp_path / "dark.html"
-    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", probe), encoding="utf-8")
-    seen = {
-        name: Page(run_browser(copy, "--window-size=1280,900", "--dump-dom", *options)).by_id("dark")
-        for name, options in (("light", ()), ("dark", ("--blink-settings=preferredColorScheme=0",)))
-    }
-    assert (seen["light"]["data-chart"], seen["light"]["data-page"]) == ("255 255 255 255", "rgb(255, 255, 255)")
-    assert (seen["dark"]["data-chart"], seen["dark"]["data-page"]) == ("20 24 28 255", "rgb(20, 24, 28)")
+@pytest.mark.parametrize(("scheme", "paper"), [("light", "rgb(255, 255, 255)"), ("dark", "rgb(20, 24, 28)")])
+def test_charts_follow_the_readers_preference(page: Path, scheme: str, paper: str) -> None:
+    with visited(page, color_scheme=scheme) as shown:
+        colours = shown.evaluate(
+            """() => [getComputedStyle(document.body).backgroundColor,
+            getComputedStyle(document.querySelector("figure[data-drawn] .main-svg")).backgroundColor]"""
+        )
+    assert colours == [paper, paper]
 
 
 @pytest.mark.slow
@@ -278,7 +245,7 @@ def test_it_prints_whole(page: Path, tmp_path: Path) -> None:
     text = " ".join(told("pdftotext", "-layout", str(paper), "-").split())
     for words in ("Figures of merit", "Settings asked for and used", "min_satellites", "SHA-256", "rear antenna"):
         assert words in text
-    # what is written along the axes of the pictures is text on paper too: every one is there
+    # what is written along the axes of the charts is text on paper too: every one is there
     read = Page(page.read_text(encoding="utf-8"))
     charts = [json.loads(read.text[f["data-chart"]]) for f in read.figures if "skyplot" not in f["class"]]
     labels = Counter(values["x_label"] for values in charts)

@@ -22,7 +22,7 @@ from railfix.track.network_match import match, read_plan_positions
 from railfix.track.network_read import check_network, links_of_ends, read_network
 from railfix.track.network_route import find_route
 from railfix.track.route import MapReading
-from report_page import Page, browser, fetched, opened
+from report_page import browser, fetched, visited
 from route_matcher import matched_track
 
 pytestmark = pytest.mark.requirement("A10")
@@ -259,9 +259,38 @@ def test_page_has_the_network_its_faults_and_the_run(tmp_path: Path) -> None:
     row = text[text.index('<th scope="row">02</th>') :].split("</tr>")[0]
     assert ["1,120" in row, ">0a<" in row, ">0b<" in row, f"{(on == 2).sum()}<" in row] == [True] * 4
     if browser() is not None:
-        shown = Page(opened(page))
-        assert shown.text.get("railfix-errors", "") == ""
-        assert len(shown.figures) == 1
+        with visited(page, viewport={"width": 1400, "height": 900}) as shown:
+            finding = shown.locator("table[data-name=findings] tbody th a").first
+            east, north = map(float, str(finding.get_attribute("href")).removeprefix("#plan:").split(","))
+            finding.click()
+            shown.wait_for_function("document.querySelector('figure').plot.range('xaxis')[1] < 1000")
+            ranges = shown.evaluate("['xaxis', 'yaxis'].map(axis => document.querySelector('figure').plot.range(axis))")
+            for (low, high), place in zip(ranges, (east, north), strict=True):
+                assert low < place < high
+                assert high - low < 1000.0
+
+
+@pytest.mark.skipif(browser() is None, reason="no chromium is installed")
+def test_names_of_tracks_do_not_lie_over_one_another_and_come_with_the_zoom(tmp_path: Path) -> None:
+    net = made_network(10.0)
+    x = np.linspace(0.0, 440.0, 23)
+    many = [segment(f"a track with the name {k}", *to_degrees(x, 0.0 * x + 6.0 * k)) for k in range(1, 40)]
+    page = tmp_path / "network.html"
+    crowded = replace(net, tracks=(*net.tracks, *many))
+    write_network_page(crowded, check_network(net), page)
+    with visited(page, viewport={"width": 1400, "height": 900}) as shown:
+        labels = "Number(document.querySelector('figure').dataset.labels)"
+        some = int(shown.evaluate(labels))
+        assert 0 < some < 39
+        shown.evaluate(
+            """() => { const plot = document.querySelector("figure").plot;
+            const names = plot.layers.find(layer => layer.kind === "marks");
+            const x = names.x[20], y = names.y[20];
+            Plotly.relayout(plot.div, { "xaxis.range": [x - 20, x + 20], "yaxis.range": [y - 10, y + 10] }); }"""
+        )
+        # three or four tracks are in view: each has its name
+        shown.wait_for_function(f"{labels} <= 4")
+        assert int(shown.evaluate(labels)) >= 1
 
 
 def test_plan_of_a_large_network_is_thinned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

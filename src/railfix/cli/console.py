@@ -101,7 +101,7 @@ def _judge(row: Mapping[str, Any]) -> str:
 
 def prepare_kernels() -> None:
     """Compile the kernels that this machine has no code of, before a command needs them."""
-    if kernels.missing():
+    if not kernels.is_compiled():
         import_module("railfix.live.warm_up").prepare_kernels()
 
 

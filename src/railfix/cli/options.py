@@ -35,14 +35,6 @@ VerboseOption = Annotated[
     bool,
     typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables of statuses and reasons."),
 ]
-LenientOption = Annotated[
-    bool,
-    typer.Option(
-        "--lenient",
-        rich_help_panel="Choices",
-        help="Count broken lines of the input files and continue, instead of stopping.",
-    ),
-]
 
 
 def overwriting(asked: bool) -> Overwrite:

@@ -67,7 +67,7 @@ def run(
 
 @from_models
 def live(
-    inputs: LiveInputs,
+    inputs: Annotated[LiveInputs, Without("reader")],
     choices: Choices,
     *,
     live_setting: Annotated[

@@ -35,6 +35,7 @@ FilePath = str | PathLike[str]
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
 #: What a reader does with a broken line: stop with an error, or leave it out and count it.
 BrokenLines = Literal["stop", "count"]
+Reader = Literal["railfix", "georinex"]  #: What reads RINEX observation files.
 #: Last clause of the error of a broken line: how to go on.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 

@@ -63,6 +63,8 @@ class Reason(IntFlag):
     LASTING_ERROR = 1 << 20
     #: Left out by the setting `exclude`.
     EXCLUDED_BY_SETTING = 1 << 21
+    #: Off by more than 100 m, where the others agree on a place: the phase and the Doppler stay in the filter.
+    GROSS_ERROR = 1 << 22
 
 
 class Status(IntEnum):
@@ -113,7 +115,7 @@ POSITIONED: Final = (
 
 _ADDED: dict[str, Reason] = {}  #: Reasons of screens that are added to the package, by name in lower case.
 #: First free bit, and the last one of the tables' 32-bit column.
-_FIRST_FREE_BIT: Final = 22
+_FIRST_FREE_BIT: Final = 23
 _LAST_BIT: Final = 30
 
 

@@ -16,7 +16,7 @@ from pydantic import Field
 from railfix import __version__
 from railfix.core.arrays import Datetimes, Floats, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import file_sha256
+from railfix.core.files import Reader, file_sha256
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings, option
@@ -130,10 +130,14 @@ def base_station(
 
 
 def base_station_from_files(
-    paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
+    paths: Sequence[Path],
+    processor: EpochProcessor,
+    *,
+    position_ecef_m: Floats | None = None,
+    reader: Reader = "railfix",
 ) -> StationErrors:
     """Compute common range errors from RINEX files, by default at the header's position; InputFileError without one."""
-    parts = list(scan_observations(paths, epochs=20_000))
+    parts = list(scan_observations(paths, epochs=20_000, reader=reader))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
     if place is None or not np.isfinite(place).all() or np.linalg.norm(place) < 1e6:
         raise InputFileError(paths[0], "its header has no position; give that of the station (--base-position)")
@@ -322,7 +326,9 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErr
     state = State()
     base: StationErrors | None = None
     if source.base:
-        base = base_station_from_files(source.base, processor, position_ecef_m=source.base_position_ecef_m)
+        base = base_station_from_files(
+            source.base, processor, position_ecef_m=source.base_position_ecef_m, reader=past.options.logs.reader
+        )
     parts: list[ErrorSamples] = []
     times: list[np.datetime64] = []
     epochs = 0

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import TypedDict, Unpack, get_args
 
 import numpy as np
 
 from railfix.core.arrays import join_rows
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import BrokenLines, Paths, path_names
+from railfix.core.files import BrokenLines, Paths, Reader, path_names
 from railfix.core.timescale import gps_time
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
@@ -40,7 +40,7 @@ def read_observations(
     start: Time = None,
     end: Time = None,
     date: Time = None,
-    reader: Literal["railfix", "georinex"] = "railfix",
+    reader: Reader = "railfix",
 ) -> Observations:
     """Read the observations of one receiver from RINEX files or receiver logs.
 
@@ -67,34 +67,25 @@ def read_observations(
         A file cannot be read, or holds no observations that can be dated.
     MismatchError
         No epoch lies between `start` and `end`; receiver logs and RINEX files are mixed, or are to be read by georinex.
-    ModuleNotFoundError
-        georinex is not installed (``pip install railfix[notebook]``).
     """
-    if reader not in ("railfix", "georinex"):
-        raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
-    if reader == "georinex":
-        letters = None if systems is None else list(systems)
-        return _by_georinex(path_names(path), letters, _instant(start), _instant(end))
     pieces = scan_observations(
-        path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62
+        path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62, reader=reader
     )
     return concatenate(list(pieces))
 
 
 def _by_georinex(
     paths: list[str], systems: list[str] | None, start: np.datetime64 | None, end: np.datetime64 | None
-) -> Observations:
-    """Read RINEX files by georinex, in order of time."""
-    try:
-        import georinex
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("georinex is not installed; pip install 'railfix[notebook]'") from error
+) -> list[Observations]:
+    """Read RINEX files by georinex, one after the other in order of time."""
+    import georinex
+
     from railfix.io.georinex_layout import observations_from_xarray
 
     parts: list[Observations] = []
     for name in paths:
         if is_receiver_log(read_head(name)):
-            raise MismatchError(f"{name} is a receiver's log, and georinex reads RINEX; leave out reader")
+            raise MismatchError(f"{name} is a receiver's log, and georinex reads RINEX; leave out reader (--reader)")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # a default of xarray that georinex relies on
             try:
@@ -109,36 +100,54 @@ def _by_georinex(
     for part in parts[1:]:
         rest = part[int(np.searchsorted(part.time, joined[-1].time[-1], side="right")) :]
         joined += [with_break_at_gap(joined[-1], rest)] if len(rest) else []
-    return concatenate(joined)
+    return joined
+
+
+class _Selection(TypedDict, total=False):
+    """Arguments of `read_observations` that `scan_observations` takes as well."""
+
+    broken_lines: BrokenLines
+    systems: Iterable[str] | None
+    start: Time
+    end: Time
+    date: Time
 
 
 def scan_observations(
     path: Paths,
     *,
     epochs: int = DEFAULT_EPOCHS,
-    broken_lines: BrokenLines = "stop",
-    systems: Iterable[str] | None = None,
-    start: Time = None,
-    end: Time = None,
-    date: Time = None,
     progress: Callable[[float], None] | None = None,
+    reader: Reader = "railfix",
+    **selection: Unpack[_Selection],
 ) -> Iterator[Observations]:
-    """Observations of one receiver in pieces of `epochs` epochs at most, the first short; see `read_observations`."""
-    paths, letters = path_names(path), None if systems is None else list(systems)
+    """Observations of one receiver in pieces of `epochs` epochs at most, the first short.
+
+    `selection` are `broken_lines`, `systems`, `start`, `end` and `date` of `read_observations`; errors as there.
+    `progress` is called with the fraction of the files that has been read. georinex reads all files before the first
+    piece.
+    """
+    if reader not in get_args(Reader):
+        raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
+    paths, systems, date = path_names(path), selection.get("systems"), _instant(selection.get("date"))
+    letters = None if systems is None else list(systems)
+    start, end = (_instant(time) for time in (selection.get("start"), selection.get("end")))
+    if reader == "georinex":
+        return in_pieces(iter(_by_georinex(paths, letters, start, end)), epochs)
     if any(mate_table(p) == "S_GNSS_SAT" for p in paths):
-        return _mate_pieces(paths, letters, (_instant(start), _instant(end)), epochs)
+        return _mate_pieces(paths, letters, (start, end), epochs)
     receiver = [is_receiver_log(read_head(p)) for p in paths]
     if not any(receiver):
         return rinex.scan_observations(
-            paths, epochs=epochs, broken_lines=broken_lines, systems=letters, start=start, end=end, progress=progress
-        )
+            paths, epochs=epochs, broken_lines=selection.get("broken_lines", "stop"), systems=letters, start=start,
+            end=end, progress=progress,
+        )  # fmt: skip
     if not all(receiver):
         raise MismatchError(
             f"{paths[receiver.index(False)]} is RINEX and {paths[receiver.index(True)]} a receiver's log; "
             "give files of one kind for one antenna"
         )
-    limits = (_instant(start), _instant(end), _instant(date))
-    return in_pieces(_receiver_runs(paths, letters, limits, progress), epochs)
+    return in_pieces(_receiver_runs(paths, letters, (start, end, date), progress), epochs)
 
 
 def _mate_pieces(

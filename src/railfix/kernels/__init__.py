@@ -16,14 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["hypotheses", "level", "model", "off_tangent", "ranges", "reading", "robust", "screens", "search", "windows"]
 
-#: The compiled function of the filter.
-FILTER: Final = "advance"
-#: Environment variable of the process that compiles the filter alone: it leaves the kernels of single epochs as Python.
-FILTER_ALONE: Final = "RAILFIX_COMPILE_FILTER_ALONE"
-#: Where the recursion of the filter is.
-_FILTER_MODULE: Final = "tracking.recursion"
-#: Where the velocities are that it takes.
-_VELOCITY_MODULE: Final = "tracking.velocity"
+#: Modules with kernels that the filter calls.
+_FILTER_MODULES: Final = ("tracking.recursion", "tracking.velocity")
 
 
 def __getattr__(name: str) -> Any:
@@ -40,26 +34,22 @@ def numba_version() -> str:
 
 def _import_all() -> Any:
     """Import all kernels, and return the module that compiles them."""
-    for module in (_FILTER_MODULE, _VELOCITY_MODULE, *__all__):
+    for module in (*_FILTER_MODULES, *__all__):
         import_module(f"railfix.kernels.{module}")
     return import_module("railfix.kernels.compiling")
 
 
-def load() -> int:
-    """Load all compiled functions, so that none is loaded while epochs wait; return how many.
-
-    Those that this machine has no code of (`missing`) are compiled at their first call.
-    """
-    loaded: int = _import_all().load()
-    return loaded
+def load() -> None:
+    """Load the code of all kernels, so that none is loaded while epochs wait."""
+    _import_all().load()
 
 
-def missing() -> list[str]:
-    """Return the names of the functions that this machine has no code of."""
-    names: list[str] = _import_all().missing()
-    return names
+def is_compiled() -> bool:
+    """Return whether this machine has the code of all kernels; others are compiled at their first call."""
+    compiled: bool = _import_all().is_compiled()
+    return compiled
 
 
-def suppress_announcement() -> None:
-    """Leave out the line on compilation: the caller has printed it."""
-    import_module("railfix.kernels.compiling").ANNOUNCEMENT.said = True
+def record_compiled() -> None:
+    """Note that this process has compiled all kernels, and for which types of arguments."""
+    _import_all().record_compiled()

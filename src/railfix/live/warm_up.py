@@ -1,19 +1,16 @@
 """Compilation of all kernels at the first command on a machine: later ones load them from disk.
 
-Two processes share it: the recursion of the filter takes as long as all kernels of single epochs together. During a
-live session it would delay epochs by seconds, in a run nobody would know why nothing happens.
+During a live session it would delay epochs by seconds, in a run nobody would know why nothing happens.
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import hatanaka
 import numpy as np
@@ -23,83 +20,49 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.protection.open_places import Forms
 from railfix.integrity.raim.model import ModelArrays
 from railfix.io import read_navigation, read_observations
-from railfix.kernels.compiling import keep_resolutions
 from railfix.pipeline.config import parse_config
 from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
-_Settings: TypeAlias = tuple[tuple[dict[str, Any], int], ...]
-#: Settings and numbers of epochs that together call every kernel of single epochs but those of `_look_beyond`; the
-#: second has too few satellites for 3-D positions.
-_STAGES: Final[_Settings] = (
+#: Settings and numbers of epochs that together call every kernel but those of `_look_beyond`; the second has too few
+#: satellites for 3-D positions.
+_SETTINGS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
+    ({"filter": "track", "protection": "off"}, 8),
 )
-_FILTER: Final[_Settings] = (({"filter": "track", "protection": "off"}, 8),)
-#: Runs the filter with the stages as plain Python: another process compiles those.
-_PROGRAM = "from railfix.live.warm_up import compile_filter; compile_filter()"
 
 
 def prepare_kernels() -> bool:
     """Compile the kernels that this machine has no code of, and say so on a terminal; return whether there were any.
 
-    InputFileError: neither the package nor the clone has the files of the demonstration, on which they are compiled.
+    Epochs of the demonstration are processed at once and one by one: kernels are compiled for the arrays of both.
+    InputFileError: neither the package nor the clone has the files of the demonstration.
     """
-    missing = kernels.missing()
-    if not missing:
+    if kernels.is_compiled():
         return False
     begin = time.monotonic()
-    kernels.suppress_announcement()
-    _say("compiling for this processor, once: about forty seconds on two cores")
-    environment = {**os.environ, kernels.FILTER_ALONE: "1"}
-    if kernels.FILTER in missing:
-        with subprocess.Popen([sys.executable, "-c", _PROGRAM], env=environment, stderr=subprocess.PIPE) as other:
-            try:
-                _run(_STAGES)
-                _say(f"single epochs compiled after {time.monotonic() - begin:.0f} s; the filter still is")
-                _, error = other.communicate()
-            except BaseException:  # as the end by a signal, which would wait for it
-                other.kill()
-                raise
-        if other.returncode:
-            raise RuntimeError(f"the filter cannot be compiled: {error.decode(errors='replace').strip()}")
-    else:
-        _run(_STAGES)
-    _say(f"compiled in {time.monotonic() - begin:.0f} s; later commands load it")
+    _process()
+    _look_beyond()
+    kernels.record_compiled()
+    if sys.stderr.isatty():
+        sys.stderr.write(f"compiled in {time.monotonic() - begin:.0f} s; later commands load it\n")
     return True
 
 
-def compile_filter() -> None:
-    """Compile the recursion of the filter."""
-    _run(_FILTER)
-
-
-def _say(text: str) -> None:
-    if sys.stderr.isatty():
-        sys.stderr.write(text + "\n")
-
-
-def _run(settings: _Settings) -> None:
-    """Process epochs of the demonstration at once and one by one: kernels are compiled for the arrays of both."""
-    with keep_resolutions():
-        _process(settings)
-        if settings is _STAGES:
-            _look_beyond()
-
-
-def _process(settings: _Settings) -> None:
+def _process() -> None:
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
-    longest = max(epochs for _, epochs in settings)
+    longest = max(epochs for _, epochs in _SETTINGS)
     logs = {"front": _first_epochs(inputs.front[0], longest), "rear": _first_epochs(inputs.rear[0], longest)}
     strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
     logs = {name: _faulty(log, strongest) for name, log in logs.items()}
     paths = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
     navigation = read_navigation(inputs.nav)
-    for chosen, epochs in settings:
+    for chosen, epochs in _SETTINGS:
         processor, state = make_processor(parse_config(chosen), navigation, paths), None
         processor.process({name: log[:epochs] for name, log in logs.items()})
         for epoch in range(epochs):

@@ -41,6 +41,8 @@ _WEIGHED_BY_FILTER: Final = (
     | Reason.CN0_CURVE
     | Reason.ANTENNA_PAIR
 )
+#: Reasons against the code alone: the filter keeps the satellite's phase and Doppler.
+_CODE_ALONE: Final = Reason.GROSS_ERROR
 #: Slower than this, with two sigmas, the train stands [m/s]: 1 km/h, where tachometers give out too.
 STANDSTILL_MPS: Final = 1.0 / 3.6
 #: Places beyond an end of the line by so many sigmas, or so far [m], are on its end.
@@ -314,7 +316,8 @@ def gnss_epochs(
     slips, after = ranges.slips, state
     if slips is None:
         slips, after = find_slips(obs, state, frequency_hz=ranges.channels.every_frequency_hz, limits=config.slips)
-    healthy = (ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0
+    healthy = ((ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0) & ~ranges.unsure[:, None]
+    moving = (ranges.reason & ~int(_WEIGHED_BY_FILTER | _CODE_ALONE)) == 0
     phases, dopplers = ("phase" in config.filter_sources, "doppler" in config.filter_sources)
     no_delay, air = np.zeros(ranges.code_m.shape), ranges.troposphere_m
     phase = corrected_phase_m(
@@ -327,8 +330,8 @@ def gnss_epochs(
         time=obs.time, satellite=ranges.satellite, clock=ranges.channels.clock,
         sat_ecef_m=ranges.satellites.position_ecef_m, sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
         code_m=np.where(healthy, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
-        phase_m=np.where(healthy & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],
-        rate_mps=np.where(healthy & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
+        phase_m=np.where(moving & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],
+        rate_mps=np.where(moving & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
         cn0_dbhz=ranges.cn0_dbhz, off_map=np.zeros(len(obs.time), dtype=np.bool_),
     )  # fmt: skip
     return epochs, after

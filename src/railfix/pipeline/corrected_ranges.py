@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, copy_with, kernel_array
+from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, copy_with, kernel_array, patch_rows
 from railfix.core.epoch_rows import OnDemand
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
@@ -20,6 +20,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import Slips
+from railfix.positioning.gross_errors import gross_errors
 from railfix.positioning.normal_equations import Ranges, SinglePointLimits, single_point
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.two_frequencies import Combined, SecondCodes
@@ -67,6 +68,8 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     channels: Channels
     satellites: SatelliteStates
     anchor_arc_m: Floats  #: Of the point of the line nearest to the approximate place, shape (T,).
+    #: A code is grossly wrong, but not clearly which one: such epochs are no evidence on noise and map; shape (T,).
+    unsure: Masks
     #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
@@ -161,7 +164,9 @@ def correct_ranges(
     clean = code + states.clock_m - states.group_delay_m
     if isinstance(fixes, SatelliteCorrections):
         clean = clean + np.nan_to_num(fixes.fast_m)
-    anchor, anchor_arc = _anchor(antennas, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
+    raw = usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups)
+    anchor, anchor_arc, gross, unsure = _anchor(antennas, config, raw)
+    reason = np.where(gross, reason | int(Reason.GROSS_ERROR), reason)
     seen, frequency = SeenFrom.of(anchor, states.position_ecef_m), channels.frequency_hz
     if isinstance(sbas, SbasCorrections) and isinstance(fixes, SatelliteCorrections):
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
@@ -205,8 +210,9 @@ def correct_ranges(
     return CorrectedRanges(
         observations=obs, channels=channels, time=obs.time, break_before=obs.break_before, satellite=satellite,
         signal=signal, frequency_hz=frequency, code_m=code, doppler_hz=obs.doppler_hz[:, columns], cn0_dbhz=cn0,
-        satellites=states, anchor_ecef_m=anchor, anchor_arc_m=anchor_arc, elevation_deg=seen.elevation_deg,
-        azimuth_deg=seen.azimuth_deg, ionosphere_m=delays.ionosphere_m, troposphere_m=delays.troposphere_m,
+        satellites=states, anchor_ecef_m=anchor, anchor_arc_m=anchor_arc, unsure=unsure,
+        elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg,
+        ionosphere_m=delays.ionosphere_m, troposphere_m=delays.troposphere_m,
         corrected_code_m=clean, sigma_m=sigma, nominal_m=nominal, unmodelled_m=unmodelled, bound_sigma_m=bound,
         bias_m=bias,
         reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason), second=second, base=base,
@@ -229,8 +235,17 @@ def _by_error_model(
 _ANCHOR_WEIGHT: Final = np.array(1.0 / ANCHOR_SIGMA_M**2)
 
 
-def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> tuple[Floats, Floats]:
-    """Return an approximate place of the antenna, good to some hundred metres, shape (T, 3), and its arc length [m].
+class _Anchor(NamedTuple):
+    """Approximate place of the antenna, and raw codes that are wrong, T epochs by K channels."""
+
+    ecef_m: Floats  # (T, 3), good to some hundred metres
+    arc_m: Floats  # (T,), of the nearest point of the line
+    gross: Masks  # (T, K), codes that are grossly wrong
+    unsure: Masks  # (T,), epochs in which nothing tells which codes are wrong
+
+
+def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> _Anchor:
+    """Return an approximate place of the antenna by the raw codes that are not grossly wrong.
 
     The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
     the middle of the line at every epoch so that no epoch depends on another; the 3-D position
@@ -238,19 +253,29 @@ def _anchor(antennas: AntennaRows, config: Config, ranges: Ranges) -> tuple[Floa
     """
     middle = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(ranges.code_m[rows]), axis=0))
     point = single_point(ranges, middle, limits=_rough(config.single_point))
+    found = gross_errors(ranges, antennas, point)
+    again = np.flatnonzero(found.gross.any(axis=1))
+    if len(again):
+        ranges = without(ranges, found.gross)
+        point = patch_rows(
+            point, again, single_point(ranges.take(again), middle[again], limits=_rough(config.single_point))
+        )
     anchor = point.ecef_m.copy()
     arc, solved = np.full(len(anchor), np.nan), np.isfinite(anchor[:, 0])
-    for index, found in antennas.split(solved.nonzero()[0]):
-        distance, vertex = index.tree.query(anchor[found])
+    for index, rows in antennas.split(solved.nonzero()[0]):
+        distance, vertex = index.tree.query(anchor[rows])
         beside = np.asarray(distance) < BESIDE_THE_LINE_M
-        own, vertex = found[beside], np.asarray(vertex)[beside]
+        own, vertex = rows[beside], np.asarray(vertex)[beside]
         anchor[own], arc[own] = index.trajectory.ecef_m[vertex], index.arc_of_points_m[vertex]
     for index, rest in antennas.split((~solved).nonzero()[0]):
         best = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
         anchor[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
     for index, off in antennas.split(np.isnan(arc).nonzero()[0]):
         arc[off], _ = index.trajectory.nearest(anchor[off])
-    return anchor, arc
+    unsure = np.isfinite(found.unsure_arc_m)
+    arc = np.where(unsure, found.unsure_arc_m, arc)
+    anchor = np.where(unsure[:, None], antennas.at_arc(arc), anchor)
+    return _Anchor(anchor, arc, found.gross, unsure)
 
 
 @lru_cache

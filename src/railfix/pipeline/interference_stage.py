@@ -35,7 +35,13 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import ClockTies
 
 #: Reasons given because ranges contradict others: those of a spoofer do.
-_CONTRADICTED: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.ALONE_ON_ITS_CLOCK)
+_CONTRADICTED: Final = int(
+    Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
+)
+#: Reasons of satellites that are wrong by themselves, where they are few.
+_WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
+#: Satellites that are wrong by themselves at most: a spoofer has more of them.
+_MOST_WRONG: Final = 2
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Statuses of positions that spoofing outranks, and those that jamming does.
 _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
@@ -79,7 +85,10 @@ class Interference:
 class PositionEpochs(NamedTuple):
     """Results of single epochs that the signs are looked for in, T epochs."""
 
-    near_ecef_m: Floats  #: 3-D positions without the map, shape (T, 3).
+    #: 3-D positions without the map, of all ranges; and of those that agree, NaN where ranges contradict each other;
+    #: shape (T, 3).
+    point_ecef_m: Floats
+    consistent_ecef_m: Floats
     noise_scale: Floats  #: Shape (T,).
     ties: ClockTies  #: Inter-system biases known before each epoch.
 
@@ -89,12 +98,16 @@ def _motion_inputs(
 ) -> MotionInputs:
     """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
-    near, off_line = single.near_ecef_m[rows], np.empty(len(rows))
+    consistent, off_line = single.consistent_ecef_m[rows], np.empty(len(rows))
+    near = np.where(np.isnan(consistent), single.point_ecef_m[rows], consistent)
     first = 0
     for index, own in antennas.split(rows):
         part = slice(first, first := first + len(own))
         arc, offset = index.trajectory.nearest(near[part])
-        off_line[part] = np.where((arc > 0.0) & (arc < index.trajectory.arc_m[-1]), offset, np.nan)
+        inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1]) & np.isfinite(consistent[part, 0])
+        off_line[part] = np.where(inside, offset, np.nan)
+    wrong = (reason & _WRONG_ALONE) != 0
+    few = (wrong.sum(axis=1) <= _MOST_WRONG)[:, None]
     return MotionInputs(
         time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
         group=corrected.channels.clock_number,
@@ -103,7 +116,7 @@ def _motion_inputs(
         code_m=np.where((reason & _NOT_ITS_SIGNAL) == 0, code, np.nan),
         rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz[rows],
         corrected_code_m=corrected.corrected_code_m[rows], sigma_m=corrected.sigma_m[rows],
-        used=(reason & ~_CONTRADICTED) == 0, noise_scale=single.noise_scale[rows],
+        used=((reason & ~_CONTRADICTED) == 0) & ~(few & wrong), noise_scale=single.noise_scale[rows],
         clock_offset_m=single.ties.offset_m[rows], clock_sigma_m=single.ties.sigma_m[rows], off_line_m=off_line,
     )  # fmt: skip
 

@@ -312,7 +312,7 @@ class EpochProcessor:
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         own_states = [state.antennas.get(name) or AntennaState() for name in names]
         corrected, solution, own_states = solve(screened.corrected, antennas, self.config, own_states)
-        single = PositionEpochs(solution.point.ecef_m, solution.noise_scale, solution.ties)
+        single = PositionEpochs(solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties)
         interference, signs = judge_interference(
             corrected, single, antennas, [own.interference for own in own_states], self.config.interference
         )

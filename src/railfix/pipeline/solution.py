@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from scipy.special import chdtri, expit
@@ -40,6 +41,7 @@ from railfix.pipeline.solve import (
 from railfix.pipeline.state import AntennaState
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions
+from railfix.positioning.gross_errors import gross_alone
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
     NoiseState,
@@ -99,6 +101,8 @@ class Solution:
     """Positions of one antenna, T epochs, before coordinates are dropped where the status says so."""
 
     point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
+    #: 3-D positions of the ranges that agree, without excluded ones; NaN where they contradict each other; (T, 3).
+    consistent_ecef_m: Floats
     point_status: Codes  #: `railfix.pipeline.solve.PointStatus`, shape (T,).
     place: Place  #: Positions from the codes, after exclusions.
     ties: ClockTies  #: Inter-system biases known before each epoch.
@@ -135,6 +139,9 @@ def solve(
         time, corrected.clocks, reference, agreeing, free, offset_states,
         parts=antennas.parts, limits=config.clock_offsets,
     )  # fmt: skip
+    alone = gross_alone(ranges, point.clock_m, ties)
+    if alone.any():
+        corrected, ranges = corrected.reject(alone, Reason.GROSS_ERROR), without(ranges, alone)
     tied, untied = point, ranges
     if len(corrected.groups) > 1:
         ranges = replace(ranges, ties=ties)
@@ -167,7 +174,8 @@ def solve(
     constrained, redundancy = place.constrained, count_redundancy(ranges)
     model = model_again(model, ranges, antennas, constrained, np.flatnonzero(raim.excluded.any(axis=1)))
     off_map = _off_map(ranges, antennas, place, constrained.arc_m, config)
-    usable_for_noise = ~off_map & ~raim.faulty
+    noisy = constrained.wsse > _LARGEST_VARIANCE * np.maximum(redundancy, 1)
+    usable_for_noise = ~(off_map | raim.faulty | corrected.unsure | noisy)
     if "raim" not in config.screens:
         usable_for_noise[:] = False
     scale, stated_sums = noise_scale(
@@ -180,6 +188,7 @@ def solve(
         return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
 
     away, off_map_states = antennas.each_with_state(own_absence, states)
+    agreeing, free = _consistent(agreeing, free, lasting | raim.excluded, corrected, scale, config)
     offset, map_states = map_offset(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
@@ -219,7 +228,8 @@ def solve(
     if phase is not None:
         off_map = _off_map(ranges, antennas, place, arc, config)
     solution = Solution(
-        point=point, point_status=validate_point(point, untied, scale, limits=config.single_point), place=place,
+        point=point, consistent_ecef_m=free.ecef_m,
+        point_status=validate_point(point, untied, scale, limits=config.single_point), place=place,
         ties=ties, raim=raim, status=np.zeros(len(ranges), dtype=np.int8), noise_scale=scale, own_sigma_m=own_sigma,
         arc_m=arc, along_sigma_m=along_sigma, phase=phase, protection=level, map_offset=offset, off_map=away,
     )  # fmt: skip
@@ -260,6 +270,34 @@ def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config:
     return agreeing, patch_rows(point, changed, again)
 
 
+#: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.
+_LARGEST_VARIANCE: Final = 1e4
+#: Probability that the residuals of consistent ranges fail the test below.
+_CONSISTENT: Final = 1e-3
+
+
+def _consistent(
+    agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
+) -> tuple[Ranges, SinglePoint]:
+    """Return ranges and 3-D positions that judge the map: without the `excluded` satellites where all ranges together
+    contradict each other, NaN where they still do or nothing tells which one is wrong.
+    """
+
+    def contradict(point: SinglePoint, ranges: Ranges) -> Masks:
+        freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
+        return np.asarray(point.wsse > chdtri(freedom, _CONSISTENT) * np.maximum(scale, 1.0) ** 2)
+
+    wrong = excluded & (agreeing.weight > 0) & contradict(free, agreeing)[:, None]
+    changed = np.flatnonzero(wrong.any(axis=1))
+    if len(changed):
+        agreeing = without(agreeing, wrong)
+        start = np.where(np.isnan(free.ecef_m), corrected.anchor_ecef_m, free.ecef_m)[changed]
+        solved = single_point(agreeing.take(changed), start, limits=config.single_point)
+        free = patch_rows(free, changed, solved)
+    unusable = corrected.unsure | contradict(free, agreeing)
+    return agreeing, copy_with(free, ecef_m=np.where(unusable[:, None], np.nan, free.ecef_m))
+
+
 def _fit_on_line(
     corrected: CorrectedRanges, ranges: Ranges, antennas: AntennaRows, place: Place, config: Config
 ) -> tuple[RobustFit, Masks]:
@@ -269,7 +307,8 @@ def _fit_on_line(
     at = np.where(known[:, None], antennas.at_arc(arc), corrected.anchor_ecef_m)
     information = compute_information(antennas.get_axes(section), antennas.sigma_plan_m, antennas.sigma_height_m)
     fit = robust_fit(ranges, at, information=information, limits=config.robust_fit)
-    return fit, known & ~_off_map(ranges, antennas, place, arc, config)
+    usable = known & ~corrected.unsure & ~(fit.variance > _LARGEST_VARIANCE)
+    return fit, usable & ~_off_map(ranges, antennas, place, arc, config)
 
 
 def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges) -> Floats:

@@ -112,16 +112,8 @@ def to_xarray(
         of `CHANNEL_COLUMNS` over ``time`` and ``channel``, each with its ``units`` and meaning (``long_name``); the
         positions also as ``ecef_m`` and ``conventional_ecef_m`` over ``xyz`` and along the trajectory (``arc_m``).
         ``satellite`` and ``signal`` are coordinates of ``channel``.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        xarray is not installed (``pip install railfix[notebook]``).
     """
-    try:
-        import xarray as xr
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("xarray is not installed; pip install 'railfix[notebook]'") from error
+    import xarray as xr
 
     def variables(columns: Mapping[str, Column[Any]], source: Any, axes: tuple[str, ...]) -> dict[str, Any]:
         shape = result.reason.shape[: len(axes)]

@@ -9,12 +9,15 @@ pulls with the same force.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Integers, Masks, kernel_array
-from railfix.positioning.normal_equations import Ranges, normal_equations
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint, normal_equations
+from railfix.track.trajectory import Trajectory
 
 #: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].
 GROSS_M: Final = 100.0
@@ -153,3 +156,141 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     rest = replace(ranges, weight=np.where(found, 0.0, ranges.weight))
     enough = (_freedom(rest, 3) >= _LEFT_IN_SPACE) & np.isfinite(place[:, 0])
     return np.asarray(found & enough[:, None])
+
+
+#: Distance between the points of a line that are tried, and between those around the best one [m].
+_COARSE_M: Final = 100.0
+_FINE_M: Final = 12.5
+#: Points times epochs times channels that are computed at once.
+_BLOCK: Final = 2_000_000
+#: Other accusations must cost so much more: a share of one gross error.
+_CLEAR: Final = 0.7
+#: Redundant ranges that agree with a point of the line.
+_LEFT_ON_LINE: Final = 2
+
+
+class LineScan(NamedTuple):
+    """Best points of a line for raw ranges of T epochs by M channels."""
+
+    arc_m: Floats  #: Point with the least cost, shape (T,).
+    gross: Masks  #: Ranges that are off there by more than `GROSS_M`, shape (T, M).
+    agreed: Masks  #: Redundant ranges agree with the point, shape (T,).
+    clear: Masks  #: Points that accuse other ranges cost clearly more, shape (T,).
+
+
+def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
+    """Find the points of a line that most raw ranges agree on.
+
+    The cost of a point is the sum of the residuals about the median of their clock, each counted with `GROSS_M` at
+    most: a larger error costs no more. Points `_COARSE_M` apart are tried, then those around the best one.
+    """
+    epochs = len(ranges)
+    nodes = np.linspace(line.arc_m[0], line.arc_m[-1], max(int(np.ceil(np.ptp(line.arc_m) / _COARSE_M)), 1) + 1)
+    steps = np.arange(-8, 9) * _FINE_M
+    arc, gross = np.empty(epochs), np.empty(ranges.weight.shape, dtype=np.bool_)
+    residual, clear = np.empty(ranges.weight.shape), np.empty(epochs, dtype=np.bool_)
+    count = max(_BLOCK // (len(nodes) * max(ranges.weight.shape[1], 1)), 1)
+    for first in range(0, epochs, count):
+        rows = slice(first, min(first + count, epochs))
+        part = ranges.take(np.arange(rows.start, rows.stop))
+        coarse = _line_residuals(part, np.broadcast_to(line.at_arc(nodes), (len(part), len(nodes), 3)))
+        cost = _capped_cost(coarse)
+        near = np.clip(nodes[cost.argmin(axis=1)][:, None] + steps, nodes[0], nodes[-1])
+        fine = _line_residuals(part, line.at_arc(near.ravel()).reshape(*near.shape, 3))
+        own = _capped_cost(fine)
+        each, best = np.arange(len(part)), own.argmin(axis=1)
+        arc[rows], residual[rows] = near[each, best], fine[each, best]
+        gross[rows] = np.abs(residual[rows]) > GROSS_M
+        others = ((np.abs(coarse) > GROSS_M) & ~gross[rows][:, None]).any(axis=2)
+        rival = np.where(others, cost, np.inf).min(axis=1)
+        clear[rows] = rival - own[each, best] > _CLEAR * GROSS_M
+    rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
+    agreed = (_freedom(rest, 1) >= _LEFT_ON_LINE) & (_median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M)
+    return LineScan(arc, gross, agreed, clear)
+
+
+def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
+    """Return residuals at N places of each epoch, (T, N, 3) [m], each clock at its median, (T, N, M); NaN: not used."""
+    used, satellite = ranges.weight > 0, ranges.sat_ecef_m
+    square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
+    square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]
+    turn = satellite[:, None, :, 0] * place_ecef_m[..., 1, None] - satellite[:, None, :, 1] * place_ecef_m[..., 0, None]
+    value = ranges.code_m[:, None] - np.sqrt(square) - EARTH_ROTATION_RATE / SPEED_OF_LIGHT * turn
+    value = np.where(used[:, None], value, np.inf)
+    for group in ranges.groups:
+        n = used[:, group].sum(axis=1)
+        ordered = np.sort(value[..., group], axis=2)
+        middle = [np.maximum(k, 0)[:, None, None] for k in ((n - 1) // 2, n // 2)]
+        low, high = (np.take_along_axis(ordered, np.minimum(k, max(ordered.shape[2] - 1, 0)), axis=2) for k in middle)
+        some = (n > 0)[:, None, None]
+        value[..., group] -= np.where(some, 0.5 * (np.where(some, low, 0.0) + np.where(some, high, 0.0)), 0.0)
+    return np.asarray(np.where(used[:, None], value, np.nan))
+
+
+def _capped_cost(residual_m: Floats) -> Floats:
+    """Return the sum of absolute residuals, each with `GROSS_M` at most, shape (T, N)."""
+    return np.asarray(np.nansum(np.minimum(np.abs(residual_m), GROSS_M), axis=2))
+
+
+class GrossErrors(NamedTuple):
+    """Gross errors of raw ranges, T epochs by M channels."""
+
+    gross: Masks  #: Ranges that are grossly wrong, shape (T, M).
+    #: Arc of the best point of the line where nothing tells which range is grossly wrong; NaN elsewhere; shape (T,).
+    unsure_arc_m: Floats
+
+
+#: Root of the sum of squared raw residuals up to which an epoch is not examined; distance of its position from the
+#: line from which on it is [m].
+_QUIET_M: Final = 30.0
+_BESIDE_M: Final = 1000.0
+
+
+def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> GrossErrors:
+    """Find grossly wrong codes among raw ranges; `point`: their 3-D positions by least squares.
+
+    Epochs with large residuals, or positions far from the line, are examined: by the point of the line that most ranges
+    agree on, where redundant ranges do and no other accusation costs about as little; where the ranges agree with no
+    point of the line, in space.
+    """
+    gross, unsure = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
+    located = np.isfinite(point.ecef_m[:, 0])
+    suspect = ~located | ~(np.sqrt(np.nansum(point.residual_m**2, axis=1)) < _QUIET_M)
+    for index, rows in antennas.split(np.flatnonzero(located)):
+        suspect[rows] |= np.asarray(index.tree.query(point.ecef_m[rows])[0]) > _BESIDE_M
+    suspect &= _freedom(ranges, 1) > 0
+    for index, rows in antennas.split(np.flatnonzero(suspect)):
+        part = ranges.take(rows)
+        scan = scan_line(part, index.trajectory)
+        sure = scan.agreed & scan.clear
+        gross[rows[sure]] = scan.gross[sure]
+        unsure[rows[~sure]] = scan.arc_m[~sure]
+        left = np.flatnonzero(~scan.agreed)
+        if len(left):
+            found = gross_in_space(part.take(left), np.repeat(index.middle_ecef_m[None], len(left), axis=0))
+            gross[rows[left]] = found
+            unsure[rows[left[found.any(axis=1)]]] = np.nan
+    return GrossErrors(gross, unsure)
+
+
+def gross_alone(ranges: Ranges, clock_m: Floats, ties: ClockTies) -> Masks:
+    """Return the ranges that are alone on their clock and off by more than `GROSS_M` by the known biases, shape (T, M).
+
+    Nothing contradicts such a range while its clock is free. `clock_m` are the clocks of a position with free clocks,
+    shape (T, G); the common clock is their median by satellites, less the biases.
+    """
+    found = np.zeros(ranges.weight.shape, dtype=np.bool_)
+    count = np.add.reduceat((ranges.weight > 0).astype(np.int64), ranges.starts, axis=1)
+    known = (ties.sigma_m < UNTIED_M) & np.isfinite(clock_m)
+    rows = np.flatnonzero((known & (count == 1)).any(axis=1) & (known & (count > 1)).any(axis=1))
+    if not len(rows):
+        return found
+    common = np.where(known, clock_m - ties.offset_m, np.inf)[rows]
+    order = np.argsort(common, axis=1)
+    weight = np.take_along_axis(np.where(known, count, 0)[rows], order, axis=1).cumsum(axis=1)
+    middle = (2 * weight >= weight[:, -1:]).argmax(axis=1)
+    median = np.take_along_axis(common, order, axis=1)[np.arange(len(rows)), middle]
+    wrong = known[rows] & (count[rows] == 1) & (np.abs(common - median[:, None]) > GROSS_M)
+    for g, group in enumerate(ranges.groups):
+        found[rows, group] = wrong[:, g, None] & (ranges.weight[rows, group] > 0)
+    return found

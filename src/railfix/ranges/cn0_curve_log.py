@@ -12,7 +12,7 @@ import numpy as np
 from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import BrokenLines, file_sha256
+from railfix.core.files import BrokenLines, Reader, file_sha256
 from railfix.core.geodesy import elevation_azimuth
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
@@ -58,6 +58,7 @@ def cn0_curve_from_log(
     position_ecef_m: Floats | None = None,
     fit: CurveFit | None = None,
     broken_lines: BrokenLines = "stop",
+    reader: Reader = "railfix",
 ) -> Cn0Calibration:
     """Fit a curve on the log of a receiver, about a day, whose antenna stood under open sky.
 
@@ -70,7 +71,7 @@ def cn0_curve_from_log(
     samples, seen, below = Cn0Samples(), 0, 0
     header: ObservationHeader | None = None
     start, end, epochs = np.datetime64("NaT", "ns"), np.datetime64("NaT", "ns"), 0
-    for part in scan_observations(list(observations), broken_lines=broken_lines):
+    for part in scan_observations(list(observations), broken_lines=broken_lines, reader=reader):
         if header is None:
             header, start = part.header, part.time[0]
             place = header.approximate_ecef_m if position_ecef_m is None else position_ecef_m

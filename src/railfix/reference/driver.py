@@ -18,7 +18,7 @@ from pydantic import Field
 
 from railfix import __version__
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import BrokenLines
+from railfix.core.files import BrokenLines, Reader
 from railfix.core.settings import Settings, option
 from railfix.gnss.observations import concatenate
 from railfix.io.logs import read_navigation
@@ -32,6 +32,7 @@ from railfix.reference.fixes import FixRejection, ReferenceSettings
 from railfix.reference.smoother import Built
 from railfix.run.inputs import (
     BROKEN_LINES,
+    READER,
     TRACK,
     VEHICLE,
     Antenna,
@@ -103,6 +104,7 @@ class ReferenceOptions(Settings):
     date: dt.date | None = option(
         "UTC date of an NMEA log without RMC sentences, or of an RTCM 3 log.", None, metavar="DATE"
     )
+    reader: Reader = READER
     broken_lines: BrokenLines = BROKEN_LINES
 
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
@@ -241,7 +243,9 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
         date = None if options.date is None else np.datetime64(options.date, "ns")
         navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=date)
         for name, paths in inputs.logs.items():
-            log = Log(paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines, date=date)
+            log = Log(
+                paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines, date=date, reader=options.reader
+            )
             antenna_dopplers = dopplers_of_log(
                 concatenate(list(log.parts())), navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS
             )

@@ -90,7 +90,8 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
 def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Path:
     """Write a campaign as one HTML page that opens without a network; return its path."""
     runs, *rest = report.tables
-    blocks: list[Block] = [*rest[::-1], runs, *([Notes("Notes", report.notes)] if report.notes else [])]
+    # what has failed stands first
+    blocks: list[Block] = [*rest, runs, *([Notes("Notes", report.notes)] if report.notes else [])]
     lead = [Sentence(f"{sentence[0].upper()}{sentence[1:]}.") for sentence in report.sentences]
     write_whole(path, charts_page(title, report.charts, blocks, lead=lead), what="page")
     return path
@@ -188,6 +189,8 @@ def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[s
     lines = [
         f"{len(done):,} of {plural(whole, 'run')} done, {int(done['epochs'].sum() or 0):,} epochs of their antennas"
     ]
+    if failed:
+        lines.append(f"{plural(failed, 'run')} failed; the first: {whole.filter(status='failed')['error'][0]}")
     if quantity:
         worst = done.sort(f"{quantity}_p95", descending=True, nulls_last=True).row(0, named=True)
         word = {"error_m": "error", "protection_level_m": "level", "along_sigma_m": "standard deviation"}[quantity]
@@ -200,6 +203,4 @@ def _sentences(whole: pl.DataFrame, done: pl.DataFrame, quantity: str) -> list[s
         lines.append(f"{over:,} errors are over their level" if over else "no error is over its level")
     elif quantity:
         lines.append("no reference was given: `reference` in the campaign file gives the errors")
-    if failed:
-        lines.append(f"{plural(failed, 'run')} failed; the first: {whole.filter(status='failed')['error'][0]}")
     return lines

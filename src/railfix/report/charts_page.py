@@ -17,6 +17,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 from numpy.typing import NDArray
+from plotly.offline import get_plotlyjs
 
 from railfix import __version__
 from railfix.core.arrays import Floats
@@ -25,7 +26,7 @@ from railfix.core.files import read_json_object, write_whole
 from railfix.core.tables import Table, number, plural, share
 from railfix.core.timescale import seconds
 from railfix.report.plots.chart import Cells, Chart, Layer, Points, SkyEpochs
-from railfix.report.plots.network import network_plan
+from railfix.report.plots.network import network_frame, network_plan
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
 from railfix.track.network_read import NetworkQuality
@@ -211,8 +212,9 @@ class Figure:
     chart: Chart | SkyEpochs
     json: Markup
     width: str
-    sky: str
-    zoomed_with: str
+    sky: str  #: Id of the sky plot that shows the epoch of a click; empty without one.
+    zoomed_with: str  #: Charts with the same word share the range of their x axis.
+    linked: str  #: Charts with the same word show the same epochs.
 
     @property
     def is_sky(self) -> bool:
@@ -253,9 +255,14 @@ def render(template: str, title: str, **content: Any) -> str:
         version=__version__,
         policy=_POLICY,
         style=_resource("page.css"),
-        scripts=(_resource("errors.js"), _resource("page.js")),
+        scripts=(_resource("errors.js"), chart_library(), _resource("page.js")),
         **content,
     )
+
+
+def chart_library() -> Markup:
+    """Return the script of plotly.js, which draws the charts."""
+    return Markup(get_plotlyjs())
 
 
 def _resource(name: str) -> Markup:
@@ -279,21 +286,24 @@ def figure(
     group: Group | None = None,
     sky: str = "",
     anchor: str = "",
+    linked: str = "",
     width: str = "",
 ) -> Figure:
     """Return a chart with its values, linked with the sky plot and the charts of an axis that belong to it."""
     values: dict[str, Any]
     if isinstance(chart, SkyEpochs):
-        values, linked, axis, width = sky_values(chart), sky, "", "wide"
+        values, chosen_in, axis, width = sky_values(chart), sky, "", "wide"
     else:
         clickable = any(isinstance(layer, Points) and layer.epoch_s is not None for layer in chart.layers)
         values = chart_values(chart, group.start if group is not None and clickable else None)
-        linked = sky if clickable else ""
+        chosen_in = sky if clickable else ""
+        linked = linked if clickable else ""
         axis = f"{anchor}-{chart.common_axis}" if chart.common_axis else ""
         width = width or chart.width
     return Figure(
-        number=next(numbers), chart=chart, json=Markup(script_json(values)), width=width, sky=linked, zoomed_with=axis
-    )
+        number=next(numbers), chart=chart, json=Markup(script_json(values)), width=width, sky=chosen_in,
+        zoomed_with=axis, linked=linked,
+    )  # fmt: skip
 
 
 #: Tracks that are listed at most.
@@ -313,10 +323,11 @@ def write_network_page(
 def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Matched] | None) -> Sequence[Block]:
     beside = {end: ", ".join(network.names[t] for t, _ in others) for end, others in network.passages.items()}
     seen = np.zeros(len(network.tracks), dtype=np.int64)
+    dead_ends = sum(f.kind == "dead end" for f in quality.findings)
     blocks: list[Block] = [
         Sentence(
             f"{quality.ends:,} ends without a connection, {plural(quality.parts, 'separate part')}, "
-            f"{sum(f.kind != 'dead end' for f in quality.findings):,} findings."
+            f"{len(quality.findings):,} findings, {dead_ends:,} of them dead ends."
         )
     ]
     if run is not None:
@@ -333,15 +344,16 @@ def _tables(network: Network, quality: NetworkQuality, run: tuple[PlanLog, Match
     if network.notes:
         blocks.append(Notes("Notes", network.notes))
     if quality.findings:
+        listed = quality.findings[:_LISTED]
+        plane = network_frame(network).to_plane(*np.array([(f.latitude_deg, f.longitude_deg) for f in listed]).T)
         blocks.append(
             Table(
                 name="findings",
+                # a click moves the plan to the finding
+                links=[f"#plan:{east:.1f},{north:.1f}" for east, north in plane],
                 head=("kind", "latitude", "longitude", "finding"),
-                rows=[
-                    (f.kind, f"{f.latitude_deg:.6f}", f"{f.longitude_deg:.6f}", f.sentence)
-                    for f in quality.findings[:_LISTED]
-                ],
-                caption=f"Findings: {len(quality.findings):,}",
+                rows=[(f.kind, f"{f.latitude_deg:.6f}", f"{f.longitude_deg:.6f}", f.sentence) for f in listed],
+                caption=f"Findings: {len(quality.findings):,}, {dead_ends:,} of them dead ends",
                 numeric=(1, 2),
             )
         )

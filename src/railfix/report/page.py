@@ -280,7 +280,9 @@ def _run(
         "anchor": anchor,
         "antenna": first,
         "headline": headline(run, first, evaluation),
-        "overview": _part(overview(run, first, background), numbers, place(0), anchor, width="half"),
+        "overview": _part(
+            overview(run, first, background), numbers, place(0), anchor, linked=f"{anchor}-0", width="half"
+        ),
         "tables": (
             *errors,
             Folded("Epochs and pseudoranges", budget(run)),
@@ -294,7 +296,7 @@ def _run(
                 "name": antenna,
                 "anchor": f"{anchor}-{i}",
                 "parts": [
-                    _part(group, numbers, place(i), anchor)
+                    _part(group, numbers, place(i), anchor, linked=f"{anchor}-{i}")
                     for group in antenna_groups(run, antenna, sky=sky, background=background)
                 ],
             }
@@ -303,6 +305,11 @@ def _run(
     }
 
 
-def _part(group: Group, numbers: Iterator[int], sky: str, anchor: str, *, width: str = "") -> PagePart:
-    figures = [figure(chart, numbers, group=group, sky=sky, anchor=anchor, width=width) for chart in group.charts]
+def _part(
+    group: Group, numbers: Iterator[int], sky: str, anchor: str, *, linked: str = "", width: str = ""
+) -> PagePart:
+    figures = [
+        figure(chart, numbers, group=group, sky=sky, anchor=anchor, linked=linked, width=width)
+        for chart in group.charts
+    ]
     return PagePart(title=group.title, figures=figures, absent=group.absent)

@@ -150,7 +150,7 @@ def open_inputs(
     def open_log(paths: tuple[Path, ...]) -> Log:
         return Log(
             paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, start=options.start,
-            end=options.end, date=options.logs.instant,
+            end=options.end, date=options.logs.instant, reader=options.logs.reader,
         )  # fmt: skip
 
     from railfix.run.route import LogPositions

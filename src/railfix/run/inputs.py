@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import BrokenLines, fingerprint
+from railfix.core.files import BrokenLines, Reader, fingerprint
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.io.position_log import column_names
 from railfix.io.receiver.framing import is_receiver_log, read_head
@@ -319,8 +319,17 @@ class ColumnNames(Settings):
         return column_names(self.column)
 
 
+READER: Final[Any] = option(
+    "What reads RINEX observation files: railfix, or georinex, an independent reader to compare with, which is slower, "
+    "reads whole files at once, and knows neither events nor broken lines.",
+    "railfix",
+)
+
+
 class LogReading(Settings):
     """How to read receiver logs."""
+
+    reader: Reader = READER
 
     date: datetime | None = option(
         "Some time within half a week of RTCM 3 logs, GPS time: their observations carry no week.", None, metavar="TIME"

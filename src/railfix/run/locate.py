@@ -56,10 +56,11 @@ def locate_files(
 ) -> LocateSummary:
     """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single)."""
     inputs.check_files()
-    date = (reading or LogReading()).instant
+    reading = reading or LogReading()
+    date = reading.instant
     navigation = read_navigation(inputs.nav, date=date)
     received = known_from_start(config, navigation=navigation)
-    log = Log(paths=inputs.log, chunk_epochs=_CHUNK_EPOCHS, date=date)
+    log = Log(paths=inputs.log, chunk_epochs=_CHUNK_EPOCHS, date=date, reader=reading.reader)
     book = ChannelBook(config)
     parts = [locate(part, received, config, book) for part in log.parts()]
     located = join_rows(parts)
@@ -227,7 +228,8 @@ def survey_files(
     twice = {path for path in paths if sum(path.samefile(other) for other in paths) > 1}
     if twice:
         raise InputFileError(min(twice), "is given twice; name each run once")
-    date = (reading or LogReading()).instant
+    reading = reading or LogReading()
+    date = reading.instant
     runs: list[SurveyRun] = []
     notes: list[str] = []
     of_nav: Navigation | None = None
@@ -245,7 +247,9 @@ def survey_files(
                 raise InputFileError(path, f"{message}; positions are files {', '.join(POSITION_ENDINGS)}")
             of_nav = read_navigation((path,), date=date) if own else of_nav or read_navigation(tuple(nav), date=date)
             received = known_from_start(config, navigation=of_nav)
-            observed = Log(paths=(path,), chunk_epochs=_CHUNK_EPOCHS, broken_lines=broken_lines, date=date)
+            observed = Log(
+                paths=(path,), chunk_epochs=_CHUNK_EPOCHS, broken_lines=broken_lines, date=date, reader=reading.reader
+            )
             runs.append(survey_run(observed.parts(), received, config, limits, name=str(path)))
             notes += [*received.notes, *observed.problems]
             of_nav = None if own else of_nav

@@ -141,6 +141,10 @@ def base_log(paths: tuple[Path, ...], options: RunOptions) -> BaseLog | None:
     if not paths:
         return None
     log = Log(
-        paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, date=options.logs.instant
+        paths=paths,
+        chunk_epochs=options.chunk_epochs,
+        broken_lines=options.broken_lines,
+        date=options.logs.instant,
+        reader=options.logs.reader,
     )
     return BaseLog(log, options.base_place)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from railfix.core.errors import MismatchError, SettingsError
-from railfix.core.files import BrokenLines
+from railfix.core.files import BrokenLines, Reader
 from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import scan_observations
@@ -225,6 +225,7 @@ class Log:
     start: datetime | None = None
     end: datetime | None = None
     date: np.datetime64 | None = None  #: Of RTCM 3 logs; see `railfix.run.inputs.LogReading`.
+    reader: Reader = "railfix"
     share: float = 0.0  #: Part of the files that has been read, 0 to 1.
     problems: list[str] = field(default_factory=list)  #: Sentences on what was broken and passed over.
     skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
@@ -239,6 +240,7 @@ class Log:
             end=None if self.end is None else np.datetime64(self.end, "ns"),
             date=self.date,
             progress=self._read_to,
+            reader=self.reader,
         )
         for piece in pieces:
             self.problems += piece.problems

@@ -308,7 +308,15 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
 
 
 def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observations:
-    log = Log(paths=paths, chunk_epochs=3000, start=options.start, end=options.end, date=options.logs.instant)
+    logs = options.logs
+    log = Log(
+        paths=paths,
+        chunk_epochs=3000,
+        start=options.start,
+        end=options.end,
+        date=logs.instant,
+        reader=logs.reader,
+    )
     parts = list(log.parts())
     if not parts:
         raise InputFileError(paths[0], "there is no epoch in the time asked for")

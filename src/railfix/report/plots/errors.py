@@ -290,7 +290,8 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     """Return levels over the time since `start`, or over the chainage without one."""
     layers: list[Layer] = []
     shown = total = 0
-    largest = alarm_limit_m
+    # levels matter near the alarm limit: a few far beyond it do not set the axis
+    top = 2.0 * alarm_limit_m
     epoch = since(positions, find_start(positions))
     x = floats(positions, "chainage_m") if start is None else epoch
     for (label, column), colour in zip(_PARTS, (*CYCLE[2:6], BLUE), strict=True):
@@ -300,14 +301,13 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
         if not len(rows) or not (level[rows] > 0.0).any():
             continue
         shown, total = shown + len(rows), total + int(np.isfinite(level).sum())
-        largest = max(largest, float(np.percentile(level[rows], 98.0)))
         layers.append(Points(label=label, colour=colour, x=x[rows], y=level[rows], size=2.5, epoch_s=epoch[rows]))
     if layers:
         line = np.array([np.nanmin(x), np.nanmax(x)])
         limit = np.full(2, alarm_limit_m)
         layers.append(Curve(label=f"alarm limit {alarm_limit_m:g} m", colour=RED, x=line, y=limit, dash="dashed"))
     infinite = int(np.isinf(floats(positions, "protection_level_m")).sum())
-    caption = [_count(positions), f"Values beyond {1.2 * largest:.1f} m are cut off"]
+    caption = [_count(positions), f"Values beyond {top:g} m, twice the alarm limit, are cut off"]
     caption[1] += f", {infinite:,} levels are infinite and not drawn." if infinite else "."
     if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
@@ -321,7 +321,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
         y_label="protection level [m]",
         layers=tuple(layers),
         start=start,
-        y_range=(0.0, 1.2 * largest),
+        y_range=(0.0, top),
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from railfix.core.arrays import Indices
+from railfix.core.arrays import Floats, Indices
 from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.draw import draw_figure, save_figure
 from railfix.report.plots.line import LocalFrame
@@ -46,10 +46,8 @@ def plot_network(
 
 def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[PlanLog, Matched] | None) -> Chart:
     """Return tracks with their switches and names, findings of the check, and the positions of a run."""
-    latitude, longitude = (
-        np.concatenate([getattr(t, name) for t in network.tracks]) for name in ("latitude_deg", "longitude_deg")
-    )
-    frame = LocalFrame.at(float(np.median(latitude)), float(np.median(longitude)))
+    latitude, longitude = _degrees(network)
+    frame = network_frame(network)
     nth = max(1, len(latitude) // _DRAWN)
     rows, breaks = _thin(network, nth)
     east, north = np.insert(frame.to_plane(latitude[rows], longitude[rows]), breaks, np.nan, axis=0).T
@@ -81,6 +79,20 @@ def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[Pl
         name="network", title="Tracks", caption=caption, x_label="east [m]", y_label="north [m]", layers=tuple(layers),
         equal=True, x_range=view and view[0], y_range=view and view[1],
     )  # fmt: skip
+
+
+def _degrees(network: Network) -> tuple[Floats, Floats]:
+    """Return the latitudes and longitudes of the points of all tracks [deg]."""
+    latitude, longitude = (
+        np.concatenate([getattr(t, name) for t in network.tracks]) for name in ("latitude_deg", "longitude_deg")
+    )
+    return latitude, longitude
+
+
+def network_frame(network: Network) -> LocalFrame:
+    """Return the plane of the plan of a network, about the median of its points."""
+    latitude, longitude = _degrees(network)
+    return LocalFrame.at(float(np.median(latitude)), float(np.median(longitude)))
 
 
 def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[float, float]] | None:
