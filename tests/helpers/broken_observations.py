@@ -160,12 +160,6 @@ def observations_without_epochs(bench: Bench) -> Options:
 
 
 @broken(INPUT, "front.obs", "line")
-def observations_cut_in_an_epoch(bench: Bench) -> Options:
-    lines = bench.front.read_text().splitlines(keepends=True)
-    return {"front": bench.write("front.obs", "".join(lines[: epoch_starts("".join(lines))[-1] + 3]))}
-
-
-@broken(INPUT, "front.obs", "line")
 def observations_with_a_broken_epoch_line(bench: Bench) -> Options:
     lines = bench.front.read_text().splitlines(keepends=True)
     at = epoch_starts("".join(lines))[5]
@@ -197,16 +191,6 @@ def observations_given_twice(bench: Bench) -> Options:
 @broken(INPUT, "front.obs", "given twice", "--rear")
 def observations_given_for_both_antennas(bench: Bench) -> Options:
     return {"rear": bench.front}
-
-
-@broken(INPUT, "second.obs", "line")
-def observations_that_overlap(bench: Bench) -> Options:
-    text = bench.front.read_text()
-    lines = text.splitlines(keepends=True)
-    starts = epoch_starts(text)
-    header, middle = "".join(lines[: starts[0]]), len(starts) // 2
-    first = bench.write("first.obs", header + "".join(lines[starts[0] : starts[middle + 3]]))
-    return {"front": [first, bench.write("second.obs", header + "".join(lines[starts[middle] :]))]}
 
 
 @broken(MISMATCH, "brdc.nav", "navigation file of that day")

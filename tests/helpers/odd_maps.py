@@ -308,10 +308,10 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("profile_turns.xml", _landxml(">1300 500<", ">1050 500<"), "refused", "stations of a profile do not rise"),
     Odd(
         "station_equation.xml", _landxml("<CoordGeom>", '<StaEquation staAhead="9" staInternal="1"/><CoordGeom>'),
-        "noted", "station equations are not used",
+        "refused", "station equations do not rise from the start",
     ),
     Odd("gap.xml", _landxml("650100</End></Line>", "650090</End></Line>"), "refused", "mend the elements that do not"),
-    Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "an alignment of 3042 m"),
+    Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "curves turn to the other side"),
     Odd("unknown_frame.xml", _landxml('"25832"', '"99999999"'), "refused", "'EPSG:99999999' is unknown"),
     Odd("frame_without_grid.xml", _landxml('"25832"', '"4258"'), "refused", "no grid; a design is in one"),
     Odd("another_grid.xml", _landxml('"25832"', '"2154"'), "refused", "is EPSG:2154 the right CRS"),

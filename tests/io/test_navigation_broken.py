@@ -42,9 +42,12 @@ CASES: dict[str, tuple[str, int | None, str]] = {
     "leap seconds in words": (header(lines=[label("   ten", "LEAP SECONDS")]) + GOOD, 2, "LEAP SECONDS"),
     "ionosphere in words": (header(lines=[label("GPSA   0.11oops", "IONOSPHERIC CORR")]) + GOOD, 2, "IONOSPHERIC CORR"),
     "only SBAS": (header() + "".join(record("S22").splitlines(keepends=True)[:4]), None, "no usable"),
-    "cut in the middle of a record": (header() + GOOD + "".join(LINES[:5]), 11, "G01 has 5 lines, 8 were expected"),
+    "cut in the middle of a record": (
+        header() + "".join(LINES[:5]) + GOOD, 3, "G01 has 5 lines, 8 were expected.*; --lenient"),
+    "cut in its only record": (header() + "".join(LINES[:5]), None, "no usable .* G01 has 5 lines, 8 were expected"),
     "a line of a record lost": (header() + "".join(LINES[:3] + LINES[4:]) + GOOD, 3, "G01 has 7 lines, 8 were"),
-    "name of the next record lost": (header() + GOOD + GOOD.replace("G01", "   "), 3, "G01 has 16 lines, 8 were"),
+    "name of the next record lost": (
+        header() + GOOD + GOOD.replace("G01", "   ") + GOOD, 3, "G01 has 16 lines, 8 were"),
     "record before any name": (header() + "".join(LINES[1:]) + GOOD, 3, "before the first record"),
     "unknown constellation": (header() + GOOD.replace("G01", "X01"), 3, "'X01' is not a satellite name"),
     "satellite zero": (header() + GOOD.replace("G01", "G00"), 3, "'G00' is not a satellite name"),
@@ -66,11 +69,9 @@ CASES: dict[str, tuple[str, int | None, str]] = {
     "exponent too long": (_damaged(1, "4.600000000000D-09", "4.60000000000D+109"), 12, "G01: delta_n is 4.6e.109"),
     "angle of many turns": (_damaged(1, "1.234500000000D+00", "1.234500000000D+02"), 12, "G01: m0 is 123.45"),
     "columns shifted": (_damaged(4, "    ", "     "), 15, "G01: "),
-    "GLONASS in the Earth's centre": (
-        header() + record("R05", {"x": 0.0, "y": 0.0, "z": 0.0}), 4, "R05: x, y, z is 0 km"),
     "GLONASS without velocity": (header() + record("R05", {"y_velocity": None}), 5, "R05: y_velocity is blank"),
-    "GLONASS with six lines": (header() + record("R05", {"extra": [1.0] * 8}), 3, "R05 has 6 lines, 4 were expected"),
-    "version 2 cut": (header(2.1) + record_2(" 1", time="20  6 26  8  0  0.0")[:-80], 3, "G01 has 7 lines"),
+    "GLONASS with six lines": (header() + record("R05", {"extra": [1.0] * 8}) + GOOD, 3, "R05 has 6 lines, 4 were"),
+    "version 2 cut": (header(2.1) + record_2(" 1", time="20  6 26  8  0  0.0")[:-80], None, "G01 has 7 lines"),
     "version 2 without a number": (header(2.1) + record_2(" x", time="20  6 26  8  0  0.0"), 3, "'G x' is no"),
     "version 4 title": (header(4.0) + "> EPH\n" + GOOD, 3, "'> EPH' is no"),
     "version 4 ionosphere cut": (header(4.0) + "> ION G01 LNAV\n    2020 06 26 00 00 00\n", 4, "record has 1 line"),
@@ -108,6 +109,25 @@ def test_files_that_are_no_text(tmp_path: Path, content: bytes, words: str) -> N
         read_navigation(path)
 
 
+@pytest.mark.requirement("G5")
+def test_a_cut_last_record_is_left_out_with_a_note(tmp_path: Path) -> None:
+    found = read_navigation(write(tmp_path, header() + GOOD + "".join(LINES[:5])))
+    assert found.skipped == {"cut at the end of the file": 1}
+    assert len(found.kepler) == len(found.notes) == 1
+
+
+@pytest.mark.requirement("G5")
+@pytest.mark.parametrize(("kind", "satellite"), [("E", "E"), ("L", "E"), ("J", "J"), ("N", "G")])
+@pytest.mark.parametrize("version", [2.11, 2.12, 3.0])
+def test_files_of_one_constellation(tmp_path: Path, kind: str, satellite: str, version: float) -> None:
+    """RINEX 2.11, 2.12 and 3.00 have files of Galileo (E, L) and QZSS (J) beside those of GPS."""
+    first = header(version).replace("N: GNSS NAV DATA", f"{kind:<16}", 1)
+    first = first[:20] + kind + first[21:]
+    body = record(f"{satellite}03") if version >= 3.0 else record_2(" 3", time="20  6 26  8  0  0.0")
+    found = read_navigation(write(tmp_path, first + body))
+    assert found.kepler.satellite.tolist() == [f"{satellite}03"]
+
+
 def test_files_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="no such file"):
         read_navigation(tmp_path / "none.nav")
@@ -119,7 +139,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
 
 def test_one_broken_file_of_several_is_named(tmp_path: Path) -> None:
     good = write(tmp_path, header() + GOOD, "good.nav")
-    bad = write(tmp_path, header() + "".join(LINES[:4]), "bad.nav")
+    bad = write(tmp_path, header() + "".join(LINES[:4]) + GOOD, "bad.nav")
     with pytest.raises(InputFileError, match=r"bad\.nav, line 3"):
         read_navigation([good, bad])
 

@@ -18,6 +18,7 @@ from railfix.core import files
 from railfix.core.errors import InputFileError
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import read_observations
+from railfix.io.epoch_order import EpochOrder
 from railfix.io.rinex import observations_decode, scan_observations
 from railfix.io.rinex.observations import BlockReader, Selection
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
@@ -106,7 +107,7 @@ def test_pieces_are_the_whole(tmp_path: Path, log: type, epochs: int) -> None:
 def test_where_blocks_of_text_end_does_not_matter(tmp_path: Path, log: type, block_bytes: int) -> None:
     path = write(tmp_path / "log", log(), strip=block_bytes != 3000, end="\r\n" if block_bytes == 700 else "\n")
     wanted = Selection(broken_lines="count")
-    runs = list(BlockReader(path, wanted, block_bytes=block_bytes).blocks())
+    runs = list(EpochOrder("count").ordered(BlockReader(path, wanted, block_bytes=block_bytes).blocks()))
     assert len(runs) > 2
     joined = concatenate([run for run in runs if len(run)])
     whole = read_observations(path, broken_lines="count")
@@ -130,7 +131,7 @@ def test_a_break_is_kept_where_a_block_ends_after_the_event(tmp_path: Path, flag
     expected = [False, False, True, False, True, False, True, False]
     assert read_observations(path).break_before.tolist() == expected
     for block_bytes in range(60, 160, 7):
-        runs = BlockReader(path, Selection(), block_bytes=block_bytes).blocks()
+        runs = (run.epochs for run in BlockReader(path, Selection(), block_bytes=block_bytes).blocks())
         found = [bool(broken) for run in runs for broken in run.break_before]
         assert found == expected, block_bytes
 
@@ -215,13 +216,14 @@ def test_files_of_a_log_are_joined_in_order_of_time(tmp_path: Path, interval: st
 
 def test_files_that_overlap(tmp_path: Path) -> None:
     parts = [_file(tmp_path, "a", range(12)), _file(tmp_path, "b", range(8, 20))]
-    with pytest.raises(InputFileError, match=r"b, line 8: .* is not later than .*of the file before"):
-        read_observations(parts)
-    joined = read_observations(parts, broken_lines="count")
-    assert (joined.time - joined.time[0]).astype("m8[s]").astype(int).tolist() == list(range(20))
-    assert joined.skipped == {"epochs out of order": 4}
-    with pytest.raises(InputFileError, match="is not later than"):
-        read_observations([parts[0], parts[0]])
+    for order in (parts, parts[::-1]):
+        joined = read_observations(order)
+        assert (joined.time - joined.time[0]).astype("m8[s]").astype(int).tolist() == list(range(20))
+        assert joined.skipped == {"duplicate epochs": 4}
+        assert not joined.break_before.any()
+    assert len(read_observations([parts[0], parts[0]])) == 12
+    long = [_file(tmp_path, "c", range(60)), _file(tmp_path, "d", range(10, 60))]
+    assert read_observations(long).skipped == {"duplicate epochs": 50}
 
 
 def test_a_file_without_epochs_among_several(tmp_path: Path) -> None:

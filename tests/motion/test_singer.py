@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
-from railfix.motion.chain import singer_steps
+from railfix.motion.singer import singer_steps
 
-SHARES = np.geomspace(1e-6, 10.0, 57)
+SHARES = np.geomspace(1e-6, 30.0, 57)
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(60)
 
 
-def van_loan(dt: float, sigma_mps2: float, tau_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Transition and noise by one matrix exponential (C. F. Van Loan, 1978), with the step as unit of time."""
-    dynamics = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -dt / tau_s]])
-    white = np.diag([0.0, 0.0, 1.0])
-    powers = expm(np.block([[-dynamics, white], [np.zeros((3, 3)), dynamics.T]]))
-    step = powers[3:, 3:].T
-    noise = step @ powers[:3, 3:]
-    unit = np.array([1.0, 1.0 / dt, 1.0 / dt**2])
-    density = 2.0 * sigma_mps2**2 / tau_s * dt**5
-    return step * unit[:, None] / unit, noise * density * np.outer(unit, unit)
+def response(x: np.ndarray, tau_s: float) -> np.ndarray:
+    """Position, speed and acceleration after `x` time constants since an impulse of the acceleration."""
+    return np.stack([tau_s**2 * (x + np.expm1(-x)), -tau_s * np.expm1(-x), np.exp(-x)])
 
 
 @pytest.mark.requirement("E5")
@@ -29,9 +22,14 @@ def test_transition_and_noise_are_the_integrals_of_the_model(tau_s: float) -> No
     dt = SHARES * tau_s
     step, noise = singer_steps(dt, 0.7, tau_s)
     for k in range(len(dt)):
-        whole_step, whole_noise = van_loan(dt[k], 0.7, tau_s)
-        np.testing.assert_allclose(step[k], whole_step, rtol=1e-9)
-        np.testing.assert_allclose(noise[k], whole_noise, rtol=1e-9)
+        x = 0.5 * SHARES[k] * (_NODES + 1.0)
+        f = response(x, tau_s)
+        density = 2.0 * 0.7**2 / tau_s
+        whole = density * (0.5 * dt[k] * _WEIGHTS * f) @ f.T
+        np.testing.assert_allclose(noise[k], whole, rtol=1e-8)
+        np.testing.assert_allclose(step[k][:, 2], response(SHARES[k], tau_s), rtol=1e-9)
+        np.testing.assert_allclose(step[k][:2, :2], [[1.0, dt[k]], [0.0, 1.0]], rtol=1e-12)
+        assert step[k][2, :2].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.requirement("E5")
@@ -40,3 +38,7 @@ def test_two_steps_are_one_of_their_length() -> None:
     (one, two, both), (noise_one, noise_two, noise_both) = singer_steps(dt, 0.4, 2.0)
     np.testing.assert_allclose(two @ one, both, rtol=1e-12, atol=1e-15)
     np.testing.assert_allclose(two @ noise_one @ two.T + noise_two, noise_both, rtol=1e-12)
+
+
+def test_no_step_is_no_motion() -> None:
+    assert singer_steps(np.zeros(0), 0.4, 2.0)[0].shape == (0, 3, 3)

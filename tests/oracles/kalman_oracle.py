@@ -13,7 +13,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter, rts_smoother
 
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.motion.chain import singer_steps
+from railfix.motion.singer import singer_steps
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, TrackingLimits
 
 #: Unknowns: arc length, speed, acceleration, arc length before, change of the phases' clock, its drift, map right and

@@ -290,6 +290,6 @@ def test_every_output_names_what_a_level_rests_on() -> None:
         ({"priors": "measured", "local_prior": 2e-5, "side_prior": 0.0}, False, True),
     ):
         text = prior_basis_text(level_facts(parse_config({"filter": "off", "risk": risk})))
-        assert ("indicative" in text, "no risk an hour" in text) == (indicative, indicative)
+        assert ("indicative" in text, "no hourly risk" in text) == (indicative, indicative)
         assert ("no data supports" in text) == unsupported
     assert prior_basis_text({}) == "not recorded"

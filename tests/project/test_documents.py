@@ -110,6 +110,7 @@ def first_example(page: str) -> tuple[str, str]:
 
 
 @pytest.mark.requirement("G4")
+@pytest.mark.requirement("S3")
 @pytest.mark.parametrize("page", ["docs/index.md", "README.md", "help"])
 def test_the_first_example_reaches_the_error_beside_it(page: str) -> None:
     code, text = first_example(page)

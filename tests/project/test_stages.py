@@ -23,6 +23,7 @@ def names() -> dict[str, Any]:
 
 
 @pytest.mark.requirement("G2")
+@pytest.mark.requirement("S1")
 def test_five_stages_by_hand_are_the_pipeline_to_a_millimetre(names: dict[str, Any]) -> None:
     text = (ROOT / "docs" / "notebooks" / "stages.md").read_text(encoding="utf-8")
     by_hand = [line for cell in cells(text)[:3] for line in cell.splitlines() if line.strip()]

@@ -363,6 +363,7 @@ def test_a_sky_needs_polar_axes(observations: pl.DataFrame) -> None:
         plots.draw_sky(plots.sky_epochs(observations), START, ax=Figure().subplots())
 
 
+@pytest.mark.requirement("S3")
 def test_functions_that_plot_take_axes_and_return_them(errors: pl.DataFrame) -> None:
     for name in plots.__all__:
         if name.startswith("plot_"):

@@ -14,6 +14,7 @@ import paths
 from railfix.core.arrays import Floats
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.pipeline.config import Config
+from railfix.run.inputs import LogReading
 from railfix.run.locate import survey_files
 from railfix.track.survey.line import Survey
 from railfix.track.survey.runs import SurveyLimits
@@ -47,7 +48,12 @@ def main(names: Sequence[str]) -> int:
         folder, log, nav, truth = RECORDINGS[name]
         files = recordings / "kinematic" / folder
         survey = survey_files(
-            [files / log], [files / nav], Config(), limits=SurveyLimits(), name=name, broken_lines="count"
+            [files / log],
+            [files / nav],
+            Config(),
+            limits=SurveyLimits(),
+            name=name,
+            reading=LogReading(broken_lines="count"),
         ).survey
         error = errors_across_m(survey, truth(recordings))
         print(

@@ -27,8 +27,7 @@ from railfix.cli.options import (
     overwriting,
 )
 from railfix.core.errors import SettingsError
-from railfix.core.files import BrokenLines, Reader
-from railfix.core.settings import Settings, validate
+from railfix.core.settings import validate
 from railfix.core.tables import Column, listing, number, percent, plain_table, signed
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
 from railfix.evaluate.inputs import POSITIONS_TABLE, TABLES, EvaluationInputs, list_position_tables
@@ -41,7 +40,7 @@ from railfix.ranges.error_model import LARGEST_PRIOR, ErrorModel, FaultRate, wri
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, summary
 from railfix.reference import ReferenceInputs, ReferenceOptions, ReferenceSettings, ReferenceSummary, reference_files
 from railfix.run import read_record
-from railfix.run.inputs import BROKEN_LINES, READER
+from railfix.run.inputs import LogReading
 from railfix.run.output import OutputFolder
 from railfix.run.processor import parse_position
 
@@ -299,13 +298,6 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
             )
 
 
-class LogOfCurve(Settings):
-    """How to read the log of a receiver under open sky."""
-
-    reader: Reader = READER
-    broken_lines: BrokenLines = BROKEN_LINES
-
-
 @from_models
 def cn0_curve(
     observations: Annotated[
@@ -329,7 +321,7 @@ def cn0_curve(
         ),
     ] = None,
     bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,
-    reading: LogOfCurve,
+    reading: LogReading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Fit the mean C/N0 over elevation of one antenna and receiver.
@@ -345,9 +337,7 @@ def cn0_curve(
     fit = validate(CurveFit, {"bin_deg": bin_deg}, source="--bin")
     place = None if position is None else parse_position(position, "--position")
     outputs = check_outputs((out, "any"), (plot, "png"), overwrite=overwrite, inputs=[*observations, *nav])
-    fitted = cn0_curve_from_log(
-        observations, nav, position_ecef_m=place, fit=fit, broken_lines=reading.broken_lines, reader=reading.reader
-    )
+    fitted = cn0_curve_from_log(observations, nav, position_ecef_m=place, fit=fit, **reading.of_observations)
     if plot is not None:
         from railfix.report.plots.screens import draw_cn0_curve
 

@@ -371,8 +371,8 @@ def train(
     """Carry the positions of a train to the centre over two links, and its authorities back.
 
     Reads position messages as lines of JSON from standard input (`railfix live ... --send json@-`), reports the newest
-    every second, and writes each authority, and each beginning and end of braking, as a line of JSON. Ends with its
-    input, once the last report is answered or after 5 s.
+    every second, and writes each authority, each beginning and end of braking, and each line that is no position
+    message, as a line of JSON. Ends with its input, once the last report is answered or after 5 s.
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 

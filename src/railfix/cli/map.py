@@ -11,14 +11,13 @@ import typer
 
 from railfix.cli.command import Command, command_group
 from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_table
-from railfix.cli.map_network import RUN_ALONE, Columns, MapReading, match_command, network, route
+from railfix.cli.map_network import RUN_ALONE, MapReading, match_command, network, route
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.core.tables import plain_table, plural
-from railfix.io.position_log import column_names
 from railfix.io.positions import read_positions
-from railfix.run.inputs import TrackReading
+from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import (
     MapLimits,
     Thinned,
@@ -29,6 +28,7 @@ from railfix.track import (
     read_track,
     write_track_csv,
 )
+from railfix.track.quality import needed_spacing_m
 
 app = command_group(
     "map", help="Check a track map, make one from positions or of a network, and put positions on a network."
@@ -139,12 +139,12 @@ def features(
 
     from railfix.motion.features import line_series, map_features
     from railfix.run.locate import centre_features, find_features, read_measured
-    from railfix.track.trajectory import Trajectory
+    from railfix.track.curves import curved_line
 
     tables = [folder / "train.parquet" for folder in run or ()]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[*tracks, *tables])
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    trajectory = Trajectory.from_antenna_path(track)
+    trajectory = curved_line(track)
     series = line_series(trajectory)
     found = map_features(series)
     if run:
@@ -184,6 +184,7 @@ def features(
 
 
 @app.command("from-positions", cls=Command)
+@from_models
 def from_positions_command(
     positions: Annotated[
         Path,
@@ -204,7 +205,7 @@ def from_positions_command(
     max_sigma: Annotated[
         float | None, typer.Option(metavar="M", help="Largest standard deviation of a position, any axis.")
     ] = None,
-    column: Columns = None,
+    columns: ColumnNames,
     name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -221,7 +222,7 @@ def from_positions_command(
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[positions])
-    log = read_positions(positions, columns=column_names(column or ()))
+    log = read_positions(positions, **columns.arguments)
     track, thinned = from_position_log(
         log, spacing_m=spacing, quality=_qualities(quality), max_sigma_m=max_sigma, name=name or positions.stem
     )
@@ -258,6 +259,12 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
         f"spacing {spacing.min():.2f} / {np.median(spacing):.2f} / {spacing.max():.2f} m (least, median, largest); "
         + (f"mid-chord deviation up to {deviation.max():.3f} m" if len(deviation) else "no mid-chord deviation")
     )
+    needed = needed_spacing_m(quality)
+    if needed < spacing.max():
+        console.print(
+            f"chords of the sharpest curve stay within 1 cm with points every {needed:.1f} m; between points the "
+            "antenna's path follows the arc"
+        )
     show_notes(console, track.provenance.notes)
     rows = []
     for finding in quality.findings:

@@ -75,7 +75,10 @@ class MatchOptions(Settings):
     """How far from a track positions are expected, and what is written of them."""
 
     sigma: float | None = option(
-        "Sigma of the distance from the track, map included; else that of LOG, or 2 m.", None, metavar="M", gt=0.0
+        "Sigma of the distance from the track, map included; else that of LOG, or one estimated by it, or 4 m.",
+        None,
+        metavar="M",
+        gt=0.0,
     )
     within: float | None = option(
         "Farthest track considered; else 30 m, farther where LOG states larger sigmas, to 100 m.",
@@ -171,7 +174,10 @@ def route(
     files = [*maps, choice.positions, choice.heights, reading.jgd_parameters]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=files)
     net = _network(maps, reading, connecting)
-    passed, notes = _route_tracks(net, choice, columns, connecting, reading)
+    log = None
+    if choice.positions is not None:
+        log = read_plan_positions(choice.positions, **columns.arguments)
+    passed, notes = _route_tracks(net, choice, log, connecting, reading)
     track = track_of_segments(
         [net.tracks[k] for k in passed],
         heights=choice.heights,
@@ -188,18 +194,18 @@ def route(
 
 
 def _route_tracks(
-    net: Network, choice: RouteChoice, columns: ColumnNames, connecting: Connecting, reading: TrackReading
+    net: Network, choice: RouteChoice, log: PlanLog | None, connecting: Connecting, reading: TrackReading
 ) -> tuple[list[int], list[str]]:
     """Return the tracks of the route asked for, and notes on it."""
     if choice.tracks:
         return net.shortest_route([net.find_index(name.strip()) for name in choice.tracks.split(",")]), []
     if choice.via:
         return net.shortest_route([_track_at(net, text) for text in choice.via]), []
-    if choice.positions is None:
+    if log is None:
         if len(net.tracks) == 1:
             return [0], []
         raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
-    log, notes = _positions(choice.positions, net, columns, connecting, reading)
+    log, notes = _in_frame_of(net, log, connecting, reading)
     passed, left_out = find_route(net, match(net, log))
     if not passed:
         raise MismatchError(f"{choice.positions}: no position lies near a track of the network")
@@ -209,11 +215,10 @@ def _route_tracks(
     return passed, notes
 
 
-def _positions(
-    path: Path, net: Network, columns: ColumnNames, connecting: Connecting, reading: TrackReading
+def _in_frame_of(
+    net: Network, log: PlanLog, connecting: Connecting, reading: TrackReading
 ) -> tuple[PlanLog, list[str]]:
     """Return the positions of a log in the frame of the network, and a note on their shift."""
-    log = read_plan_positions(path, columns=columns.names)
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)
@@ -260,7 +265,8 @@ def match_command(
     picture, page = options.picture, options.page
     check_outputs((out, "csv"), (picture, "picture"), (page, "page"), overwrite=overwrite, inputs=[*maps, log])
     net = _network(maps, reading, connecting)
-    positions, notes = _positions(log, net, columns, connecting, reading)
+    as_read = read_plan_positions(log, **columns.arguments)
+    positions, notes = _in_frame_of(net, as_read, connecting, reading)
     matched = match(net, positions, sigma_m=options.sigma, within_m=options.within)
     if not (matched.track >= 0).any():
         raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
@@ -273,7 +279,10 @@ def match_command(
         f"{len(on)} positions, {on.sum()} on a track ({on.mean():.1%}), {(np.abs(matched.offset_m) <= 5.0).mean():.1%} "
         f"within 5 m of it; {(matched.probability < 0.9).sum()} with a probability below 0.9"
     )
-    show_notes(console, [*net.notes, *notes])
+    show_notes(
+        console,
+        dict.fromkeys([*net.notes, *(note for track in net.tracks for note in track.notes), *notes, *matched.notes]),
+    )
     if picture is not None:
         from railfix.report.plots.network import plot_network
 

@@ -13,10 +13,9 @@ import typer
 from railfix.cli.console import TableConsole, show_files, show_notes, show_table, show_verdict
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, resolve_settings
 from railfix.core.errors import SettingsError
-from railfix.core.files import BrokenLines
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import Column, count, listing, number, percent, plain_table, plural
-from railfix.run.inputs import BROKEN_LINES, ColumnNames, LogReading
+from railfix.run.inputs import ColumnNames, LogReading
 from railfix.track.survey.runs import SurveyLimits
 
 #: Share of the epochs of a stretch within the alarm limit from which satellites serve there.
@@ -73,8 +72,9 @@ def service(
     verdict = [f"{len(found)} stretches of {stretch:g} m passed by {plural(runs, 'run')}"]
     if worst["within_limit_share"] is not None:
         verdict.append(
-            f"{len(served)} of them have a level within {limit:g} m in {_SERVED:.0%} of the epochs or more; worst from "
-            f"{worst['from_m']:.0f} to {worst['to_m']:.0f} m: {worst['within_limit_share']:.0%}"
+            f"{len(served)} of them have a level within {limit:g} m in {_SERVED:.0%} of the epochs or more; "
+            f"worst stretch {worst['from_m']:.0f} to {worst['to_m']:.0f} m "
+            f"({worst['within_limit_share']:.0%} of its epochs)"
         )
     else:
         verdict.append("the runs have no filter and no levels; the shares are those of single epochs")
@@ -93,7 +93,6 @@ class SurveyFiles(Settings):
     )
     picture: Path | None = option("Picture of map, runs and standard deviations (.png or .svg).", None, metavar="FILE")
     name: str | None = option("Name of the track; else that of the file.", None, metavar="NAME")
-    broken_lines: BrokenLines = BROKEN_LINES
 
 
 @from_models
@@ -134,7 +133,6 @@ def survey(
     surveyed = survey_files(
         runs, files.nav, settings,
         limits=limits, name=files.name or out.stem, reading=reading, columns=columns.names,
-        broken_lines=files.broken_lines,
     )  # fmt: skip
     result = surveyed.survey
     track = result.track
@@ -154,7 +152,8 @@ def survey(
     ]
     if weak.mean() >= 0.005:
         verdict.append(
-            f"{weak.mean():.0%} of it is worse than twice the median: more runs there, or a receiver of two bands, help"
+            f"{weak.mean():.0%} of it is worse than twice the median: more runs there, or a dual-frequency"
+            " receiver help"
         )
     show_verdict(console, verdict)
     rows = [

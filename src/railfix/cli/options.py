@@ -5,25 +5,25 @@ from __future__ import annotations
 import inspect
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import UTC, date, datetime
 from functools import wraps
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
 import typer
 from pydantic import ValidationError
 
 from railfix.core.errors import SettingsError
 from railfix.core.settings import INPUTS, Settings, option, read_toml
+from railfix.core.timescale import utc_to_gpst
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
 from railfix.run.output import FileKind, Overwrite, check_output_file
 from railfix.run.processor import with_measured_priors
 
 _DAY: Final = "%Y-%m-%d"
-_TIMES: Final = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", _DAY]
 
 Model = TypeVar("Model", bound=Settings)
 
@@ -151,12 +151,19 @@ def _option(name: str, field: Any, path: tuple[str, ...]) -> _Option:
 
 
 def _gps_time(text: str) -> datetime:
-    """Read a time of the command line."""
-    for form in _TIMES:
-        with suppress(ValueError):
-            return datetime.strptime(text, form)
-    zone = "; GPS time has no time zone, and UTC is behind it by the leap seconds" if text[-1:] in "Zz" else ""
-    raise typer.BadParameter(f"{text!r} is no GPS time such as 2026-05-12 or 2026-05-12T03:00:00.5{zone}")
+    """Read a time of the command line: GPS time, or with a time zone, which is converted to GPS time."""
+    try:
+        time = datetime.fromisoformat(text.strip().replace("/", "-"))
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r} is no GPS time such as 2026-05-12, 2026-05-12T03:00 or 2026-05-12T03:00:00.5 (a time with a "
+            "zone, 2026-05-12T03:00Z, is converted)"
+        ) from None
+    if time.tzinfo is None:
+        return time
+    utc = np.datetime64(time.astimezone(UTC).replace(tzinfo=None), "ns")
+    gps: datetime = utc_to_gpst(utc).astype("datetime64[us]").item()
+    return gps
 
 
 def _plain_type(annotation: Any) -> tuple[Any, bool]:
@@ -181,8 +188,6 @@ def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any])
             value = chosen.switch[int(value)]
         elif chosen.numbers:
             value = tuple(part.strip() for text in value for part in text.split(","))
-        elif isinstance(value, datetime) and chosen.path[-1] == "date":
-            value = value.date()
         if value == chosen.default:
             continue
         place = values

@@ -124,6 +124,7 @@ class PreciseEphemeris(NotebookTable):
     position_ecef_m: Floats  #: NaN where the file has none (0.000000), shape (E, N, 3).
     clock_s: Floats  #: NaN where the file has none (999999.999999), shape (E, N).
     source: str = ""  #: The files it was read from.
+    notes: tuple[str, ...] = ()  #: What was left out, and why.
 
     def __post_init__(self) -> None:
         expected = (len(self.time), len(self.satellite))

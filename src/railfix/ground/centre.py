@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from railfix.core.arrays import Floats, freeze_arrays
 from railfix.core.settings import Settings
-from railfix.io.train_message import MessageStatus, TrainMessage
+from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Acceleration of the reference run curve [m/s^2]; a train this near to a station is at it [m].
 _RUN_MPS2, _AT_STATION_M = 0.5, 25.0
@@ -148,6 +148,8 @@ class Rejection(Enum):
     REPEATED = "repeated or older than the newest"
     FAR_AHEAD = "number far ahead of the newest, to be confirmed by the next"
     NO_PLACE = "without a place"
+    NO_FACING = "the direction in which the front end looks is unknown"
+    NO_FRONT_END = "where the front end is is unknown"
     TOO_OLD = "place too old when it was sent, or the train's clock was stepped"
 
 
@@ -167,8 +169,12 @@ def report_received(
     if far and not 0 <= record.ahead < message.sequence <= record.ahead + limits.jump:
         return replace(record, ahead=message.sequence), Rejection.FAR_AHEAD
     record, age_ns = replace(record, sequence=message.sequence, ahead=-1), message.sent_ns - message.time_ns
-    if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING) or message.facing == 0:
+    if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING):
         return record, Rejection.NO_PLACE
+    if message.facing == 0:
+        return record, Rejection.NO_FACING
+    if Unknown.FRONT_END in message.unknown:
+        return record, Rejection.NO_FRONT_END
     if not 0 <= age_ns <= limits.age_s * 1e9:
         return record, Rejection.TOO_OLD
     assert message.chainage_cm is not None

@@ -5,10 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
-import os
-import stat
 import struct
-import sys
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
@@ -21,8 +18,9 @@ from pydantic import Field
 
 from railfix.core.settings import Settings, option
 from railfix.ground.links import Bearer, LinkMode, LinkName, TrainLinks, first_sequence
+from railfix.ground.positions import Clock, read_positions, standard_input
 from railfix.ground.quic import check_keys
-from railfix.io.train_message import MessageError, TrainMessage, encode, from_json, validate_message
+from railfix.io.train_message import MessageError, TrainMessage, encode, validate_message
 
 #: Version of the message; a receiver rejects others.
 VERSION: Final = 2
@@ -82,6 +80,9 @@ class OnBoardLimits(Settings):
     #: Deceleration with which the train can stop before a shorter authority.
     braking_mps2: float = Field(default=0.5, gt=0)
     reaction_s: float = Field(default=3.0, ge=0)  #: Time before the brakes act, with that since the newest report.
+    clock: Clock = option(
+        "Positions are of a recording: report each as of now, at the recording's own pace.", "live", name="--replay"
+    )
     mode: LinkMode = option("Send reports over bearer A alone, and over B while A fails.", "both", name="--spare")
 
 
@@ -194,8 +195,6 @@ REPORT_S, LOOK_S = 1.0, 0.1
 ANSWER_S: Final = 5.0
 #: Largest age of what the integrity device has written [s].
 INTEGRITY_S = 2.0
-#: Longest line of a position message [bytes].
-LONGEST_LINE = 100_000
 
 
 async def run_train(
@@ -215,16 +214,16 @@ async def run_train(
     of authorities.
 
     With the train's own two files and ``authority.pem`` of the folder `keys`. The positions are messages as
-    `railfix.io.train_message.to_json` writes them, from the standard input by default. With `integrity`, a file of the
-    train's integrity device, `is_complete` of it takes the place of what the messages say. InputFileError: when a key
-    is not there, or a line is no position message.
+    `railfix.io.train_message.to_json` writes them, from the standard input by default; lines that are none are written
+    as rejected (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, `is_complete` of
+    it takes the place of what the messages say. InputFileError: when a key is not there.
     """
     check_keys(keys, f"train-{train}")
     limits = limits or OnBoardLimits()
     desk = _Desk(train=train, write=write, limits=limits, integrity=integrity)
     links = TrainLinks(train, keys, bearers, mode=limits.mode, received=desk.receive)
     await links.start()
-    reading = asyncio.create_task(desk.read(_standard_input() if lines is None else lines))
+    reading = asyncio.create_task(desk.read(standard_input() if lines is None else lines, limits.clock))
     sending = asyncio.create_task(desk.work(links))
     try:
         done, _ = await asyncio.wait([reading, sending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
@@ -262,10 +261,9 @@ class _Desk:
         self._reason: str | None = ""
         self.reports = self.authorities = 0
 
-    async def read(self, lines: AsyncIterator[str]) -> None:
-        async for line in lines:
-            if line.strip():
-                self._newest = from_json(line)
+    async def read(self, lines: AsyncIterator[str], clock: Clock) -> None:
+        async for message in read_positions(lines, rejected=lambda why: self._line(rejected=why), clock=clock):
+            self._newest = message
         with suppress(TimeoutError):
             async with asyncio.timeout(ANSWER_S):
                 while self._newest is not None or self._answered < self._sequence:
@@ -322,19 +320,3 @@ class _Desk:
 
     def _line(self, **values: Any) -> None:
         self._write(json.dumps(values))
-
-
-async def _standard_input() -> AsyncIterator[str]:
-    """Yield lines as they come; a reader that waits does not hold the end of the program up."""
-    kind = os.fstat(sys.stdin.fileno()).st_mode
-    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # a file has all its lines
-        for line in sys.stdin:
-            yield line
-        return
-    reader = asyncio.StreamReader(limit=LONGEST_LINE)
-    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    try:
-        while data := await reader.readline():
-            yield data.decode(errors="replace")
-    except ValueError:
-        raise MessageError(f"is longer than {LONGEST_LINE} bytes") from None

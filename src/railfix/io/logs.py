@@ -19,10 +19,12 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.gnss.plausible_records import plausible_navigation
 from railfix.io import rinex
+from railfix.io.epoch_order import EpochOrder, Run
 from railfix.io.mate import mate_table, read_mate_observations
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.io.rinex.observations import (
     DEFAULT_EPOCHS,
+    check_one_run,
     in_pieces,
     of_channels,
     with_break_at_gap,
@@ -180,24 +182,28 @@ def _receiver_runs(
     from railfix.io.receiver.log import scan_receiver_log
 
     start, end, date = limits
-    found, last = 0, None
-    for k, path in enumerate(_in_order(paths, date)):
+    ordered = _in_order(paths, date)
+    found = 0
 
-        def share(part: float, k: int = k) -> None:
-            if progress is not None:
-                progress((k + part) / len(paths))
+    def of_files() -> Iterator[Run]:
+        last: Observations | None = None
+        for k, path in enumerate(ordered):
 
-        joint = k > 0
-        for run in scan_receiver_log(path, date=date, progress=share):
-            part = _of_systems(run, systems)[start:end]
-            if last is not None:
-                part = part[int(np.searchsorted(part.time, last.time[-1], side="right")) :]
-            part = replace(part, skipped=run.skipped)
-            if joint and len(part):
-                part, joint = with_break_at_gap(last, part), False
-            found += len(part)
-            last = part if len(part) else last
-            yield part
+            def share(part: float, k: int = k) -> None:
+                if progress is not None:
+                    progress((k + part) / len(paths))
+
+            joint = k > 0
+            for run in scan_receiver_log(path, date=date, progress=share):
+                part = replace(_of_systems(run, systems)[start:end], skipped=run.skipped)
+                if joint and len(part):
+                    part, joint = with_break_at_gap(last, part), False
+                last = part if len(part) else last
+                yield Run(path=path, epochs=part, line=np.zeros(len(part), dtype=np.int64))
+
+    for part in EpochOrder("count").ordered(of_files()):
+        found += len(part)
+        yield part
     if not found:
         raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
 
@@ -208,6 +214,7 @@ def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
     from railfix.io.receiver.log import scan_receiver_log
 
     firsts = [next(run.time[0] for run in scan_receiver_log(p, date=date) if len(run)) for p in paths]
+    check_one_run(paths, firsts)
     return [paths[k] for k in np.argsort(np.array(firsts), kind="stable")]
 
 

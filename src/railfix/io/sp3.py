@@ -18,7 +18,7 @@ from railfix.gnss.plausible_records import plausible_radius
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
 #: Time systems other than GPS time, by the names that files use.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
-_NO_CLOCK: Final = 999_999.0  #: Written where a clock is unknown [us].
+_NO_CLOCK: Final = 999_999.0  #: Written where a clock is unknown [us]; some programs write 0.
 
 
 def read_sp3(paths: Paths) -> PreciseEphemeris:
@@ -52,7 +52,15 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     # Assigned in reverse order, so that the first of several values is kept.
     grid[row[::-1], column[::-1]] = np.array(numbers)[::-1]
     position, clock = grid[..., :3], grid[..., 3]
-    position[~plausible_radius(satellites, position * 1e3)] = np.nan  # zeros, where there is none, among them
+    known = (position != 0.0).any(axis=-1) & np.isfinite(position).all(axis=-1)
+    wrong = ~plausible_radius(satellites, position * 1e3)  # zeros, where there is none, among them
+    if known.any() and wrong[known].all():
+        radius = float(np.median(np.linalg.norm(position[known], axis=-1)))
+        what = f"its satellites are {radius:,.0f} km from the Earth's centre; are the positions in metres? SP3 has km"
+        raise InputFileError(source, what)
+    zeros = (clock == 0.0) & known
+    counts = {"positions at the radius of no satellite": int((wrong & known).sum()), "clocks of 0": int(zeros.sum())}
+    position[wrong] = np.nan
     clock[(np.abs(clock) >= _NO_CLOCK) | (clock == 0.0)] = np.nan
     return PreciseEphemeris(
         time=times.astype("datetime64[ns]"),
@@ -60,6 +68,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
         position_ecef_m=position * 1e3,
         clock_s=clock * 1e-6,
         source=source,
+        notes=tuple(f"{source}: {n:,} {what} left out" for what, n in counts.items() if n),
     )
 
 

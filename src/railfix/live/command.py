@@ -264,7 +264,7 @@ def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, Epo
     units = units_of_ranges(tables, inputs.ranging_units, ranging=inputs.sensors.get("ranging"))
     navigation = no_navigation()
     if inputs.nav:
-        navigation = read_navigation(list(inputs.nav), date=inputs.logs.instant)
+        navigation = read_navigation(list(inputs.nav), **inputs.logs.arguments)
     at = find_record_time(navigation)
     if at is None:
         at = np.datetime64("now", "ns") if inputs.logs.instant is None else inputs.logs.instant

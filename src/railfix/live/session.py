@@ -105,6 +105,8 @@ async def run_session(
     session.read_to_ns = dict.fromkeys(sources, -1)
     files = [name for name, source in sources.items() if is_file(source)]
     turn: _Pace | _InTurn | None = None if speed is None else _Pace(speed, files)
+    if isinstance(turn, _Pace) and len(files) == len(sources):
+        session.clock = turn.now_ns
     if replay:
         turn = _InTurn(session.read_to_ns)
     pumps = [
@@ -137,6 +139,8 @@ class _Session:
     streams: dict[str, ReceiverState] = field(default_factory=dict)
     read_to_ns: dict[str, int] = field(default_factory=dict)
     place: bytes = b""
+    #: Time of sending, GPS time since 1980 [ns]: of the computer, or of files that are replayed at their own pace.
+    clock: Callable[[], int] = field(default_factory=lambda: _gps_now_ns)
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     reserved_from: int = 0
@@ -173,12 +177,12 @@ class _Session:
                 due = now + round(5e8 * self.engine.settings.period_s)
                 # In a replay the clock is the tag up to which all files have been read: no pair is torn, whatever file
                 # is ahead.
-                clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, _gps_now_ns())
+                clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, self.clock())
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
                     self.in_idle_time(outputs)
             if not replay:  # what still waits for its pair or for its period
-                self.emit(END_NS, _gps_now_ns())
+                self.emit(END_NS, self.clock())
         except asyncio.CancelledError:
             self.save()
             raise
@@ -309,6 +313,13 @@ class _Pace:
         await self._all_known.wait()
         due = self._began + float((tag - min(self._first)) / np.timedelta64(1, "s")) / self._speed
         await asyncio.sleep(max(0.0, due - asyncio.get_running_loop().time()))
+
+    def now_ns(self) -> int:
+        """Return the time of the recording, GPS time since 1980 [ns]; of the computer before the first tag."""
+        if not self._first or not self._all_known.is_set():
+            return _gps_now_ns()
+        elapsed_s = (asyncio.get_running_loop().time() - self._began) * self._speed
+        return int((min(self._first) - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64)) + round(elapsed_s * 1e9)
 
     def ended(self, name: str) -> None:
         """Note that the first tag of a file is known, or that it has none."""

@@ -243,7 +243,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_basis",
-            "priors of faults: `measured` on the line, or `indicative`: assumed, the level carries no risk an hour",
+            "priors of faults: `measured` on the line, or `indicative`: assumed, no hourly risk is claimed",
             "protection.basis",
             words=BASES,
         ),

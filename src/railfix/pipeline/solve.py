@@ -16,7 +16,8 @@ from typing import Final
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings, copy_with, kernel_array, patch_rows
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, copy_with, kernel_array, patch_rows
+from railfix.core.channel_state import join_channels
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,
@@ -260,6 +261,8 @@ def with_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, config: C
 
 #: Below this share of its own error in its residual a range shows nothing of it.
 _LEAST_REDUNDANCY: Final = 0.1
+#: A mean that is smaller is forgotten.
+_FORGOTTEN: Final = 1e-12
 #: Degrees of freedom that are left, so that the rest is still checked.
 _LEAST_FREEDOM: Final = 2
 
@@ -288,10 +291,14 @@ def lasting_errors(
         window_s=limits.memory_s, least_epochs=limits.memory_s,
     )  # fmt: skip
     share = np.minimum(windows.step_s, 1.0)[:, None] / limits.memory_s
-    sums = np.stack([_arrange(state, channel, limits.most_satellites) for state in states], axis=1)
+    joined = join_channels(channel, [state.channel for state in states], [_is_remembered(state) for state in states])
+    sums = np.zeros((limits.most_satellites, len(states), len(joined.channel)))
+    for k, state in enumerate(states):
+        sums[: state.sums.shape[1], k] = joined.arrange(state.sums.T, 0.0, k)
     error = _own_errors(model, noise, limits.clipped)
     for turn in range(limits.most_satellites):
-        mean, sums[turn] = windows.sums(share * error, sums[turn])
+        mean, sums[turn] = windows.sums(joined.widen(share * error, 0.0), sums[turn])
+        mean = mean[:, : joined.present]
         worst = np.abs(np.where(ranges.weight > 0, mean, 0.0)).argmax(axis=1) if len(channel) else np.zeros(0, int)
         found = np.zeros_like(left_out)
         if len(channel):
@@ -310,10 +317,15 @@ def lasting_errors(
             model = model_again(model, ranges, antennas, place.constrained, solved)
             error = _own_errors(model, noise, limits.clipped)
     after_states = [
-        copy_with(state, time=when, age=age, channel=channel, sums=sums[:, k].T) if len(time[rows]) else state
+        copy_with(state, time=when, age=age, channel=joined.channel, sums=sums[:, k].T) if len(time[rows]) else state
         for k, (rows, state, (when, age)) in enumerate(zip(antennas.parts, states, windows.last, strict=True))
     ]
     return ranges, place, model, left_out, after_states
+
+
+def _is_remembered(state: LastingErrorState) -> Masks:
+    """Return the channels whose means are not forgotten, shape (S,)."""
+    return np.asarray((np.abs(state.sums) > _FORGOTTEN).any(axis=1))
 
 
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
@@ -322,13 +334,3 @@ def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
     own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]
     return np.asarray(np.minimum(np.maximum(own, -clipped), clipped) / clipped)
-
-
-def _arrange(state: LastingErrorState, channel: Strings, turns: int) -> Floats:
-    """Return the sums by turn for some channels, shape (P, K): 0 for new ones; those that are gone are forgotten."""
-    if state.channel is channel:
-        return state.sums.T
-    start = np.zeros((turns, len(channel)))
-    _, here, there = np.intersect1d(channel, state.channel, return_indices=True)
-    start[: state.sums.shape[1], here] = state.sums[there].T
-    return start

@@ -59,6 +59,7 @@ def cn0_curve_from_log(
     fit: CurveFit | None = None,
     broken_lines: BrokenLines = "stop",
     reader: Reader = "railfix",
+    date: np.datetime64 | None = None,
 ) -> Cn0Calibration:
     """Fit a curve on the log of a receiver, about a day, whose antenna stood under open sky.
 
@@ -67,11 +68,11 @@ def cn0_curve_from_log(
     and none was given. MismatchError: satellites were tracked that are below the horizon of the position, or the
     navigation files have none of them, or too few samples for any curve.
     """
-    records = read_navigation(list(navigation), broken_lines=broken_lines)
+    records = read_navigation(list(navigation), broken_lines=broken_lines, date=date)
     samples, seen, below = Cn0Samples(), 0, 0
     header: ObservationHeader | None = None
     start, end, epochs = np.datetime64("NaT", "ns"), np.datetime64("NaT", "ns"), 0
-    for part in scan_observations(list(observations), broken_lines=broken_lines, reader=reader):
+    for part in scan_observations(list(observations), broken_lines=broken_lines, reader=reader, date=date):
         if header is None:
             header, start = part.header, part.time[0]
             place = header.approximate_ecef_m if position_ecef_m is None else position_ecef_m

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import platform
 import sys
 import time as clock
@@ -18,7 +17,6 @@ from pydantic import Field
 
 from railfix import __version__
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import BrokenLines, Reader
 from railfix.core.settings import Settings, option
 from railfix.gnss.observations import concatenate
 from railfix.io.logs import read_navigation
@@ -31,13 +29,12 @@ from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.fixes import FixRejection, ReferenceSettings
 from railfix.reference.smoother import Built
 from railfix.run.inputs import (
-    BROKEN_LINES,
-    READER,
     TRACK,
     VEHICLE,
     Antenna,
     ColumnNames,
     InputFiles,
+    LogReading,
     TrackReading,
     check_given_once,
     input_option,
@@ -101,12 +98,7 @@ class ReferenceInputs(InputFiles):
 class ReferenceOptions(Settings):
     """Options that do not change the reference."""
 
-    date: dt.date | None = option(
-        "UTC date of an NMEA log without RMC sentences, or of an RTCM 3 log.", None, metavar="DATE"
-    )
-    reader: Reader = READER
-    broken_lines: BrokenLines = BROKEN_LINES
-
+    logs: LogReading = Field(default_factory=LogReading)
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     track: TrackReading = Field(default_factory=TrackReading)
     columns: ColumnNames = Field(default_factory=ColumnNames)  #: Of positions in CSV.
@@ -230,22 +222,17 @@ def reference_files(
 
 def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
     """Read all files except those of the line."""
-    day = None if options.date is None else np.datetime64(options.date, "D")
     logs: dict[str, PositionLog] = {
-        name: read_positions(path, broken_lines=options.broken_lines, date=day, columns=options.columns.names)
-        for name, path in inputs.positions.items()
+        name: read_positions(path, **options.columns.arguments) for name, path in inputs.positions.items()
     }
     notes = [note for log in logs.values() for note in log.notes]
     unrated = [log.path for log in logs.values() if not log.has_quality]
     notes += [f"{path}: has no qualities, every row is taken as fixed" for path in unrated]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
-        date = None if options.date is None else np.datetime64(options.date, "ns")
-        navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=date)
+        navigation = read_navigation(inputs.nav, **options.logs.arguments)
         for name, paths in inputs.logs.items():
-            log = Log(
-                paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines, date=date, reader=options.reader
-            )
+            log = Log(paths=paths, chunk_epochs=_CHUNK, reading=options.logs)
             antenna_dopplers = dopplers_of_log(
                 concatenate(list(log.parts())), navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS
             )

@@ -1,8 +1,8 @@
 """Smooth the distance between fixes, all sensors weighted by their variances, and assemble the reference.
 
 Unknown at each instant are place, speed, and one slow error for each kind of sensor: of the Doppler speed, the
-difference and scale of the wheel's distance, the accelerometer's offset. A forward-backward smoother (`chain`) shares
-the closing error of a gap in proportion to what each part may have contributed.
+difference and scale of the wheel's distance, the accelerometer's offset. A forward-backward smoother shares the closing
+error of a gap in proportion to what each part may have contributed.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 
 from railfix.core.arrays import Datetimes, Floats, Indices, places_in_groups
 from railfix.core.timescale import nearest_rows, seconds, timedelta
 from railfix.io.reference_log import AntennaReference
-from railfix.motion.chain import Chain, singer_steps
+from railfix.motion.singer import singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
 from railfix.track.trajectory import Trajectory
 
@@ -80,8 +81,12 @@ class SmoothedReference:
     wheel_scale: Floats  #: Share that the wheel's distance is too long by; NaN without a wheel; shape (N,).
 
 
-class _Unknowns:
-    """Column of each unknown."""
+class _States:
+    """Column of each state that the evidence needs; -1 of the others.
+
+    Place, speed and acceleration of the train; with an accelerometer its offset and the speed at the instant before;
+    the time-correlated error of the Doppler speed; difference and scale error of the wheel's distance.
+    """
 
     def __init__(self, evidence: Evidence) -> None:
         self.place, self.speed, self.acceleration, self.count = 0, 1, 2, 3
@@ -89,6 +94,7 @@ class _Unknowns:
         self.difference = self._next(np.isfinite(evidence.wheel_m).any())
         self.scale = self._next(self.difference >= 0)
         self.offset = self._next(np.isfinite(evidence.acceleration_mps2).any())
+        self.speed_before = self._next(self.offset >= 0)
 
     def _next(self, present: object) -> int:
         if not present:
@@ -98,131 +104,132 @@ class _Unknowns:
 
 
 def smooth(evidence: Evidence, settings: ReferenceSettings) -> SmoothedReference:
-    """Estimate position and speed at every instant from all measurements, at least one fix among them."""
-    t = seconds(evidence.time - evidence.time[0])
-    fixed = np.flatnonzero(np.isfinite(evidence.fix_m))
-    nominal = np.interp(t, t[fixed], evidence.fix_m[fixed])
-    unknowns = _Unknowns(evidence)
-    seen = np.flatnonzero(np.isfinite(evidence.doppler_mps))
-    relief = np.ones(len(seen))
-    for _ in range(_ROUNDS if len(seen) else 1):
-        chain = Chain.empty(len(t), unknowns.count)
-        chain = _with_motion(chain, unknowns, evidence, np.diff(t), np.diff(nominal), settings)
-        row = _one(unknowns, unknowns.place)
-        chain = chain.with_observations(
-            fixed, row, (evidence.fix_m - nominal)[fixed], evidence.fix_sigma_m[fixed] ** -2.0
-        )
-        chain = _with_doppler(chain, unknowns, evidence, np.diff(t), seen, relief, settings)
-        chain = _with_wheel(chain, unknowns, evidence, np.diff(t), nominal, settings)
-        chain = _with_offset(chain, unknowns, np.diff(t))
-        value, covariance = chain.solve()
-        if len(seen):
-            left = np.abs(evidence.doppler_mps - value[:, unknowns.speed] - value[:, unknowns.doppler])[seen]
-            relief = np.minimum(1.0, _HUBER * evidence.doppler_sigma_mps[seen] / np.maximum(left, 1e-12))
-    spread = np.sqrt(np.maximum(np.einsum("kii->ki", covariance), 0.0))
+    """Estimate position and speed at every instant from all measurements, at least one fix among them.
+
+    A Kalman filter forward and the smoother of Rauch, Tung and Striebel back (`filterpy.kalman.KalmanFilter`); Doppler
+    speeds are weighed by Huber's function of their residuals, in `_ROUNDS` rounds.
+    """
+    states = _States(evidence)
+    dt = seconds(np.diff(evidence.time))
+    origin_m = float(evidence.fix_m[np.isfinite(evidence.fix_m)][0])
+    transition, noise = _motion(states, evidence, dt, settings)
+    value, variance, design = _measurements(states, evidence, dt, origin_m, settings)
+    has_doppler, relief = np.isfinite(evidence.doppler_mps), np.ones(len(evidence.time))
+    for _ in range(_ROUNDS if has_doppler.any() else 1):
+        weighed = variance.copy()
+        weighed[:, _DOPPLER] /= relief
+        mean, spread = _filter_and_smooth(states, settings, (transition, noise), (value, weighed, design))
+        if has_doppler.any():
+            left = np.abs(evidence.doppler_mps - mean[:, states.speed] - mean[:, states.doppler])
+            relief = np.fmin(1.0, _HUBER * evidence.doppler_sigma_mps / np.maximum(left, 1e-12))
+    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", spread), 0.0))
     return SmoothedReference(
-        arc_m=nominal + value[:, unknowns.place],
-        sigma_m=spread[:, unknowns.place],
-        speed_mps=value[:, unknowns.speed],
-        speed_sigma_mps=spread[:, unknowns.speed],
-        wheel_scale=value[:, unknowns.scale] if unknowns.scale >= 0 else np.full(len(t), np.nan),
+        arc_m=origin_m + mean[:, states.place],
+        sigma_m=sigma[:, states.place],
+        speed_mps=mean[:, states.speed],
+        speed_sigma_mps=sigma[:, states.speed],
+        wheel_scale=mean[:, states.scale] if states.scale >= 0 else np.full(len(mean), np.nan),
     )
 
 
-def _with_motion(
-    chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, moved: Floats, settings: ReferenceSettings
-) -> Chain:
-    """Position, speed and a time-correlated acceleration (Singer's model), with the accelerometer's measurements."""
-    chain = _with_prior(chain, unknowns.speed, _ANY_SPEED_MPS)
-    chain = _with_prior(chain, unknowns.acceleration, MOTION_MPS2)
-    turn, noise = singer_steps(dt, MOTION_MPS2, MOTION_S)
-    before, after = np.zeros((2, len(dt), 3, unknowns.count))
-    before[:, :, :3], after[:, :, :3] = -turn, np.eye(3)
-    value = np.zeros((len(dt), 3))
-    value[:, 0] = -moved
-    noise[:, [0, 1], [0, 1]] += _LEAST_STEP_M**2
-    chain = chain.with_steps(before, after, value, np.asarray(np.linalg.inv(noise)))
-    measured = np.isfinite(evidence.acceleration_mps2)
-    if measured.any():
-        before, after = np.zeros((2, len(dt), 1, unknowns.count))
-        after[:, 0, unknowns.speed], before[:, 0, unknowns.speed] = 1.0, -1.0
-        before[:, 0, unknowns.offset] = dt
-        gained = np.where(measured, evidence.acceleration_mps2, 0.0) * dt
-        weight = np.where(measured, 1.0 / (settings.acceleration_mps2**2 * dt), 0.0)
-        chain = chain.with_steps(before, after, gained[:, None], weight[:, None, None])
-    return chain
-
-
-def _with_doppler(
-    chain: Chain,
-    unknowns: _Unknowns,
-    evidence: Evidence,
-    dt: Floats,
-    seen: Indices,
-    relief: Floats,
+def _filter_and_smooth(
+    states: _States,
     settings: ReferenceSettings,
-) -> Chain:
-    """Doppler speed = speed + time-correlated error + noise; that error is a first-order Gauss-Markov process."""
-    if unknowns.doppler < 0:
-        return chain
-    kept = np.exp(-dt / settings.doppler_bias_s)
-    variance = settings.doppler_bias_mps**2
-    chain = _with_prior(chain, unknowns.doppler, settings.doppler_bias_mps)
-    chain = _with_walk(chain, unknowns.doppler, kept, 1.0 / (variance * (1.0 - kept**2)))
-    row = _one(unknowns, unknowns.speed) + _one(unknowns, unknowns.doppler)
-    weight = relief * evidence.doppler_sigma_mps[seen] ** -2.0
-    return chain.with_observations(seen, row, evidence.doppler_mps[seen], weight)
+    motion: tuple[Floats, Floats],
+    measured: tuple[Floats, Floats, Floats],
+) -> tuple[Floats, Floats]:
+    """Return means (N, n) and covariances (N, n, n) of the states given all measurements."""
+    (transition, noise), (value, variance, design) = motion, measured
+    count, known = len(value), np.isfinite(value)
+    kalman = KalmanFilter(dim_x=states.count, dim_z=value.shape[1])
+    kalman.x, kalman.P = np.zeros(states.count), np.diag(_first_sigmas(states, settings) ** 2)
+    means, covariances = np.empty((count, states.count)), np.empty((count, states.count, states.count))
+    for k in range(count):
+        if k:
+            kalman.predict(F=transition[k], Q=noise[k])
+        has = known[k]
+        if has.any():
+            kalman.update(value[k, has], R=np.diag(variance[k, has]), H=design[k, has])
+        means[k], covariances[k] = kalman.x, kalman.P
+    smoothed, spread, _, _ = kalman.rts_smoother(means, covariances, transition, noise)
+    return np.asarray(smoothed), np.asarray(spread)
 
 
-def _with_wheel(
-    chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, nominal: Floats, settings: ReferenceSettings
-) -> Chain:
-    """Reading = position + difference; the difference changes with distance by the scale error, and by slip."""
-    if unknowns.difference < 0:
-        return chain
-    read = np.flatnonzero(np.isfinite(evidence.wheel_m))
-    distance = np.diff(evidence.wheel_m)
-    known = np.isfinite(distance)
-    distance = np.where(known, distance, 0.0)
-    row = _one(unknowns, unknowns.place) + _one(unknowns, unknowns.difference)
-    start = evidence.wheel_m[read[0]] - nominal[read[0]]
-    weight = np.full(len(read), max(evidence.wheel_sigma_m, _LEAST_READING_M) ** -2)
-    chain = chain.with_observations(read, row, evidence.wheel_m[read] - start - nominal[read], weight)
-    chain = _with_prior(chain, unknowns.difference, _ANY_DISTANCE_M)
-    chain = _with_prior(chain, unknowns.scale, settings.wheel_scale)
-    before, after = np.zeros((2, len(distance), 1, unknowns.count))
-    after[:, 0, unknowns.difference], before[:, 0, unknowns.difference] = 1.0, -1.0
-    before[:, 0, unknowns.scale] = -distance
-    variance = np.where(known, settings.slip_m**2 * np.abs(distance) + _LEAST_STEP_M**2, _ANY_DISTANCE_M**2)
-    chain = chain.with_steps(before, after, np.zeros((len(distance), 1)), (1.0 / variance)[:, None, None])
-    return _with_walk(chain, unknowns.scale, np.ones(len(dt)), 1.0 / (_SCALE_DRIFT**2 * dt))
+def _first_sigmas(states: _States, settings: ReferenceSettings) -> Floats:
+    """Return the standard deviations of the states at the first instant, where all are expected to be 0."""
+    sigmas = {
+        states.place: _ANY_DISTANCE_M,
+        states.speed: _ANY_SPEED_MPS,
+        states.acceleration: MOTION_MPS2,
+        states.doppler: settings.doppler_bias_mps,
+        states.difference: _ANY_DISTANCE_M,
+        states.scale: settings.wheel_scale,
+        states.offset: ACCELERATION_BIAS_MPS2,
+        states.speed_before: _ANY_SPEED_MPS,
+    }
+    return np.array([sigmas[column] for column in range(states.count)])
 
 
-def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats) -> Chain:
-    """Add the accelerometer's offset, a random walk."""
-    if unknowns.offset >= 0:
-        chain = _with_prior(chain, unknowns.offset, ACCELERATION_BIAS_MPS2)
-        chain = _with_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
-    return chain
+def _motion(states: _States, evidence: Evidence, dt: Floats, settings: ReferenceSettings) -> tuple[Floats, Floats]:
+    """Return the transition to each instant from the one before and the covariance of its noise, shapes (N, n, n).
+
+    Position, speed and a time-correlated acceleration (Singer's model); the Doppler speed's error is a first-order
+    Gauss-Markov process; the wheel's difference changes with the distance by the scale error, and by slip; its scale
+    error and the accelerometer's offset are random walks.
+    """
+    count = len(evidence.time)
+    transition, noise = np.zeros((2, count, states.count, states.count))
+    transition[0] = np.eye(states.count)
+    after = slice(1, None)
+    transition[after, :3, :3], noise[after, :3, :3] = singer_steps(dt, MOTION_MPS2, MOTION_S)
+    noise[after, [0, 1], [0, 1]] += _LEAST_STEP_M**2
+    if (d := states.doppler) >= 0:
+        kept = np.exp(-dt / settings.doppler_bias_s)
+        transition[after, d, d], noise[after, d, d] = kept, settings.doppler_bias_mps**2 * (1.0 - kept**2)
+    if (w := states.difference) >= 0:
+        distance = np.diff(evidence.wheel_m)
+        slip = settings.slip_m**2 * np.abs(distance) + _LEAST_STEP_M**2
+        transition[after, w, w], transition[after, w, states.scale] = 1.0, np.nan_to_num(distance)
+        noise[after, w, w] = np.where(np.isfinite(distance), slip, _ANY_DISTANCE_M**2)
+        transition[after, states.scale, states.scale] = 1.0
+        noise[after, states.scale, states.scale] = _SCALE_DRIFT**2 * dt
+    if (o := states.offset) >= 0:
+        transition[after, o, o], noise[after, o, o] = 1.0, _OFFSET_DRIFT_MPS2**2 * dt
+        transition[after, states.speed_before, states.speed] = 1.0
+    return transition, noise
 
 
-def _with_prior(chain: Chain, unknown: int, sigma: float) -> Chain:
-    """Add the expectation 0 of an unknown at the first instant."""
-    row = np.eye(chain.right.shape[1])[unknown]
-    return chain.with_observations(np.array([0]), row, np.zeros(1), np.full(1, sigma**-2))
+#: Kinds of measurements, columns of `_measurements`.
+_FIX, _DOPPLER, _WHEEL, _ACCELERATION = range(4)
 
 
-def _with_walk(chain: Chain, unknown: int, kept: Floats, weight: Floats) -> Chain:
-    """``x_{k+1} = kept x_k`` with noise, for one unknown."""
-    before, after = np.zeros((2, len(kept), 1, chain.right.shape[1]))
-    after[:, 0, unknown], before[:, 0, unknown] = 1.0, -kept
-    return chain.with_steps(before, after, np.zeros((len(kept), 1)), weight[:, None, None])
+def _measurements(
+    states: _States, evidence: Evidence, dt: Floats, origin_m: float, settings: ReferenceSettings
+) -> tuple[Floats, Floats, Floats]:
+    """Return values (N, 4), NaN where there is none, their variances (N, 4) and design (N, 4, n).
 
-
-def _one(unknowns: _Unknowns, unknown: int) -> Floats:
-    row = np.zeros(unknowns.count)
-    row[unknown] = 1.0
-    return row
+    Fix = place. Doppler speed = speed + error. Wheel = place + difference. The accelerometer's mean over a step times
+    its duration = gain of speed + offset times the duration.
+    """
+    count = len(evidence.time)
+    value, variance = np.full((count, 4), np.nan), np.ones((count, 4))
+    design = np.zeros((count, 4, states.count))
+    value[:, _FIX], variance[:, _FIX] = evidence.fix_m - origin_m, evidence.fix_sigma_m**2
+    design[:, _FIX, states.place] = 1.0
+    if states.doppler >= 0:
+        value[:, _DOPPLER], variance[:, _DOPPLER] = evidence.doppler_mps, evidence.doppler_sigma_mps**2
+        design[:, _DOPPLER, [states.speed, states.doppler]] = 1.0
+    if states.difference >= 0:
+        start_m = float(evidence.wheel_m[np.isfinite(evidence.wheel_m)][0])
+        value[:, _WHEEL] = evidence.wheel_m - start_m
+        variance[:, _WHEEL] = max(evidence.wheel_sigma_m, _LEAST_READING_M) ** 2
+        design[:, _WHEEL, [states.place, states.difference]] = 1.0
+    if states.offset >= 0:
+        value[1:, _ACCELERATION] = evidence.acceleration_mps2 * dt
+        variance[1:, _ACCELERATION] = settings.acceleration_mps2**2 * dt
+        design[1:, _ACCELERATION, states.speed], design[1:, _ACCELERATION, states.speed_before] = 1.0, -1.0
+        design[1:, _ACCELERATION, states.offset] = dt
+    return value, variance, design
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ import polars.selectors as cs
 
 from railfix import __version__
 from railfix.core.errors import InputFileError, NoPositionError, OutputError
-from railfix.core.files import Reader, stage_file
+from railfix.core.files import stage_file
 from railfix.core.timescale import gpst_to_utc, utc_to_gpst
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
@@ -54,38 +54,33 @@ def convert_logs(
         if target is not None:
             check_output_file(target, overwrite=overwrite, inputs=logs)
     reading = reading or LogReading()
-    date, reader = reading.instant, reading.reader
     version: Literal["3.04", "4.02"] = "3.04" if rinex == "3" else "4.02"
     lines: list[str] = []
     if out is not None:
-        header, epochs, skipped = _scan(logs, date, reader)
-        pieces = (piece for piece in scan_observations(logs, date=date, reader=reader) if len(piece))
+        header, epochs, skipped = _scan(logs, reading)
+        pieces = (piece for piece in scan_observations(logs, **reading.of_observations) if len(piece))
         observables = {
             system: [kind + signal for signal in signals for kind in "CLDS"]
             for system, signals in header.signals.items()
         }
         write_observations(pieces, out, version=version, observables=observables, header=header)
         lines.append(f"wrote {out}: {epochs:,} epochs, RINEX {version}")
-        lines += [f"passed over: {count:,} {what}" for what, count in sorted(skipped.items())]
+        lines += [f"skipped {count:,} {what}" for what, count in sorted(skipped.items())]
     if nav_out is not None:
-        navigation, left_out = with_written_messages(read_navigation(logs, date=date), version)
+        navigation, left_out = with_written_messages(read_navigation(logs, **reading.arguments), version)
         write_navigation(navigation, nav_out, version=version)
         records = len(navigation.kepler) + len(navigation.glonass)
         lines.append(f"wrote {nav_out}: {records:,} ephemerides, RINEX {version}")
-        lines += [
-            f"passed over: {count:,} {what}" for what, count in sorted({**navigation.skipped, **left_out}.items())
-        ]
+        lines += [f"skipped {count:,} {what}" for what, count in sorted({**navigation.skipped, **left_out}.items())]
     return lines
 
 
-def _scan(
-    logs: tuple[Path, ...], date: np.datetime64 | None, reader: Reader
-) -> tuple[ObservationHeader, int, Counter[str]]:
+def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeader, int, Counter[str]]:
     """Return the header with the signals of the whole log, number of epochs, and what is passed over."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
     header, epochs, skipped = ObservationHeader(), 0, Counter[str]()
-    for piece in scan_observations(logs, date=date, reader=reader):
+    for piece in scan_observations(logs, **reading.of_observations):
         header = piece.header if not epochs else header
         channels |= piece.header.glonass_channel
         epochs += len(piece)

@@ -37,6 +37,7 @@ from railfix.run.verdict import Verdict, judge_run
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
+from railfix.track.vehicle import read_vehicle
 
 if TYPE_CHECKING:
     from railfix.run.batch_check import BatchCheck
@@ -140,25 +141,27 @@ def open_inputs(
     inputs: RunInputs, options: RunOptions, config: Config
 ) -> tuple[Navigation, OpenedLine, dict[Antenna, Log]]:
     """Read navigation and line, and open the logs, by antenna; find the route in a network of tracks."""
-    navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=options.logs.instant)
+    navigation = read_navigation(inputs.nav, **options.logs.arguments)
     if inputs.sp3:
         from railfix.io.sp3 import read_sp3
 
-        navigation = replace(navigation, precise=read_sp3(inputs.sp3))
+        precise = read_sp3(inputs.sp3)
+        navigation = replace(navigation, precise=precise, notes=(*navigation.notes, *precise.notes))
     at = find_record_time(navigation)
 
     def open_log(paths: tuple[Path, ...]) -> Log:
         return Log(
-            paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines, start=options.start,
-            end=options.end, date=options.logs.instant, reader=options.logs.reader,
+            paths=paths, chunk_epochs=options.chunk_epochs, start=options.start, end=options.end,
+            reading=options.logs,
         )  # fmt: skip
 
     from railfix.run.route import LogPositions
 
-    paths = next(iter(inputs.logs.values()))
+    antenna, paths = next(iter(inputs.logs.items()))
+    offset = None if inputs.vehicle is None else read_vehicle(inputs.vehicle).antennas.get(antenna)
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
-        reading=options.track,
+        reading=options.track, antenna_up_m=0.0 if offset is None else offset.up_m,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
@@ -312,7 +315,7 @@ def collect_notes(
     notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [
-            f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
+            f"{name}: screen {screen.name} tested nothing; it needs {screen.needs}"
             for screen in SCREENS
             if antenna.judged.get(screen.name) is False
         ]
@@ -322,7 +325,7 @@ def collect_notes(
         for by, counts in (("single epochs", antenna.lasting), ("the filter", antenna.left_out)):
             notes += [
                 f"{name}: {by} left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
-                "over a minute they contradict all others"
+                "inconsistent with the others for over a minute"
                 for satellite, (count, first) in sorted(counts.items(), key=lambda item: -item[1][0])[:_NAMED]
             ]
         offset = antenna.map_offset
@@ -348,8 +351,8 @@ def _describe_detectable(detectable_m: Floats) -> str:
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
     return (
-        f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
-        f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
+        f"map errors smaller than {across:.0f} m laterally or {up:.0f} m in height cannot be detected; where the "
+        f"ranges are worst, smaller than {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
 
 

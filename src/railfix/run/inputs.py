@@ -50,11 +50,6 @@ BALISE_LIST: Final = (
 VIRTUAL_BALISES: Final = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
 
 
-BROKEN_LINES: Final[Any] = option(
-    "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
-)
-
-
 class InputFiles(Settings):
     """Input files of a command, each field a path, several paths, or None."""
 
@@ -302,8 +297,45 @@ class TrackReading(Settings):
     )
 
 
+class LogReading(Settings):
+    """How to read logs and navigation files: one policy of every command."""
+
+    date: datetime | None = option(
+        "Some time within half a week of RTCM 3 logs without ephemerides, GPS time: their observations carry no week.",
+        None,
+        metavar="TIME",
+    )
+    broken_lines: BrokenLines = option(
+        "Skip and count what is broken in the input files, instead of stopping. What loses nothing is read without it: "
+        "comments, further headers, doubled and exchanged epochs, a cut last record.",
+        "stop",
+        name="--lenient",
+    )
+
+    reader: Reader = option(
+        "What reads RINEX observation files: railfix, or georinex, an independent reader to compare with, which is "
+        "slower, reads whole files at once, and knows neither events nor broken lines.",
+        "railfix",
+    )
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of the readers of positions and navigation."""
+        return {"date": self.instant, "broken_lines": self.broken_lines}
+
+    @property
+    def of_observations(self) -> dict[str, Any]:
+        """Return the arguments of the readers of observations."""
+        return {**self.arguments, "reader": self.reader}
+
+    @property
+    def instant(self) -> np.datetime64 | None:
+        """The date as the readers take it."""
+        return None if self.date is None else np.datetime64(self.date.replace(tzinfo=None), "ns")
+
+
 class ColumnNames(Settings):
-    """Names of columns in CSV files of positions."""
+    """How to read logs of positions: names of columns in tables, and what `LogReading` has."""
 
     column: tuple[str, ...] = option(
         "Column of CSV positions under another name, such as time_utc=Timestamp; may be repeated. Names: time_gpst, "
@@ -313,32 +345,17 @@ class ColumnNames(Settings):
         metavar="NAME=COLUMN",
     )
 
+    logs: LogReading = Field(default_factory=LogReading)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of `railfix.io.read_positions`."""
+        return {"columns": self.names, **self.logs.arguments}
+
     @property
     def names(self) -> dict[str, str]:
         """Name in the file by that in railfix; SettingsError where a text is not NAME=COLUMN."""
         return column_names(self.column)
-
-
-READER: Final[Any] = option(
-    "What reads RINEX observation files: railfix, or georinex, an independent reader to compare with, which is slower, "
-    "reads whole files at once, and knows neither events nor broken lines.",
-    "railfix",
-)
-
-
-class LogReading(Settings):
-    """How to read receiver logs."""
-
-    reader: Reader = READER
-
-    date: datetime | None = option(
-        "Some time within half a week of RTCM 3 logs, GPS time: their observations carry no week.", None, metavar="TIME"
-    )
-
-    @property
-    def instant(self) -> np.datetime64 | None:
-        """The date as the readers take it."""
-        return None if self.date is None else np.datetime64(self.date.replace(tzinfo=None), "ns")
 
 
 class RunOptions(Settings):
@@ -356,7 +373,6 @@ class RunOptions(Settings):
         "skip",
         name="--observations",
     )
-    broken_lines: BrokenLines = BROKEN_LINES
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     chunk_epochs: int = option(
         "Epochs in memory at a time; the results do not depend on it.", 4000, name="--chunk", metavar="EPOCHS", ge=1

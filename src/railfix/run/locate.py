@@ -13,13 +13,13 @@ import polars as pl
 
 from railfix.core.arrays import Floats, join_rows
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
-from railfix.core.files import BrokenLines, ending, write_whole
+from railfix.core.files import write_whole
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
-from railfix.io.positions import read_positions
+from railfix.io.positions import position_kind, read_positions
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
 from railfix.pipeline.channels import ChannelBook
@@ -57,10 +57,9 @@ def locate_files(
     """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single)."""
     inputs.check_files()
     reading = reading or LogReading()
-    date = reading.instant
-    navigation = read_navigation(inputs.nav, date=date)
+    navigation = read_navigation(inputs.nav, **reading.arguments)
     received = known_from_start(config, navigation=navigation)
-    log = Log(paths=inputs.log, chunk_epochs=_CHUNK_EPOCHS, date=date, reader=reading.reader)
+    log = Log(paths=inputs.log, chunk_epochs=_CHUNK_EPOCHS, reading=reading)
     book = ChannelBook(config)
     parts = [locate(part, received, config, book) for part in log.parts()]
     located = join_rows(parts)
@@ -194,10 +193,6 @@ def _duration(seconds: int) -> str:
     return " ".join([*([f"{hours} h"] if hours else []), *([f"{rest:+d} s" if hours else f"{rest} s"] if rest else [])])
 
 
-#: Endings of files of positions; others are logs of observations.
-POSITION_ENDINGS: Final = (".pos", ".csv", ".nmea", ".nma", ".gga", ".gpx", ".asc", ".ascii", ".gps")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Surveyed:
     """A survey with its runs, and notes on the files."""
@@ -216,7 +211,6 @@ def survey_files(
     name: str,
     reading: LogReading | None = None,
     columns: Mapping[str, str] | None = None,
-    broken_lines: BrokenLines = "stop",
 ) -> Surveyed:
     """Survey a line from files of positions and logs of observations.
 
@@ -229,27 +223,29 @@ def survey_files(
     if twice:
         raise InputFileError(min(twice), "is given twice; name each run once")
     reading = reading or LogReading()
-    date = reading.instant
     runs: list[SurveyRun] = []
     notes: list[str] = []
     of_nav: Navigation | None = None
     for path in paths:
         try:
-            if ending(path) in POSITION_ENDINGS:
-                of_file = columns if ending(path) == ".csv" else None
-                log = read_positions(path, broken_lines=broken_lines, date=date, columns=of_file)
+            kind = position_kind(path)
+            if kind not in ("", "receiver"):
+                of_file = columns if kind == "csv" else None
+                log = read_positions(path, columns=of_file, **reading.arguments)
                 notes += log.notes
                 runs.append(run_of_log(log, limits))
                 continue
             own = not nav and is_receiver_log(read_head(path))
             if not nav and not own:
                 message = "is a log of observations, which needs navigation files: give --nav"
-                raise InputFileError(path, f"{message}; positions are files {', '.join(POSITION_ENDINGS)}")
-            of_nav = read_navigation((path,), date=date) if own else of_nav or read_navigation(tuple(nav), date=date)
-            received = known_from_start(config, navigation=of_nav)
-            observed = Log(
-                paths=(path,), chunk_epochs=_CHUNK_EPOCHS, broken_lines=broken_lines, date=date, reader=reading.reader
+                raise InputFileError(path, message)
+            of_nav = (
+                read_navigation((path,), **reading.arguments)
+                if own
+                else of_nav or read_navigation(tuple(nav), **reading.arguments)
             )
+            received = known_from_start(config, navigation=of_nav)
+            observed = Log(paths=(path,), chunk_epochs=_CHUNK_EPOCHS, reading=reading)
             runs.append(survey_run(observed.parts(), received, config, limits, name=str(path)))
             notes += [*received.notes, *observed.problems]
             of_nav = None if own else of_nav

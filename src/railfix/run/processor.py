@@ -140,11 +140,5 @@ def base_log(paths: tuple[Path, ...], options: RunOptions) -> BaseLog | None:
     check_base_place(paths, options.base_place)
     if not paths:
         return None
-    log = Log(
-        paths=paths,
-        chunk_epochs=options.chunk_epochs,
-        broken_lines=options.broken_lines,
-        date=options.logs.instant,
-        reader=options.logs.reader,
-    )
+    log = Log(paths=paths, chunk_epochs=options.chunk_epochs, reading=options.logs)
     return BaseLog(log, options.base_place)

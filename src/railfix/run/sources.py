@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from railfix.core.errors import MismatchError, SettingsError
-from railfix.core.files import BrokenLines, Reader
 from railfix.core.reasons import Status
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import scan_observations
@@ -21,7 +20,7 @@ from railfix.pipeline.along_track import mark_doubtful
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import apply_verdicts
 from railfix.pipeline.results import Result
-from railfix.run.inputs import OF_LOG, Antenna, TrackReading
+from railfix.run.inputs import OF_LOG, Antenna, LogReading, TrackReading
 from railfix.run.prepared import PreparedLines, compute_key, track_key
 from railfix.run.route import RouteOfLog
 from railfix.track import Track
@@ -220,12 +219,10 @@ class Log:
 
     paths: tuple[Path, ...]
     chunk_epochs: int
-    broken_lines: BrokenLines = "stop"
+    reading: LogReading = field(default_factory=LogReading)
     #: First epoch, and the time before which the last one lies.
     start: datetime | None = None
     end: datetime | None = None
-    date: np.datetime64 | None = None  #: Of RTCM 3 logs; see `railfix.run.inputs.LogReading`.
-    reader: Reader = "railfix"
     share: float = 0.0  #: Part of the files that has been read, 0 to 1.
     problems: list[str] = field(default_factory=list)  #: Sentences on what was broken and passed over.
     skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
@@ -235,12 +232,10 @@ class Log:
         pieces = scan_observations(
             self.paths,
             epochs=self.chunk_epochs,
-            broken_lines=self.broken_lines,
             start=None if self.start is None else np.datetime64(self.start, "ns"),
             end=None if self.end is None else np.datetime64(self.end, "ns"),
-            date=self.date,
             progress=self._read_to,
-            reader=self.reader,
+            **self.reading.of_observations,
         )
         for piece in pieces:
             self.problems += piece.problems

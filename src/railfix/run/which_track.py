@@ -39,6 +39,7 @@ _SAME_PLACE_M: Final = 1.0
 #: What the distance moved may be wrong by: share, and constant part [m].
 _ODOMETER_SHARE: Final = 0.05
 _ODOMETER_M: Final = 10.0
+_NOTED_MISFIT: Final = 2.5  #: Distances from the most likely track in standard deviations that are noted.
 #: Least probability of a track that the map does not have.
 _LEAST_UNMAPPED: Final = 1e-9
 
@@ -265,7 +266,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front one")
     if (inputs.last is None) != (options.moved is None):
         raise SettingsError("the last place needs --last and --moved, the distance moved since (0: none)")
-    navigation = read_navigation(inputs.nav, date=options.logs.instant)
+    navigation = read_navigation(inputs.nav, **options.logs.arguments)
     base = None
     if options.base_place is not None:
         base = _observations(inputs.base, options), parse_position(options.base_place, "--base-place")
@@ -304,19 +305,18 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
         least_s=options.least_s,
         prior=prior,
     )
+    last = decision.posteriors[-1]
+    best = int(np.argmax(last.probability))
+    if last.misfit_sigmas[best] > _NOTED_MISFIT:
+        notes.append(
+            f"the codes' place lies {last.misfit_sigmas[best]:.1f} standard deviations from {last.names[best]}, the "
+            "most likely track; beyond 4 nothing is decided: is the map displaced, or a track missing?"
+        )
     return replace(decision, notes=tuple(notes))
 
 
 def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observations:
-    logs = options.logs
-    log = Log(
-        paths=paths,
-        chunk_epochs=3000,
-        start=options.start,
-        end=options.end,
-        date=logs.instant,
-        reader=logs.reader,
-    )
+    log = Log(paths=paths, chunk_epochs=3000, start=options.start, end=options.end, reading=options.logs)
     parts = list(log.parts())
     if not parts:
         raise InputFileError(paths[0], "there is no epoch in the time asked for")

@@ -162,7 +162,7 @@ class Screen(ABC, Generic[Limits]):
 
     def notes(self, limits: Limits, setup: ScreenSetup) -> tuple[str, ...]:
         """Return sentences on a screen that was asked for and cannot judge, or not fully."""
-        return (f"screen {self.name}: inactive; it needs {self.needs}",) if self.unable(limits, setup) else ()
+        return (f"screen {self.name} was not run: it needs {self.needs}",) if self.unable(limits, setup) else ()
 
     def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:
         """Yield name and data of each picture of the screen: `observation_pictures`, or what an override yields."""

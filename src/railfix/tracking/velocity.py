@@ -15,7 +15,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Masks
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.motion.chain import singer_steps
+from railfix.motion.singer import singer_steps
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 
@@ -94,7 +94,7 @@ def _fit(gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floa
 
 
 def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
-    """`railfix.motion.chain.singer_steps` of one interval, shapes (3, 3)."""
+    """`railfix.motion.singer.singer_steps` of one interval, shapes (3, 3)."""
     step, noise = singer_steps(np.array([dt]), sigma_mps2, tau_s)
     return step[0], noise[0]
 

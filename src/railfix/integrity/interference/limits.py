@@ -11,6 +11,7 @@ from pydantic import Field
 
 from railfix import kernels
 from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Integers, Masks, Strings, kernel_array
+from railfix.core.channel_state import join_channels
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 
@@ -165,6 +166,7 @@ def hold_signs(
 
 _MINUTE_S: Final = 60.0
 _GAIN_DECAY_PER_MIN: Final = 0.005  #: The gain's peak is forgotten by this share of it a minute.
+_LARGEST_DBHZ: Final = 100.0  #: A peak that has been forgotten by so much is below every C/N0.
 _LONGEST_SILENCE_S: Final = 60.0  #: Satellites not heard for longer are not compared with what they were [s].
 
 
@@ -202,10 +204,16 @@ def power_signs(
     stays is seen for minutes. `channel` names satellite and signal, one signal of each satellite at an epoch. The gain
     is in the receiver's unit, + for more gain; NaN where unknown.
     """
-    now = seconds(time - GPS_EPOCH)
+    now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
+    young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ
+    joined = join_channels(channel, [state.channel], [young])
+    before = tuple(
+        joined.arrange(values, fill)
+        for values, fill in ((state.peak_db, -np.inf), (state.first_s, np.nan), (state.last_s, np.nan))
+    )
     fall, spread, difference, (peak, first, last) = kernels.screens.falls_of_cn0(
-        now, kernel_array(cn0_dbhz), _rearrange(state, channel), limits.peak_decay_db_per_min / _MINUTE_S,
-        _LONGEST_SILENCE_S, limits.known_after_s, limits.least_satellites,
+        now, kernel_array(joined.widen(cn0_dbhz, np.nan)), before, decay, _LONGEST_SILENCE_S, limits.known_after_s,
+        limits.least_satellites,
     )  # fmt: skip
     logarithm, forgotten = np.log(np.where(gain > 0, gain, np.nan)), _GAIN_DECAY_PER_MIN / _MINUTE_S * now
     gains = np.fmax.accumulate(np.concatenate([[state.gain], logarithm + forgotten]))[1:]
@@ -215,15 +223,5 @@ def power_signs(
     )  # fmt: skip
     if not len(time):
         return signs, state
-    after = PowerState(channel=channel, peak_db=peak, first_s=first, last_s=last, gain=float(gains[-1]))
+    after = PowerState(channel=joined.channel, peak_db=peak, first_s=first, last_s=last, gain=float(gains[-1]))
     return signs, after
-
-
-def _rearrange(state: PowerState, channel: Strings) -> tuple[Floats, Floats, Floats]:
-    """Return peaks, beginnings and last observations on other channels."""
-    if state.channel is channel:
-        return state.peak_db, state.first_s, state.last_s
-    peak, first, last = np.full(len(channel), -np.inf), np.full(len(channel), np.nan), np.full(len(channel), np.nan)
-    _, here, there = np.intersect1d(channel, state.channel, return_indices=True)
-    peak[here], first[here], last[here] = state.peak_db[there], state.first_s[there], state.last_s[there]
-    return peak, first, last

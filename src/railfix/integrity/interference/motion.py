@@ -9,6 +9,7 @@ import numpy as np
 
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array
+from railfix.core.channel_state import join_channels
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.integrity.interference.limits import InterferenceLimits
@@ -149,8 +150,8 @@ def motion_signs(
         off_line_sigmas=np.maximum(off - limits.position_jump_m, 0.0) / fixes.sigma_m,
     )  # fmt: skip
     after = MotionSignState(
-        time=inputs.time[-1], channel=inputs.channel, code_m=last_codes[0], rate_mps=last_codes[1],
-        since=last_codes[2], position=last_position, velocity=last_velocity, on_map=bool(been[-1]),
+        time=inputs.time[-1], channel=last_codes[0], code_m=last_codes[1], rate_mps=last_codes[2],
+        since=last_codes[3], position=last_position, velocity=last_velocity, on_map=bool(been[-1]),
     )  # fmt: skip
     return signs, after
 
@@ -249,20 +250,18 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 
 def _clock_jump(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
-) -> tuple[Floats, tuple[Floats, Floats, Datetimes]]:
+) -> tuple[Floats, tuple[Strings, Floats, Floats, Datetimes]]:
     """Return the median change of codes against Dopplers, less whole milliseconds (T,) [m], and the new state."""
-    channels = len(inputs.channel)
-    code, rate, since = state.code_m, state.rate_mps, state.since
-    if state.channel is not inputs.channel:
-        code, rate = np.full((2, channels), np.nan)
-        since = np.full(channels, np.datetime64("NaT", "ns"))
-        _, here, there = np.intersect1d(inputs.channel, state.channel, return_indices=True)
-        code[here], rate[here], since[here] = state.code_m[there], state.rate_mps[there], state.since[there]
+    young = seconds(inputs.time[0] - state.since) <= limits.longest_gap_s
+    joined = join_channels(inputs.channel, [state.channel], [young])
+    code, rate = (joined.arrange(values, np.nan) for values in (state.code_m, state.rate_mps))
+    since = joined.arrange(state.since, np.datetime64("NaT", "ns"))
     step, (code, rate, since_ns) = kernels.screens.clock_steps(
-        inputs.time.astype(np.int64), inputs.break_before, kernel_array(inputs.code_m), kernel_array(inputs.rate_mps),
-        (code, rate, since.view(np.int64)), limits.longest_gap_s, limits.least_satellites,
+        inputs.time.astype(np.int64), inputs.break_before, kernel_array(joined.widen(inputs.code_m, np.nan)),
+        kernel_array(joined.widen(inputs.rate_mps, np.nan)), (code, rate, since.view(np.int64)), limits.longest_gap_s,
+        limits.least_satellites,
     )  # fmt: skip
-    after = code, rate, since_ns.view("datetime64[ns]")
+    after = joined.channel, code, rate, since_ns.view("datetime64[ns]")
     return np.asarray(step - np.round(step / _MILLISECOND_M) * _MILLISECOND_M), after
 
 

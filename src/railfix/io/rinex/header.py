@@ -12,8 +12,9 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import ByteStream, FilePath
+from railfix.core.files import LENIENT, ByteStream, FilePath
 from railfix.gnss.observations import ObservationHeader
+from railfix.io.rinex.observations_epochs import FaultLog
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_columns
 
 #: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
@@ -22,7 +23,9 @@ _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZ
 ALL: Final = ""  #: Key of the types of a RINEX 2 file, which hold for all constellations.
 #: Longest header; a longer file without END OF HEADER is no RINEX file.
 _MAX_HEADER_BYTES: Final = 4 << 20
-Note = Callable[[str], None]  #: What takes a note on a record that was skipped.
+VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
+#: Names of time systems that programs write otherwise.
+_OTHER_NAMES: Final = {"GPST": "GPS", "BDS": "BDT", "GLONASS": "GLO", "GALILEO": "GAL", "QZSS": "QZS"}
 _FILE_TYPES: Final = {
     "N": "a RINEX navigation file; give it with --nav",
     "G": "a RINEX navigation file (GLONASS); give it with --nav",
@@ -49,6 +52,11 @@ class RinexHeader:
     scale: Mapping[tuple[str, str], float] = field(default_factory=dict)
     #: The part that becomes `Observations.header`.
     public: ObservationHeader = field(default_factory=ObservationHeader)
+
+    @property
+    def reading(self) -> tuple[object, ...]:
+        """Return everything that decides how the lines after the header are read."""
+        return self.version, self.system, self.time_system, self.types, self.scale
 
     def get_types(self, system: str) -> tuple[str, ...] | None:
         """Return the declared types of a constellation, None for an undeclared one."""
@@ -79,7 +87,7 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
 
 
 def _check_kind(path: str, line: str) -> None:
-    if line[60:].strip() != "RINEX VERSION / TYPE":
+    if line[60:].strip() != VERSION:
         if re.match(r"#[a-d][PV]", line):
             raise InputFileError(path, "is an SP3 orbit file, a RINEX observation file was expected", line=1)
         if line.startswith(("$G", "$P", "%")):
@@ -95,16 +103,18 @@ def _check_kind(path: str, line: str) -> None:
         raise InputFileError(path, f"is {what} (an observation file was expected)", line=1)
 
 
-def parse_header(path: str, lines: Sequence[str], *, note: Note | None = None) -> RinexHeader:
-    """Parse the header of an observation file; `note` takes unreadable records that do not matter, else errors."""
+def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: int = 1) -> RinexHeader:
+    """Parse the header of an observation file that begins at a line; `log` takes notes on what is not in its columns,
+    and unreadable records that do not matter where broken lines do not stop the reading.
+    """
     version = read_version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
     if system not in SYSTEMS + "M":
-        raise InputFileError(path, f"satellite system '{system}' is none of {', '.join(SYSTEMS)} or M", line=1)
+        raise InputFileError(path, f"satellite system '{system}' is none of {', '.join(SYSTEMS)} or M", line=first_line)
     start = RinexHeader(
         version=version, system=system, time_system=_DEFAULT_TIME[system], public=ObservationHeader(version=version)
     )
-    header = apply_records(path, start, lines[1:], first_line=2, note=note)
+    header = apply_records(path, start, lines[1:], first_line=first_line + 1, log=log)
     if not header.types:
         label = "# / TYPES OF OBSERV" if version < 3.0 else "SYS / # / OBS TYPES"
         raise InputFileError(path, f"the header has no {label} record; the observation types are unknown")
@@ -124,22 +134,22 @@ def read_version(path: FilePath, line: str) -> float:
 
 
 def apply_records(
-    path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, note: Note | None = None
+    path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, log: FaultLog
 ) -> RinexHeader:
     """Apply header records in the middle of a file (epoch flags 2 to 4); `first_line` is the number of the first."""
-    reader = _HeaderRecords(path, header, note)
+    reader = _HeaderRecords(path, header, log)
     for number, line in enumerate(lines, start=first_line):
         reader.read(line, number)
     return reader.finish()
 
 
 class _HeaderRecords:
-    """Reader of header records into a copy of a header."""
+    """Reader of header records into a copy of a header: by columns, else by words, with a note."""
 
-    def __init__(self, path: str, header: RinexHeader, note: Note | None) -> None:
+    def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path
         self._header = header
-        self._note = note
+        self._log = log
         self._line = 0
         self._types = dict(header.types)
         self._scale = dict(header.scale)
@@ -161,11 +171,27 @@ class _HeaderRecords:
             name, read = _VALUES[label]
             try:
                 self._changes[name] = read(text)
-            except ValueError as error:
-                message = f"{label}: '{text.strip()}' cannot be read as the numbers expected"
-                if self._note is None:
-                    raise InputFileError(self._path, message, line=number) from error
-                self._note(f"{self._path}, line {number}: {message}; the record was skipped")
+            except ValueError:
+                self._changes |= self._by_words(name, label, text)
+
+    def _by_words(self, name: str, label: str, text: str) -> dict[str, Any]:
+        """Return a value by the words of a record; none where it cannot be read and broken lines do not stop."""
+        read = _BY_WORDS.get(label)
+        try:
+            if read is not None:
+                value = read(text.split())
+                self._remark(label)
+                return {name: value}
+        except (ValueError, IndexError):
+            pass
+        message = f"{label}: '{text.strip()}' cannot be read as the numbers expected"
+        if self._log.stops:
+            raise self._fail(f"{message}; {LENIENT}")
+        self._log.note(f"{self._path}, line {self._line}: {message}; the record was skipped")
+        return {}
+
+    def _remark(self, label: str) -> None:
+        self._log.remark(f"{self._path}, line {self._line}: {label} is not in its columns; it was read by its words")
 
     def finish(self) -> RinexHeader:
         """Return the header with all records applied."""
@@ -196,23 +222,34 @@ class _HeaderRecords:
             self._types[ALL] = ()
         elif ALL not in self._declared:
             raise self._fail("# / TYPES OF OBSERV: the number of types is missing")
-        self._extend(ALL, [text[k : k + 6].strip() for k in range(6, 60, 6)], r"[CPLDSTX][0-9A-D]")
+        names = [text[k : k + 6].strip() for k in range(6, 60, 6)]
+        self._extend(ALL, names, text[6:].split(), "# / TYPES OF OBSERV", r"[CPLDSTX][0-9A-D]")
 
     def types_3(self, text: str) -> None:
         """SYS / # / OBS TYPES."""
-        if text[0] != " ":
-            self._current = text[0]
-            self._declared[text[0]] = (self._count(text[3:6], "SYS / # / OBS TYPES"), self._line)
-            self._types[text[0]] = ()
+        words = text.split()
+        beside = re.match(r" +[A-Z] +\d+ ", text)
+        if text[0] != " " or beside:
+            letter, count = (words[0], words[1]) if beside else (text[0], text[3:6])
+            words = words[2:] if words[0] == letter else words[1:]
+            self._current = letter
+            self._declared[letter] = (self._count(count, "SYS / # / OBS TYPES"), self._line)
+            self._types[letter] = ()
         elif self._current not in self._declared:
             raise self._fail("SYS / # / OBS TYPES: the constellation letter is missing")
-        self._extend(self._current, [text[k : k + 3].strip() for k in range(7, 59, 4)], r"[CLDSXI][0-9][A-Z]?")
+        names = words if beside else [text[k : k + 3].strip() for k in range(7, 59, 4)]
+        self._extend(self._current, names, words, "SYS / # / OBS TYPES", r"[CLDSXI][0-9][A-Z]?")
+        if beside:
+            self._remark("SYS / # / OBS TYPES")
 
-    def _extend(self, system: str, names: list[str], pattern: str) -> None:
+    def _extend(self, system: str, names: list[str], words: list[str], label: str, pattern: str) -> None:
         names = [name for name in names if name]
-        for name in names:
-            if not re.fullmatch(pattern, name):
-                raise self._fail(f"'{name}' is no observation type")
+        wrong = [name for name in names if not re.fullmatch(pattern, name)]
+        if wrong:
+            if not words or not all(re.fullmatch(pattern, word) for word in words):
+                raise self._fail(f"'{wrong[0]}' is no observation type")
+            names = words
+            self._remark(label)
         self._types[system] += tuple(names)
 
     def scale_factor(self, text: str) -> None:
@@ -220,10 +257,13 @@ class _HeaderRecords:
         names = [text[k : k + 3].strip() for k in range(11, 59, 4)]
         names = [name for name in names if name]
         if text[0] != " ":
-            factor = text[2:6].strip()
-            if factor not in ("1", "10", "100", "1000"):
-                raise self._fail(f"SYS / SCALE FACTOR: '{factor}' is none of 1, 10, 100, 1000")
-            count = text[8:10].strip()
+            factor, count = text[2:6].strip(), text[8:10].strip()
+            if factor.lstrip("0") not in ("1", "10", "100", "1000"):
+                words = text.split()
+                factor, count, names = (*words[1:3], words[3:]) if len(words) > 2 else (*words[1:2], "", [])  # type: ignore[assignment]
+                if factor.lstrip("0") not in ("1", "10", "100", "1000"):
+                    raise self._fail(f"SYS / SCALE FACTOR: '{text[2:6].strip()}' is none of 1, 10, 100, 1000")
+                self._remark("SYS / SCALE FACTOR")
             if count.strip("0"):
                 self._scaling = (text[0], float(factor), self._count(count, "SYS / SCALE FACTOR"))
             else:
@@ -244,7 +284,11 @@ class _HeaderRecords:
         """TIME OF FIRST OBS: its time system; the time itself is that of the first epoch."""
         name = text[48:51].strip()
         if name and name not in TIME_SYSTEMS:
-            raise self._fail(f"TIME OF FIRST OBS: time system '{name}' is none of {', '.join(TIME_SYSTEMS)}")
+            word = text.split()[-1]
+            if (found := _OTHER_NAMES.get(word.upper(), word.upper())) not in TIME_SYSTEMS:
+                raise self._fail(f"TIME OF FIRST OBS: time system '{name}' is none of {', '.join(TIME_SYSTEMS)}")
+            name = found
+            self._remark("TIME OF FIRST OBS")
         if name:
             self._changes["time_system"] = name
 
@@ -298,6 +342,19 @@ _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
     "MARKER NAME": ("marker", str.strip),
     "REC # / TYPE / VERS": ("receiver", lambda text: text[20:40].strip()),
     "ANT # / TYPE": ("antenna", lambda text: text[20:40].strip()),
+}
+
+
+def _words_of_three(words: Sequence[str]) -> Floats:
+    return _three("".join(f"{word:>14}" for word in words[:3]))
+
+
+#: Readers of such records by their words.
+_BY_WORDS: Final[Mapping[str, Callable[[Sequence[str]], Any]]] = {
+    "APPROX POSITION XYZ": lambda words: _place("".join(f"{word:>14}" for word in words[:3])),
+    "ANTENNA: DELTA H/E/N": _words_of_three,
+    "INTERVAL": lambda words: _interval(words[0]),
+    "LEAP SECONDS": lambda words: int(words[0]),
 }
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import BrokenLines, FilePath, Paths, path_names, read_text_lines
+from railfix.core.files import LENIENT, BrokenLines, FilePath, Paths, path_names, read_text_lines
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.header import read_version
 from railfix.io.rinex.navigation_records import (
@@ -53,8 +53,12 @@ class NavigationContent:
     def reject(self, error: InputFileError) -> None:
         """Raise the error of a broken record, or count and note it."""
         if self.broken_lines == "stop":
-            raise error
-        self.skipped["broken"] += 1
+            raise InputFileError(error.path, f"{error.message}; {LENIENT}", line=error.line)
+        self.drop("broken", error)
+
+    def drop(self, reason: str, error: InputFileError) -> None:
+        """Count and note a record that is not used."""
+        self.skipped[reason] += 1
         self.notes.append(f"skipped: {error}")
 
     def keep_ionosphere(self, letter: str, half: str, values: list[float]) -> None:
@@ -97,7 +101,7 @@ def _version(path: FilePath, first: str) -> tuple[float, str]:
         raise InputFileError(
             path, "is a RINEX observation file; give it with --front or --rear (a navigation file was expected)", line=1
         )
-    if kind != "N" and not (kind in ("G", "H") and version < 3.0):
+    if kind not in _FILE_SYSTEMS:
         raise InputFileError(path, f"is RINEX of type {kind!r}, a navigation file (N) was expected", line=1)
     return version, kind
 
@@ -125,6 +129,8 @@ _MESSAGES: Final = {
     "G": ("LNAV", "CNAV", "CNV2"), "J": ("LNAV", "CNAV", "CNV2"), "E": ("INAV", "FNAV"),
     "C": ("D1", "D2", "CNV1", "CNV2", "CNV3"), "R": ("FDMA",),
 }  # fmt: skip
+#: File types, and the constellation of records without a letter (RINEX 2.11, 2.12; 3.00 has types of its own, too).
+_FILE_SYSTEMS: Final = {"N": "G", "G": "R", "H": "S", "E": "E", "L": "E", "J": "J"}
 _SKIPPED: Final = ("S", "I")  #: Constellations whose records are skipped: SBAS, NavIC.
 _WIDTH: Final = 19  #: Width of a number.
 #: ``> EPH G01 LNAV`` (RINEX 4.02, table A7); time offsets (STO) may name a constellation alone: ``> STO E   IFNV``.
@@ -142,8 +148,9 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     for path in files:
         _read_file(path, content)
     if not content.records:
+        first = next((f"; {note}" for note in content.notes if note.startswith("skipped: ")), "")
         names = ", ".join(files)
-        raise InputFileError(names, "has no usable GPS, QZSS, Galileo, BeiDou or GLONASS record")
+        raise InputFileError(names, f"has no usable GPS, QZSS, Galileo, BeiDou or GLONASS record{first}")
     return Navigation(
         kepler=kepler_records([r for r in content.records if r.system != "R"]),
         glonass=glonass_records([r for r in content.records if r.system == "R"]),
@@ -163,6 +170,7 @@ class _Block:
     name: str
     message: str
     text: list[str]
+    last: bool = False  #: Whether it is the last one of the file, which may be cut.
 
 
 def _read_file(path: FilePath, content: NavigationContent) -> None:
@@ -175,21 +183,24 @@ def _read_file(path: FilePath, content: NavigationContent) -> None:
         try:
             record = _record(path, block, version, content)
         except InputFileError as error:
-            content.reject(error)
-        else:
-            if record is not None:
-                content.add(record)
+            if block.last and "lines," in error.message:
+                content.drop("cut at the end of the file", error)
+            else:
+                content.reject(error)
+            continue
+        if record is not None:
+            content.add(record)
 
 
 def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: str) -> Iterator[_Block]:
     """Yield the records of versions 2 and 3, whose first lines do not begin with blanks."""
     starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
     _reject_stray(path, lines, begin, starts)
-    letter = {"N": "G", "G": "R", "H": "S"}[kind] if version < 3.0 else ""
+    letter = _FILE_SYSTEMS[kind] if version < 3.0 else ""
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         text = lines[start]
         name = letter + text[:2] if letter and not text[:1].isalpha() else text[:3]
-        yield _Block(start + 1, name, "", lines[start:end])
+        yield _Block(start + 1, name, "", lines[start:end], end == len(lines))
 
 
 def _reject_stray(path: FilePath, lines: list[str], begin: int, starts: list[int]) -> None:
@@ -211,7 +222,7 @@ def _blocks_4(path: FilePath, lines: list[str], begin: int, content: NavigationC
                 raise InputFileError(path, what, line=start + 1)
             kind, name, message = title.groups()
             if kind == "EPH":
-                yield _Block(start + 2, name, message, text)
+                yield _Block(start + 2, name, message, text, end == len(lines))
             elif kind == "ION":
                 _ionosphere_4(path, name[0], message, text, start + 2, content)
             else:

@@ -76,8 +76,6 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
     },
 }
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
-#: Distance of a satellite from the Earth's centre [km]: above its surface.
-_RADIUS_KM: Final = (6_400.0, 70_000.0)
 _BLANK: Final = float("nan")
 _UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.
 _TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times further than this from toe are invalid [s].
@@ -124,11 +122,6 @@ def first_fault(record: RawRecord) -> tuple[int, str] | None:
         low, high = _BETWEEN.get(name, _OTHERS_BETWEEN)
         if value < low or value > high:
             return k, f"{name} is {value:g}; between {low:g} and {high:g} was expected"
-    if record.system == "R":
-        radius = float(np.linalg.norm(record.numbers[3:15:4]))
-        low, high = _RADIUS_KM
-        if not low <= radius <= high:
-            return 3, f"x, y, z is {radius:g} km from the Earth's centre; between {low:g} and {high:g} was expected"
     return None
 
 

@@ -8,24 +8,26 @@ always raised.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, get_args
 
 import numpy as np
 
-from railfix.core.arrays import Integers, Masks
+from railfix.core.arrays import Masks
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import BrokenLines, ByteStream, FilePath, Paths, open_stream, path_names
+from railfix.core.files import LENIENT, BrokenLines, ByteStream, FilePath, Paths, open_stream, path_names
 from railfix.core.timescale import bdt_to_gpst, gps_time, utc_to_gpst
 from railfix.gnss.observations import Observations, channels_with_data, concatenate
-from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
+from railfix.io.epoch_order import EpochOrder, Run
+from railfix.io.rinex.header import VERSION, RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.io.rinex.observations_decode import PADDING, decode, lines_per_satellite
 from railfix.io.rinex.observations_epochs import (
     CYCLE_SLIPS,
-    DUPLICATES,
     EXTERNAL_EVENTS,
+    FURTHER_HEADERS,
     FaultLog,
     find_epochs,
 )
@@ -51,26 +53,26 @@ class Selection:
 
 
 class BlockReader:
-    """Reader of one file, for tags later than `after_ns`; knows its last tag, epochs and the share read."""
+    """Reader of one file in the order in which its epochs stand there; knows its last tag, epochs and the share read.
 
-    def __init__(
-        self, path: FilePath, selection: Selection, *, after_ns: int = _BEFORE_ALL, block_bytes: int = BLOCK_BYTES
-    ) -> None:
+    A cut last record is left out with a note.
+    """
+
+    def __init__(self, path: FilePath, selection: Selection, *, block_bytes: int = BLOCK_BYTES) -> None:
         self.path = str(path)
-        self.last_ns = after_ns
+        self.last_ns = _BEFORE_ALL
         self.epochs = 0
         self.share = 0.0
-        self._after_ns = after_ns
         self._selection = selection
         self._block_bytes = block_bytes
         self._log = FaultLog(self.path, broken_lines=selection.broken_lines)
         self._break = False
 
-    def blocks(self) -> Generator[Observations]:
+    def blocks(self) -> Generator[Run]:
         """Yield runs of epochs in the order of the file; a run may be empty."""
         with open_stream(self.path) as stream:
             head, rest = read_header_bytes(stream)
-            header = parse_header(self.path, head, note=None if self._log.stops else self._log.note)
+            header = parse_header(self.path, head, log=self._log)
             number = len(head) + 1
             at_end = False
             while not at_end and self.last_ns < self._selection.end_ns:
@@ -81,6 +83,8 @@ class BlockReader:
                     message = f"the line is longer than {_MAX_LINE_BYTES} characters; this is no RINEX file"
                     raise InputFileError(self.path, message, line=number + text.count(b"\n"))
                 lines = split_lines(text, first_number=number, keep_blank=header.version < 3.0)
+                if at_end and len(lines):
+                    self._log.last_line = int(lines.number[np.flatnonzero(lines.length)[-1:]].max(initial=0))
                 used = 0
                 while used < len(lines):
                     piece, header, taken = self._part(lines[used:], header, at_end=at_end)
@@ -99,12 +103,12 @@ class BlockReader:
             self.share = stream.share
         except InputFileError as error:
             if self._log.stops:
-                raise
+                raise InputFileError(self.path, f"{error.message}; {LENIENT}") from None
             self._log.note(f"{error}; the data before it were read")
             return b"", True
         return block, not block
 
-    def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[Observations, RinexHeader, int]:
+    def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[Run, RinexHeader, int]:
         """Read the epochs up to the end of the lines, or to a change of the observation types."""
         trial = self._log.fresh()
         table, taken = self._find(lines, header, at_end=at_end, log=trial)
@@ -115,7 +119,7 @@ class BlockReader:
                 continue
             first, count = int(table.line[k]) + 1, int(table.count[k])
             after = self._event(lines[first : first + count], after)
-            if after.types != header.types or after.scale != header.scale:
+            if after.reading != header.reading:
                 taken = first + count  # the lines after it have other types: decode those before it again
                 trial = self._log.fresh()
                 table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
@@ -130,10 +134,18 @@ class BlockReader:
     def _event(self, lines: Lines, header: RinexHeader) -> RinexHeader:
         records = [lines.text(i) for i in range(len(lines))]
         number = int(lines.number[0]) if records else 0
-        note = None if self._log.stops else self._log.note
-        return apply_records(self.path, header, records, first_line=number, note=note)
+        if records and records[0][60:80].strip() == VERSION:
+            self._log.count(FURTHER_HEADERS, 1)
+            further = parse_header(self.path, records, first_line=number, log=self._log)
+            if (further.version < 3.0) != (header.version < 3.0):
+                what = f"a header of RINEX {further.version:g} begins here, the file has RINEX {header.version:g}"
+                raise InputFileError(self.path, f"{what}; divide the file at this line", line=number)
+            if further.reading != header.reading:
+                self._log.remark(f"{self.path}, line {number}: a further header begins here; applied from here on")
+            return further
+        return apply_records(self.path, header, records, first_line=number, log=self._log)
 
-    def _observations(self, lines: Lines, table: EpochHeads, header: RinexHeader) -> Observations:
+    def _observations(self, lines: Lines, table: EpochHeads, header: RinexHeader) -> Run:
         self._log.count(CYCLE_SLIPS, int((table.flag == 6).sum()))
         breaks = np.cumsum((table.flag >= 1) & (table.flag <= 3)) + int(self._break)
         seen = (table.flag == 0) | (table.flag == 1)
@@ -141,8 +153,10 @@ class BlockReader:
         time_ns = epochs.time_ns
         if header.time_system in _TO_GPST:
             time_ns = _TO_GPST[header.time_system](time_ns.astype("datetime64[ns]")).astype(np.int64)
-        kept = self._in_order(lines, epochs, time_ns)
-        kept &= (time_ns >= self._selection.start_ns) & (time_ns < self._selection.end_ns)
+        self.epochs += len(time_ns)
+        if len(time_ns):
+            self.last_ns = int(np.median(time_ns))  # of a block: single tags may be wrong
+        kept = (time_ns >= self._selection.start_ns) & (time_ns < self._selection.end_ns)
         epochs, breaks_at, time_ns = epochs[kept], breaks_at[kept], time_ns[kept]
         before = np.diff(breaks_at, prepend=0) > 0
         total = int(breaks[-1]) if len(breaks) else int(self._break)
@@ -150,7 +164,7 @@ class BlockReader:
         dense = decode(lines, epochs, header=header, systems=self._selection.systems, log=self._log)
         self._log.settle()
         problems, problem_count, skipped = self._log.take()
-        return Observations(
+        observations = Observations(
             time=time_ns.astype("datetime64[ns]"),
             **dense,
             break_before=before,
@@ -159,35 +173,7 @@ class BlockReader:
             problem_count=problem_count,
             skipped=skipped,
         )
-
-    def _in_order(self, lines: Lines, epochs: EpochHeads, time_ns: Integers) -> Masks:
-        """Flag the epochs whose time tags rise; of an outlier ahead of its successors only the outlier is dropped."""
-        if not len(time_ns):
-            return np.zeros(0, dtype=np.bool_)
-        ahead = np.zeros(len(time_ns), dtype=np.bool_)
-        if len(time_ns) > 2:
-            before = np.concatenate([[self.last_ns], time_ns[:-3]])
-            this, following, next_but_one = time_ns[:-2], time_ns[1:-1], time_ns[2:]
-            rising = (before < following) & (following < next_but_one)
-            ahead[:-2] = (this > next_but_one) & rising
-        considered = np.where(ahead, _BEFORE_ALL, time_ns)
-        highest = np.maximum.accumulate(np.concatenate([[self.last_ns], considered]))
-        late = time_ns <= highest[:-1]
-        wrong = late | ahead
-
-        def message(i: int) -> str:
-            k = int(np.flatnonzero(wrong)[i])
-            tag = np.datetime64(int(time_ns[k]), "ns")
-            if ahead[k]:
-                return f"the time tag {tag} is later than those of the epochs after it"
-            other = np.datetime64(int(highest[k]), "ns")
-            where = " of the file before" if highest[k] == self._after_ns else ""
-            return f"the time tag {tag} is not later than {other}{where}"
-
-        self._log.faults(DUPLICATES, lines.number[epochs.line[wrong]], message)
-        self.last_ns = int(highest[-1])
-        self.epochs += int((~wrong).sum())
-        return ~wrong
+        return Run(path=self.path, epochs=observations, line=lines.number[epochs.line])
 
 
 #: Default number of epochs of a piece.
@@ -232,42 +218,67 @@ def _runs(
     paths: list[str], selection: Selection, progress: Callable[[float], None] | None = None
 ) -> Iterator[Observations]:
     """Yield runs of epochs of all files in order of time; at least one run and one epoch in total."""
-    if len(paths) > 1:
-        paths = [paths[k] for k in np.argsort([_first_time(path, selection) for path in paths], kind="stable")]
-    last: Observations | None = None
-    reader: BlockReader | None = None
+    firsts = [first_time(path) for path in paths] if len(paths) > 1 else []
+    if firsts:
+        check_one_run(paths, firsts)
+        paths = [paths[k] for k in np.argsort(firsts, kind="stable")]
+    readers = [BlockReader(path, selection) for path in paths]
     epochs = 0
-    for k, path in enumerate(paths):
-        joint = reader is not None and reader.epochs > 0
-        reader = BlockReader(path, selection, after_ns=_BEFORE_ALL if reader is None else reader.last_ns)
-        for run in reader.blocks():
-            if joint and len(run):
-                run = with_break_at_gap(last, run)
-                joint = False
-            epochs += len(run)
-            last = run if len(run) else last
-            if progress is not None:
-                progress((k + reader.share) / len(paths))
-            yield run
-        if not reader.epochs and selection.broken_lines == "stop":
-            raise InputFileError(path, "has a header but no epochs; the recording is empty or cut short")
-    if reader is not None and not epochs:
-        if not reader.epochs:
-            raise InputFileError(reader.path, "has no usable epoch; broken_lines='stop' shows the first fault")
-        begin, end = _first_time(paths[0], selection), np.datetime64(reader.last_ns, "ns")
+    for run in EpochOrder(selection.broken_lines).ordered(_of_files(readers, selection, progress)):
+        epochs += len(run)
+        yield run
+    if not epochs:
+        last = readers[-1]
+        if not any(reader.epochs for reader in readers):
+            raise InputFileError(last.path, "has no usable epoch; without --lenient the first fault is named")
+        begin, end = first_time(paths[0]), np.datetime64(max(reader.last_ns for reader in readers), "ns")
         what = f"is of {str(begin)[:19]} to {str(end)[:19]}"
-        if begin > end or reader.last_ns >= selection.end_ns:
+        if begin > end or last.last_ns >= selection.end_ns:
             what = f"begins at {str(begin)[:19]}"
         raise MismatchError(
             f"{', '.join(paths)}: no epoch lies in the time span from start to end; the log {what} (GPS time)"
         )
 
 
-def _first_time(path: str, selection: Selection) -> np.datetime64:
-    """Return the time of the first epoch of a file whatever the selected span, NaT without any."""
-    peek = replace(selection, broken_lines="count", systems=None, start_ns=Selection.start_ns, end_ns=Selection.end_ns)
-    with closing(BlockReader(path, peek, block_bytes=_PEEK_BYTES).blocks()) as runs:
-        return next((run.time[0] for run in runs if len(run)), np.datetime64("NaT", "ns"))
+def _of_files(
+    readers: list[BlockReader], selection: Selection, progress: Callable[[float], None] | None
+) -> Iterator[Run]:
+    """Yield the runs of files that follow each other, with a break where there is a gap between two."""
+    last: Observations | None = None
+    for k, reader in enumerate(readers):
+        joint = last is not None
+        for run in reader.blocks():
+            if joint and len(run.epochs):
+                run = replace(run, epochs=with_break_at_gap(last, run.epochs))
+                joint = False
+            last = run.epochs if len(run.epochs) else last
+            if progress is not None:
+                progress((k + reader.share) / len(readers))
+            yield run
+        if not reader.epochs and selection.broken_lines == "stop":
+            raise InputFileError(reader.path, "has a header but no epochs; the recording is empty or cut short")
+
+
+#: Files of one antenna that are farther apart than this are of two runs.
+LONGEST_GAP: Final = np.timedelta64(7, "D")
+
+
+def check_one_run(paths: Sequence[str], firsts: Sequence[np.datetime64]) -> None:
+    """Raise MismatchError where the first epochs of two files that follow each other lie more than a week apart."""
+    order = np.argsort(np.array(firsts), kind="stable")
+    for before, after in pairwise(order.tolist()):
+        if firsts[after] - firsts[before] > LONGEST_GAP:
+            days = (firsts[after] - firsts[before]) / np.timedelta64(1, "D")
+            raise MismatchError(
+                f"{paths[before]} begins at {str(firsts[before])[:19]} and {paths[after]} at {str(firsts[after])[:19]} "
+                f"(GPS time), {days:,.0f} days apart; give the files of one run"
+            )
+
+
+def first_time(path: str) -> np.datetime64:
+    """Return the time of the first epoch of a file, NaT without any."""
+    with closing(BlockReader(path, Selection(broken_lines="count"), block_bytes=_PEEK_BYTES).blocks()) as runs:
+        return next((run.epochs.time[0] for run in runs if len(run.epochs)), np.datetime64("NaT", "ns"))
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:

@@ -3,38 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
-from railfix.core.files import BrokenLines
+from railfix.core.files import LENIENT, BrokenLines
 from railfix.gnss.observations import MAX_PROBLEMS, first_problems
 from railfix.io.rinex.observations_lines import EpochHeads, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
 
 EPOCHS = "broken epochs"
 SATELLITES = "broken satellite lines"
 RECORDS = "broken records"
-DUPLICATES = "epochs out of order"
 UNKNOWN_SYSTEMS = "satellites of unknown constellations"
 NOT_SELECTED = "satellites of constellations not selected"
 EXTERNAL_EVENTS = "external events"
 CYCLE_SLIPS = "cycle-slip records"
+FURTHER_HEADERS = "further headers"
+COMMENTS = "lines of comments among the epochs"
 
 _CONSEQUENCE = {
     EPOCHS: "the epoch was skipped",
     SATELLITES: "the satellite was skipped in this epoch",
     RECORDS: "the record was skipped",
-    DUPLICATES: "the epoch was skipped",
 }
 
 
 class FaultLog:
-    """Faults of one file; `settle` raises the first one where broken lines stop the reading."""
+    """Faults of one file; `settle` raises the first one where broken lines stop the reading.
+
+    A fault of the last line of the file, which is cut where a recording ends, is noted and does not stop it.
+    """
 
     def __init__(self, path: str, *, broken_lines: BrokenLines) -> None:
         self.path = path
         self.stops = broken_lines == "stop"
+        self.last_line = 0  #: Number of the last line of the file, once it is read.
         self.counts: dict[str, int] = {}
         self._messages: list[str] = []
         self._problems = 0
@@ -50,7 +55,7 @@ class FaultLog:
         message = "".join(c if c.isprintable() else "?" for c in message)
         self.count(kind, 1)
         self._problems += 1
-        if self.stops:
+        if self.stops and line != self.last_line:
             if self._first is None or line < self._first[0]:
                 self._first = (line, message)
         elif len(self._messages) < MAX_PROBLEMS:
@@ -68,13 +73,19 @@ class FaultLog:
     def note(self, message: str) -> None:
         """Record a fault of records by its complete message."""
         self.count(RECORDS, 1)
+        self.remark(message)
+
+    def remark(self, message: str) -> None:
+        """Record what was read otherwise than it stands there, by its complete message."""
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)
 
     def fresh(self) -> FaultLog:
         """Return an empty log of the same file, for a trial that may be discarded."""
-        return FaultLog(self.path, broken_lines="stop" if self.stops else "count")
+        log = FaultLog(self.path, broken_lines="stop" if self.stops else "count")
+        log.last_line = self.last_line
+        return log
 
     def absorb(self, other: FaultLog) -> None:
         """Add the faults of another log of the same file."""
@@ -88,7 +99,7 @@ class FaultLog:
     def settle(self) -> None:
         """Raise the first fault of the file where broken lines stop the reading."""
         if self.stops and self._first is not None:
-            raise InputFileError(self.path, self._first[1], line=self._first[0])
+            raise InputFileError(self.path, f"{self._first[1]}; {LENIENT}", line=self._first[0])
 
     def take(self) -> tuple[tuple[str, ...], int, dict[str, int]]:
         """Return messages, number of faults and counts since the last call, and reset them."""
@@ -97,6 +108,20 @@ class FaultLog:
         return taken
 
 
+#: Labels of header records that stand among epochs where files were joined or edited.
+LABELS: Final = frozenset(
+    (
+        "COMMENT", "RINEX VERSION / TYPE", "END OF HEADER", "PGM / RUN BY / DATE", "MARKER NAME", "MARKER NUMBER",
+        "MARKER TYPE", "OBSERVER / AGENCY", "REC # / TYPE / VERS", "ANT # / TYPE", "APPROX POSITION XYZ",
+        "ANTENNA: DELTA H/E/N", "ANTENNA: DELTA X/Y/Z", "ANTENNA: PHASECENTER", "ANTENNA: B.SIGHT XYZ",
+        "ANTENNA: ZERODIR AZI", "ANTENNA: ZERODIR XYZ", "CENTER OF MASS: XYZ", "DOI", "LICENSE OF USE",
+        "STATION INFORMATION", "WAVELENGTH FACT L1/2", "# / TYPES OF OBSERV", "SYS / # / OBS TYPES",
+        "SIGNAL STRENGTH UNIT", "INTERVAL", "TIME OF FIRST OBS", "TIME OF LAST OBS", "RCV CLOCK OFFS APPL",
+        "SYS / DCBS APPLIED", "SYS / PCVS APPLIED", "SYS / SCALE FACTOR", "SYS / PHASE SHIFT", "SYS / PHASE SHIFTS",
+        "GLONASS SLOT / FRQ #", "GLONASS COD/PHS/BIS", "GLONASS COD/PHS/BIS#", "LEAP SECONDS", "# OF SATELLITES",
+        "PRN / # OF OBS",
+    )
+)  # fmt: skip
 #: More lines than the three-digit count of an epoch line allows.
 _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
@@ -116,7 +141,10 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
     n = len(lines)
     line = np.flatnonzero(lines.data[lines.start] == ord(">"))
     before = int(line[0]) if len(line) else n
-    if before and (at_end or len(line) or n > _MAX_LINES):
+    leading: list[tuple[int, int, int]] = []
+    if before and len(line) and all(_is_record(lines, k) for k in range(before)):
+        leading = [(-1, 4, before)]
+    elif before and (at_end or len(line) or n > _MAX_LINES):
         log.fault(EPOCHS, int(lines.number[0]), _no_epoch(lines, 0, version))
     head = read_epoch_lines(lines, line, version=version)
     if not len(line):
@@ -136,6 +164,8 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
         lines.number[line[broken]],
         lambda i: flaw_text(lines, int(line[broken][i]), int(head.flaw[broken][i]), version=version),
     )
+    records = _records_after(lines, head, room, log)
+    room = room - _counts(records, len(head))
     wrong = ~broken & (head.count != room)
     if at_end and len(line) and wrong[-1] and head.count[-1] > room[-1]:
         wrong[-1] = False
@@ -146,7 +176,43 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
         lines.number[line[wrong]],
         lambda i: f"the epoch declares {head.count[wrong][i]} lines, {room[wrong][i]} follow before the next epoch",
     )
-    return head[~broken & ~wrong], done
+    return _with_events(head[~broken & ~wrong], [*leading, *records.values()]), done
+
+
+def _records_after(lines: Lines, head: EpochHeads, room: Integers, log: FaultLog) -> dict[int, tuple[int, int, int]]:
+    """Return header records that follow the lines of an epoch, as events, by the number of the epoch."""
+    records: dict[int, tuple[int, int, int]] = {}
+    for k in np.flatnonzero((head.flaw == 0) & (room > head.count)).tolist():
+        first, end = int(head.line[k] + 1 + head.count[k]), int(head.line[k] + 1 + room[k])
+        if all(_is_record(lines, line) for line in range(first, end)):
+            records[k] = (first - 1, 4, end - first)
+            log.count(COMMENTS, sum(_label(lines, line) == "COMMENT" for line in range(first, end)))
+    return records
+
+
+def _counts(records: dict[int, tuple[int, int, int]], epochs: int) -> Integers:
+    """Return the number of lines of header records after each epoch."""
+    counts = np.zeros(epochs, dtype=np.int64)
+    for k, (_, _, count) in records.items():
+        counts[k] = count
+    return counts
+
+
+def _with_events(epochs: EpochHeads, events: list[tuple[int, int, int]]) -> EpochHeads:
+    """Return epochs with events (line, flag, count) among them."""
+    if not events:
+        return epochs
+    joined = join_rows([epochs, EpochHeads(*np.array([(*event, 0, 0) for event in events], dtype=np.int64).T)])
+    return joined[np.argsort(joined.line, kind="stable")]
+
+
+def _label(lines: Lines, line: int) -> str:
+    return lines.text(line)[60:80].strip()
+
+
+def _is_record(lines: Lines, line: int) -> bool:
+    """Return whether a line is a header record by its label."""
+    return lines.length[line] > 60 and _label(lines, line) in LABELS
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
@@ -222,6 +288,8 @@ class _Walk:
 
     def _other(self, position: int, k: int, *, at_end: bool) -> int:
         """Handle a line that is no epoch line: an event without time, or a broken line."""
+        if _is_record(self._lines, position):
+            return self._header_records(position, at_end=at_end)
         event = event_line(self._lines, position)
         if event is not None:
             end = position + 1 + event[1]
@@ -241,13 +309,20 @@ class _Walk:
         self._log.fault(EPOCHS, int(self._lines.number[position]), message)
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
+    def _header_records(self, position: int, *, at_end: bool) -> int:
+        """Take header records among the epochs as one event; they may go on after the end of the block."""
+        end = position
+        while end < len(self._lines) and _is_record(self._lines, end):
+            end += 1
+        if end == len(self._lines) and not at_end:
+            return position
+        self._events.append((position - 1, 4, end - position))
+        comments = sum(_label(self._lines, line) == "COMMENT" for line in range(position, end))
+        self._log.count(COMMENTS, comments)
+        return end
+
     def _table(self) -> EpochHeads:
-        epochs = self._head[self._kept]
-        if not self._events:
-            return epochs
-        extra = np.array([(*event, 0, 0) for event in self._events], dtype=np.int64).T
-        joined = join_rows([epochs, EpochHeads(*extra)])
-        return joined[np.argsort(joined.line, kind="stable")]
+        return _with_events(self._head[self._kept], self._events)
 
 
 def _no_epoch(lines: Lines, line: int, version: float) -> str:

@@ -36,6 +36,9 @@ from railfix.kernels.tracking.layout import (
 from railfix.kernels.tracking.model import restart
 from railfix.kernels.tracking.update import Equations, median
 
+#: Times since that differ by less are equal: their rounding depends on where a chunk begins [s].
+TIE_S = 1e-6
+
 
 @inner
 def _code_interval_s(given: Given, t: int, state: State) -> float:
@@ -49,7 +52,7 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
         coded = coded or given.channel[t, k].has[CODE]
     if not coded:
         return float(dt)
-    if epoch.motion_measured and since < period - 0.5 * dt:
+    if epoch.motion_measured and since < period - 0.5 * dt - TIE_S:
         return 0.0
     return float(min(max(since, dt), max(period, dt)))
 

@@ -1,0 +1,85 @@
+"""Position messages of a train from lines of JSON: as they are measured, or of a recording, at its own pace."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import stat
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
+from railfix.io.train_message import MessageError, TrainMessage, from_json
+
+#: Longest line of a position message [bytes].
+LONGEST_LINE: Final = 100_000
+#: Bytes that are read at once.
+_READ: Final = 1 << 16
+
+#: Whether positions are of now, or of a recording.
+Clock = Literal["live", "replay"]
+
+
+async def read_positions(
+    lines: AsyncIterator[str], *, rejected: Callable[[str], None], clock: Clock = "live"
+) -> AsyncIterator[TrainMessage]:
+    """Yield the position messages of lines; what is none is rejected with a sentence, and the next line counts.
+
+    With the clock "replay" each message waits until as much time has passed since the first one as between the instants
+    of their places. Its times are then those of now, so that the centre takes the place for a new one.
+    """
+    first: tuple[int, int] | None = None
+    number = 0
+    async for line in lines:
+        number += 1
+        if not line.strip():
+            continue
+        try:
+            message = from_json(line)
+        except MessageError as error:
+            rejected(f"line {number}: {error}")
+            continue
+        if clock == "replay":
+            now_ns = gps_now_ns()
+            first = first or (message.time_ns, now_ns)
+            due_ns = first[1] + message.time_ns - first[0]
+            await asyncio.sleep(max(0.0, (due_ns - now_ns) * 1e-9))
+            now_ns = gps_now_ns()
+            message = message.replaced(time_ns=min(due_ns, now_ns), sent_ns=now_ns)
+        yield message
+
+
+async def standard_input() -> AsyncIterator[str]:
+    """Yield lines as they come; a reader that waits does not hold the end of the program up.
+
+    A line longer than `LONGEST_LINE` is cut to its beginning, which is no message.
+    """
+    kind = os.fstat(sys.stdin.fileno()).st_mode
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # a file has all its lines
+        while data := sys.stdin.buffer.readline(LONGEST_LINE):
+            yield data.decode(errors="replace")
+        return
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    rest, cut = b"", False
+    while data := await reader.read(_READ):
+        *ended, rest = (rest + data).split(b"\n")
+        for line in ended:
+            if not cut:
+                yield line[:LONGEST_LINE].decode(errors="replace")
+            cut = False
+        if len(rest) > LONGEST_LINE:
+            if not cut:
+                yield rest[:LONGEST_LINE].decode(errors="replace")
+            rest, cut = b"", True
+    if rest and not cut:
+        yield rest.decode(errors="replace")
+
+
+def gps_now_ns() -> int:
+    """Return the computer's clock as GPS time since 1980 [ns]."""
+    return int((utc_to_gpst(np.datetime64(time.time_ns(), "ns")) - GPS_EPOCH).astype(np.int64))

@@ -1,0 +1,225 @@
+"""Epochs of one receiver in rising order of time: sorted where a few are late, equal ones merged, others rejected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Indices, Integers, Masks
+from railfix.core.errors import InputFileError
+from railfix.core.files import LENIENT, BrokenLines
+from railfix.core.tables import plural
+from railfix.gnss.observations import Observations, first_problems, stack_parts
+
+DUPLICATES: Final = "duplicate epochs"
+OUT_OF_ORDER: Final = "epochs out of order"
+#: An epoch that at most this many epochs with other tags have passed is put into its place; one that more have passed
+#: has a wrong time tag.
+MOST_PASSED: Final = 20
+_HELD: Final = 2 * MOST_PASSED  #: Epochs that wait for later ones.
+#: A single tag that is farther than this from both neighbours, which follow each other, is wrong.
+_LONE: Final = np.timedelta64(3600, "s")
+_ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """Consecutive epochs of a file in the order in which they stand there, and the line of each (0: no text)."""
+
+    path: str
+    epochs: Observations
+    line: Integers
+
+
+class EpochOrder:
+    """Puts the epochs of one log into order, run by run; equal input cut otherwise gives the same."""
+
+    def __init__(self, broken_lines: BrokenLines) -> None:
+        self._broken_lines = broken_lines
+        self._held: list[Run] = []
+        self._times: list[Datetimes] = []  # of all epochs that were handed on
+        self._counts = {DUPLICATES: 0, "sorted": 0}
+        self._first: dict[str, tuple[str, int]] = {}
+        self._found: list[str] = []
+        self._rejected = 0
+        self._break = False
+
+    def ordered(self, runs: Iterable[Run]) -> Iterator[Observations]:
+        """Yield the epochs in rising order; the last part has the notes. InputFileError: a wrong time tag ("stop")."""
+        for run in runs:
+            self._held.append(run)
+            if self._rises():
+                while sum(len(held.epochs) for held in self._held[1:]) >= _HELD:
+                    yield self._hand_on(self._held.pop(0).epochs)
+            else:
+                yield self._sort(final=False)
+        if self._rises():
+            yield from (self._hand_on(run.epochs) for run in self._held)
+        else:
+            yield self._sort(final=True)
+        self._held = []
+        yield self._summary()
+
+    def _rises(self) -> bool:
+        """Return whether all epochs that are held follow each other and those that were handed on."""
+        last = [self._times[-1][-1:]] if self._times else []
+        time = np.concatenate([*last, *(run.epochs.time for run in self._held)])
+        return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
+
+    def _hand_on(self, part: Observations) -> Observations:
+        if not len(part):
+            return part
+        self._times.append(part.time)
+        if self._break:
+            before = part.break_before.copy()
+            before[0] = True
+            part = replace(part, break_before=before)
+        self._break = False
+        return part
+
+    def _sort(self, *, final: bool) -> Observations:
+        """Sort and judge what is held; return what no later epoch can precede, and hold the rest."""
+        joined = stack_parts([run.epochs for run in self._held])
+        line = np.concatenate([run.line for run in self._held])
+        path = np.repeat([run.path for run in self._held], [len(run.epochs) for run in self._held])
+        time = joined.time
+        decided = len(time) if final else max(len(time) - _HELD, 0)
+        equal = self._handed_on(time)
+        fresh = np.flatnonzero(~equal & ~_is_repeated(time))
+        passed_by, passes = _passed(time[fresh])
+        wrong = np.zeros(len(time), dtype=np.bool_)
+        wrong[fresh] = (passed_by > MOST_PASSED) | (passes > MOST_PASSED) | (time[fresh] <= self._last)
+        wrong |= ~equal & _is_lone(time)
+        wrong[decided:] = False
+        self._reject(np.flatnonzero(wrong), time, path, line)
+        self._count(DUPLICATES, np.flatnonzero(equal), path, line)
+        kept = np.flatnonzero(~wrong & ~equal)
+        sorted_rows = np.zeros(len(time), dtype=np.bool_)
+        sorted_rows[kept] = _passed(time[kept])[0] > 0
+        sorted_rows[decided:] = False
+        first, rest = kept[kept < decided], kept[kept >= decided]
+        order = first[np.argsort(time[first], kind="stable")]
+        repeated = np.zeros(len(order), dtype=np.bool_)
+        repeated[1:] = time[order[1:]] == time[order[:-1]]
+        sorted_rows[order[repeated]] = False
+        self._count(DUPLICATES, order[repeated], path, line)
+        self._count("sorted", np.flatnonzero(sorted_rows), path, line)
+        merged = _merge(joined, order, repeated)
+        order = order[~repeated]
+        ready = len(order) if final else max(len(order) - MOST_PASSED, 0)
+        waiting = stack_parts([merged[ready:], take_epochs(joined, rest)])
+        where = np.concatenate([order[ready:], rest])
+        self._held = [
+            Run(path=str(path[k]), epochs=waiting[i : i + 1], line=line[k : k + 1]) for i, k in enumerate(where)
+        ]
+        return self._hand_on(replace(merged[:ready], **_carried(joined)))
+
+    @property
+    def _last(self) -> np.datetime64:
+        return self._times[-1][-1] if self._times else np.datetime64(np.iinfo(np.int64).min + 1, "ns")
+
+    def _handed_on(self, time: Datetimes) -> Masks:
+        """Return whether an epoch with the same tag was handed on before."""
+        if not self._times:
+            return np.zeros(len(time), dtype=np.bool_)
+        self._times = [np.concatenate(self._times)]
+        known = self._times[0]
+        at = np.minimum(np.searchsorted(known, time), len(known) - 1)
+        return np.asarray(known[at] == time)
+
+    def _count(self, kind: str, rows: Indices, path: np.ndarray, line: Integers) -> None:
+        self._counts[kind] += len(rows)
+        if len(rows):
+            name, number = self._first.setdefault(kind, (str(path[rows[0]]), int(line[rows[0]])))
+            own = line[rows][path[rows] == name]
+            self._first[kind] = (name, min(number, int(own.min(initial=number))))
+
+    def _reject(self, rows: Indices, time: Datetimes, path: np.ndarray, line: Integers) -> None:
+        for row in rows.tolist():
+            what = f"the time tag {str(time[row])[:23]} stands more than {MOST_PASSED} epochs or an hour from its place"
+            if self._broken_lines == "stop":
+                raise InputFileError(str(path[row]), f"{what}; {LENIENT}", line=int(line[row]) or None)
+            self._found.append(f"{_where(str(path[row]), int(line[row]))}: {what}; the epoch was skipped")
+        self._rejected += len(rows)
+        self._break |= len(rows) > 0
+
+    def _summary(self) -> Observations:
+        """Return no epochs, with the notes on all."""
+        notes = []
+        if number := self._counts["sorted"]:
+            notes.append(f"{_where(*self._first['sorted'])}: {plural(number, 'epoch')} out of order, sorted by time")
+        if number := self._counts[DUPLICATES]:
+            notes.append(
+                f"{_where(*self._first[DUPLICATES])}: {plural(number, 'epoch')} with a time tag that was there before"
+            )
+            notes[-1] += ", merged"
+        counts = {DUPLICATES: self._counts[DUPLICATES], OUT_OF_ORDER: self._rejected}
+        empty = np.zeros((0, 0))
+        return Observations(
+            time=np.zeros(0, dtype="datetime64[ns]"), satellite=np.zeros(0, dtype="<U3"),
+            signal=np.zeros(0, dtype="<U2"), code_m=empty, phase_cycles=empty, doppler_hz=empty, cn0_dbhz=empty,
+            loss_of_lock=np.zeros((0, 0), dtype=np.uint8), break_before=np.zeros(0, dtype=np.bool_),
+            problems=(*notes, *first_problems(self._found, count=self._rejected)), problem_count=self._rejected,
+            skipped={kind: number for kind, number in counts.items() if number},
+        )  # fmt: skip
+
+
+def take_epochs(observations: Observations, rows: Indices) -> Observations:
+    """Return some epochs in a given order."""
+    arrays = (*_ARRAYS, "time", "break_before", "receiver_alarm", "front_end_gain")
+    values = {name: getattr(observations, name)[rows] for name in arrays}
+    return replace(observations, **values, problems=(), problem_count=0, skipped={})
+
+
+def _carried(joined: Observations) -> dict[str, Any]:
+    return {"problems": joined.problems, "problem_count": joined.problem_count, "skipped": joined.skipped}
+
+
+def _where(path: str, line: int) -> str:
+    return f"{path}, line {line}" if line else path
+
+
+def _passed(time: Datetimes) -> tuple[Integers, Integers]:
+    """Return how many of the epochs before each one have later tags, and how many after it earlier ones."""
+    reach = min(2 * MOST_PASSED, max(len(time) - 1, 0))
+    passed_by, passes = np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.int64)
+    for step in range(1, reach + 1):
+        later = time[:-step] > time[step:]
+        passed_by[step:] += later
+        passes[:-step] += later
+    return passed_by, passes
+
+
+def _is_repeated(time: Datetimes) -> Masks:
+    """Return whether a tag stands earlier in the array."""
+    repeated = np.ones(len(time), dtype=np.bool_)
+    repeated[np.unique(time, return_index=True)[1]] = False
+    return repeated
+
+
+def _is_lone(time: Datetimes) -> Masks:
+    """Return whether a tag is far from both neighbours, between which the time rises without it."""
+    lone = np.zeros(len(time), dtype=np.bool_)
+    before, this, after = time[:-2], time[1:-1], time[2:]
+    lone[1:-1] = (before < after) & ((this > after + _LONE) | (this < before - _LONE))
+    return lone
+
+
+def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
+    """Return epochs in an order, those repeated filled into the first of the same tag."""
+    ordered = take_epochs(joined, order)
+    if not repeated.any():
+        return ordered
+    first = np.flatnonzero(~repeated)
+    owner = (np.cumsum(~repeated) - 1)[repeated]
+    values = {name: getattr(ordered, name)[first].copy() for name in _ARRAYS}
+    for name, target in values.items():
+        source = getattr(ordered, name)[repeated]
+        for k, row in enumerate(owner.tolist()):
+            blank = target[row] == 0 if name == "loss_of_lock" else np.isnan(target[row])
+            target[row] = np.where(blank, source[k], target[row])
+    kept = take_epochs(ordered, first)
+    return replace(kept, **values)

@@ -1,0 +1,36 @@
+"""Motion with a time-correlated acceleration."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import expm
+
+from railfix.core.arrays import Floats
+
+
+def singer_steps(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
+    """Compute the transition of position, speed and acceleration, and the covariance of its noise, shapes (K, 3, 3).
+
+    The acceleration is a first-order Gauss-Markov process (R. A. Singer 1970, doi:10.1109/TAES.1970.310128) with the
+    standard deviation `sigma_mps2` [m/s2] and the time constant `tau_s` [s]; `dt`, shape (K,) [s]. Discretised by a
+    matrix exponential (C. F. Van Loan 1978, doi:10.1109/TAC.1978.1101743), in units in which a step takes 1; a step
+    longer than `tau_s` by halves, as the exponential would lose digits.
+    """
+    halvings = np.ceil(np.log2(np.maximum(dt / tau_s, 1.0))).astype(np.int64)
+    part = dt / 2.0**halvings
+    system = np.zeros((len(dt), 6, 6))
+    system[:, 0, 1] = system[:, 1, 2] = -1.0
+    system[:, 2, 2] = part / tau_s
+    system[:, 3:, 3:] = -np.swapaxes(system[:, :3, :3], 1, 2)
+    system[:, 2, 5] = 2.0 * sigma_mps2**2 * part / tau_s
+    exponential = expm(system)
+    unit = part[:, None] ** np.array([2.0, 1.0, 0.0])
+    step = np.swapaxes(exponential[:, 3:, 3:], 1, 2)
+    noise = step @ exponential[:, :3, 3:] * unit[:, :, None] * unit[:, None, :]
+    step = step * unit[:, :, None] / unit[:, None, :]
+    for k in range(int(halvings.max(initial=0))):
+        longer = halvings > k
+        turn = step[longer]
+        noise[longer] += turn @ noise[longer] @ np.swapaxes(turn, 1, 2)
+        step[longer] = turn @ turn
+    return step, 0.5 * (noise + np.swapaxes(noise, 1, 2))
