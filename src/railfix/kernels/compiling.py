@@ -78,10 +78,20 @@ def _files(package: Path, module: str) -> set[Path]:
 
 
 @cache
+def _tuples(package: Path) -> bytes:
+    """Return the named tuples of all of railfix by their files: numba cannot read code for one that has moved."""
+    named = re.compile(rb"^class \w+\(NamedTuple\)", re.MULTILINE)
+    files = ((path, named.findall(path.read_bytes())) for path in sorted(package.parent.rglob("*.py")))
+    return b"\n".join(
+        b" ".join([str(path.relative_to(package.parent)).encode(), *found]) for path, found in files if found
+    )
+
+
+@cache
 def compute_stamp(package: Path, module: str) -> str:
-    """Return the hash of all that the code of a module depends on: its files and the constants."""
+    """Return the hash of all that the code of a module depends on: its files, the constants, the names of tuples."""
     files = [*sorted(_files(package, module)), package.parent / "core" / "constants.py"]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    return hashlib.sha256(b"".join([*(path.read_bytes() for path in files), _tuples(package)])).hexdigest()
 
 
 @cache
