@@ -15,7 +15,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.pipeline.channels import ChannelBook, Channels
+from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received
 from railfix.positioning.approximate import ANCHOR_SIGMA_M
@@ -25,7 +25,7 @@ from railfix.positioning.normal_equations import SinglePoint, point_position
 from railfix.positioning.range_arrays import Ranges, usable_ranges, without
 from railfix.positioning.receiver_noise import robust_fit
 from railfix.ranges.atmosphere import SeenFrom, model_delays
-from railfix.ranges.channels import PLAUSIBLE_CODE_M, first_available
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 

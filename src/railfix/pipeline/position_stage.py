@@ -138,7 +138,7 @@ def position_stage(
     )  # fmt: skip
     if sigma.phase is not None:
         off_map = _off_map(checked.ranges, antennas, fix, sigma.arc_m, config)
-    observed = np.isfinite(corrected.code_m).any(axis=1)
+    observed = np.asarray(np.isfinite(corrected.code_m).any(axis=1))
     solution = copy_with(
         solution, status=_status(observed, checked.ranges, solution, sigma.judged_m, off_map, open_elsewhere, config)
     )
@@ -304,11 +304,13 @@ def _published(
     variance = epoch_variance(scale, constrained.wsse, ranges.redundancy, limits=config.noise_scale)
     nominal, phase = _nominal_variance_m2(checked.model, corrected.unmodelled_m), None
     if config.carrier in ("float", "fixed"):
+        assert slips is not None, "found where the carrier phase is used"
+        of_all = slips
 
         def own_phase(
             index: SearchIndex, rows: slice, state: CarrierState | None
         ) -> tuple[PhasePositions, CarrierState]:
-            given = take_epochs(corrected, rows), take_epochs(ranges, rows), take_epochs(slips, rows)
+            given = take_epochs(corrected, rows), take_epochs(ranges, rows), take_epochs(of_all, rows)
             return code_and_phase(*given, index.trajectory, constrained.arc_m[rows], config, state or CarrierState())
 
         phase, carriers = antennas.each_with_state(own_phase, carriers)

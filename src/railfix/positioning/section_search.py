@@ -125,12 +125,12 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
             part, tried = _coarse_to_fine(ranges, index, weight_norm, freedom, limits, coarse)
             evaluations[coarse] += tried
             candidates.append(part)
-        line = (trajectory.arc_m, trajectory.tangent, trajectory.length_m)
+        sections = (trajectory.arc_m, trajectory.tangent, trajectory.length_m)
         for part in candidates:
             at = part.at
             evaluations[at] += part.points
             vertex[at], q[at], excess[at], other[at] = kernels.search.best_points(
-                part, freedom[at], line, limits.separation_m, trajectory.turn_m
+                part, freedom[at], sections, limits.separation_m, trajectory.turn_m
             )
     return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)
 

@@ -6,6 +6,7 @@ observation back that another one rejected, and it only judges: the pipeline act
 
 from __future__ import annotations
 
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.antenna_pair import (
     AntennaPairLimits,
     AntennaPairScreened,
@@ -18,7 +19,6 @@ from railfix.screens.antenna_pair import (
 )
 from railfix.screens.antenna_spacing import AntennaSpacingLimits, antenna_spacing_screen
 from railfix.screens.base import (
-    AntennaRanges,
     FilteredMotion,
     ObservationScreen,
     PairedEpochs,

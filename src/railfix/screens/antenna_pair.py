@@ -30,8 +30,8 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
-    AntennaRanges,
     ObservationPicture,
     PairedEpochs,
     PairScreen,

@@ -17,8 +17,8 @@ from railfix.core.arrays import Strings
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
-    AntennaRanges,
     ObservationPicture,
     ObservationScreen,
     ScreenColumn,

@@ -10,8 +10,8 @@ from pydantic import Field
 
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
-    AntennaRanges,
     ObservationPicture,
     ObservationScreen,
     Screened,
