@@ -47,15 +47,11 @@ def kernel(function: Function) -> Function:
     SettingsError
         No folder for the code can be written.
     """
-    return _kernel(function, OPTIONS)
-
-
-def _kernel(function: Function, options: dict[str, Any]) -> Function:
     if is_plain():
         # Machine code does not warn: integers that wrap around, divisions by zero and NaN are meant.
         return np.errstate(all="ignore")(function)
     try:
-        compiled = numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **OPTIONS)(function)
     except RuntimeError as error:
         raise SettingsError(
             f"compiled kernels cannot be kept on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
@@ -71,20 +67,6 @@ def inner(function: Function) -> Function:
     if is_plain():
         return function
     return cast(Function, numba.njit(**OPTIONS)(function))
-
-
-#: Of functions that take tuples by reference (`railfix.kernels.tracking.references`): arrays are not counted.
-_BORROWING: Final[dict[str, Any]] = {**OPTIONS, "_nrt": False}
-
-
-def borrowing(function: Function) -> Function:
-    """Compile an inner function that makes no array, without counting references to those that it is given."""
-    return function if is_plain() else cast(Function, numba.njit(**_BORROWING)(function))
-
-
-def borrowing_kernel(function: Function) -> Function:
-    """Compile a kernel that makes no array, without counting references to those that it is given."""
-    return _kernel(function, _BORROWING)
 
 
 @cache
