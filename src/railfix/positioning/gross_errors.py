@@ -17,7 +17,8 @@ from railfix.core.arrays import Floats, Integers, Masks, kernel_array
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint, normal_equations
+from railfix.positioning.normal_equations import SinglePoint, normal_equations
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
 #: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].

@@ -9,19 +9,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
+from railfix.core.errors import NoPositionError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
-from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.state import State
 from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
@@ -38,9 +40,6 @@ from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
 from railfix.track.vehicle import read_vehicle
-
-if TYPE_CHECKING:
-    from railfix.run.batch_check import BatchCheck
 
 
 class Progress(Protocol):
@@ -102,7 +101,6 @@ def run_files(
         rows = ResultRows(
             folder=folder, line=line, observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
-            batches=_batches(logs, line) if options.check == "batch" else {},
             passings=balises is not None, replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )  # fmt: skip
         tally = _position(logs, (sensors, base), processor, rows, beside, progress)
@@ -117,7 +115,6 @@ def run_files(
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
             *shorten_notes(rows.balise_notes),
-            *rows.compare_batches(),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
@@ -130,11 +127,14 @@ def run_files(
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
+        verdict = judge_run(record)
+        if not any(antenna.leading.positions for antenna in verdict.antennas):
+            raise NoPositionError(f"not one position is promised: {'; '.join(verdict.lines())}")
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
-    return RunSummary(tally=tally, record=record, verdict=judge_run(record), files=files, wall_s=wall)
+    return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
 
 
 def open_inputs(
@@ -226,18 +226,11 @@ def _position(
     return tally
 
 
-def _batches(logs: Iterable[Antenna], line: OpenedLine) -> dict[str, BatchCheck]:
-    """Return the checks of each antenna; loaded when asked for: 0.03 s."""
-    from railfix.run.batch_check import BatchCheck
-
-    return {name: BatchCheck(trajectory=line.trajectories[name]) for name in logs}
-
-
 def _screen_chunks(
     chunks: Iterator[dict[str, Observations]],
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
-) -> Iterator[ScreenedChunk]:
+) -> Iterator[Chunk]:
     """Yield the screened ranges of chunks, each with what sensors and base station measured up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
@@ -249,11 +242,11 @@ def _screen_chunks(
         yield screened
 
 
-def _single_epochs(screened: Iterator[ScreenedChunk], processor: EpochProcessor) -> Iterator[SolvedChunk]:
+def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iterator[Chunk]:
     """Yield the single epochs of chunks."""
     state = State()
     for chunk in screened:
-        solved, state = processor.single_epochs(chunk, state)
+        solved, state = processor.position(chunk, state)
         yield solved
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending, open_stream
+from railfix.core.files import FilePath, ending, open_stream, unpacked_file
 from railfix.track.crs import choose_crs, unit_of_heights
 from railfix.track.georeference import georeference
 from railfix.track.heights import check_height_datum, heights_of_file
@@ -237,10 +237,11 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are no heights and not read
-            found = [
-                pyogrio.raw.read(path, layer=layer, read_geometry=geometry != "none")
-                for layer, _ in pyogrio.list_layers(path)
-            ]
+            with unpacked_file(path) as file:
+                found = [
+                    pyogrio.raw.read(file, layer=layer, read_geometry=geometry != "none")
+                    for layer, _ in pyogrio.list_layers(file)
+                ]
         for meta, _, blob, values in found:
             if blob is None and geometry != "none":
                 continue
