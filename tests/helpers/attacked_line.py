@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from railfix.ground.interlocking import InterlockingLimits, from_documents, to_documents
+from railfix.ground.authority import Authority
 from railfix.ground.layout import Layout, LoopStation, Piece, PointName, overlap
+from railfix.ground.on_board import OnBoard
+from railfix.ground.state import InterlockingLimits, from_documents, to_documents
 from railfix.ground.stops import release_train
 from railfix.ground.supervision import Supervision, at_start, standing_train
-from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 STEP_S, SPEED_MPS, LENGTH_M, BOUND_M = 3.0, 20.0, 80.0, 5.0

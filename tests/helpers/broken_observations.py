@@ -77,10 +77,11 @@ def observations_binary(bench: Bench) -> Options:
     return {"front": bench.write("random.obs", random.Random(1).randbytes(5000))}
 
 
-@broken(INPUT, "front.zip", "zip")
-def observations_in_a_zip_archive(bench: Bench) -> Options:
+@broken(INPUT, "front.zip", "zip archive of 2 files")
+def observations_of_two_in_a_zip_archive(bench: Bench) -> Options:
     with zipfile.ZipFile(bench.folder / "front.zip", "w") as archive:
-        archive.write(bench.front)
+        archive.write(bench.front, "a.obs")
+        archive.write(bench.front, "b.obs")
     return {"front": bench.folder / "front.zip"}
 
 

@@ -12,8 +12,8 @@ from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Floats
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.crs import frame_degrees
 from railfix.track.frames import FrameShift, points_at
+from railfix.track.georeference import georeference
 
 TIME, YEAR = np.datetime64("2026-07-02T12:00:00"), 2026.5
 #: Geocentric codes of the realisations of the ITRF, for a way that is not the code's own.
@@ -99,8 +99,8 @@ def moved(name: str) -> FrameCase:
     x, y = (np.array([v]) for v in (longitude, latitude))
     if grid.is_projected:
         x, y = Transformer.from_crs(grid.geodetic_crs, grid, always_xy=True).transform(x, y)
-    lat, lon, frame = frame_degrees(code, x, y, path="map")
-    place = ecef_from_geodetic(lat, lon, np.array([100.0]))
+    there = georeference(code, x, y, path="map")
+    frame, place = there.frame, ecef_from_geodetic(there.latitude_deg, there.longitude_deg, np.array([100.0]))
     by_railfix, shift = points_at(place, frame, TIME, **MOTION.get(name, {}))
     if isinstance(definition, int):
         steps = Transformer.from_crs(definition, 9988, allow_ballpark=False)

@@ -64,6 +64,7 @@ def visited(page: Path, **options: Any) -> Iterator[BrowserPage]:
         window = started.chromium.launch(executable_path=browser(), args=["--no-sandbox"])
         shown = window.new_page(**options)
         shown.on("pageerror", lambda error: errors.append(str(error)))
+        shown.set_default_timeout(180_000)  # a busy machine
         shown.goto(page.resolve().as_uri())
         shown.wait_for_function("document.getElementById('railfix-timing').dataset.load !== undefined")
         yield shown

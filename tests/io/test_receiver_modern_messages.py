@@ -164,7 +164,7 @@ def test_convert_leaves_cnav_out_and_says_so(tmp_path: Path) -> None:
         stream(cnav_pages(CNAV, 30), "G", 30, protocol="ubx") + stream(fnav_pages(FNAV, 5), "E", 5, protocol="ubx")
     )
     lines = convert_logs((log,), out=None, nav_out=out, rinex="4")
-    assert "passed over: 1 G CNAV ephemerides, which are not written" in lines
+    assert "skipped 1 G CNAV ephemerides, which are not written" in lines
     again = read_navigation([out]).kepler
     assert (again.satellite.tolist(), again.message.tolist()) == (["E05"], ["FNAV"])
 

@@ -163,7 +163,7 @@ def test_innovations_are_in_the_table_of_observations(tracked: RunSummary) -> No
 def test_the_command_tracks_unless_told_not_to(tmp_path: Path, given: tuple[str, ...], written: bool) -> None:
     demo, out = demo_inputs(), tmp_path / "run"
     words = ["run", "--front", demo.front[0], "--nav", demo.nav[0], "--track", demo.track[0], "--out", out]
-    words += ["--end", "2024-03-05T03:10:03", *given]
+    words += ["--end", "2024-03-05T03:10:03", "--verbose", *given]
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert result.exit_code == 0, result.output
     assert (out / "train.csv").exists() is written

@@ -150,4 +150,4 @@ def test_a_run_on_a_map_without_the_geoid_says_so(tmp_path: Path) -> None:
     summary = run_files(inputs, out=tmp_path / "results")
     notes = [note for note in summary.notes if "the map" in note]
     assert any("contradicts the positions" in note and "geoid" in note for note in notes), summary.notes
-    assert any("m in height is not excluded" in note for note in notes), summary.notes
+    assert any("m in height cannot be detected" in note for note in notes), summary.notes

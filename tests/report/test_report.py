@@ -373,8 +373,9 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     np.testing.assert_allclose(filtered, on_map, atol=1e-6)
     assert evaluation is not None
     largest = evaluation.figure("max_m", run="run (train)", antenna="front")
-    assert "of all epochs, those without satellites included, by the filter along the track" in document
-    assert f"and the worst is {largest:.1f} m off." in document
+    assert "The filter along the track has a position in" in document
+    assert "errors are below" in document
+    assert f"and the largest is {largest:.1f} m. " in document
     assert f"<dd>{largest:.2f} m</dd>" in document
     assert evaluation.levels is not None
     level = evaluation.levels.filter(run="run (train)", antenna="front", position="constrained_ok")[

@@ -135,7 +135,7 @@ def test_reasons_of_too_few_satellites_by_hand() -> None:
 
 def test_the_screen_shows_the_budget(bench: Bench, tmp_path: Path) -> None:
     files = ["--front", bench.front, "--rear", bench.rear, "--nav", bench.nav, "--track", bench.track]
-    command = ["run", *map(str, files), "--vehicle", str(bench.vehicle), "--out", str(tmp_path / "out")]
+    command = ["run", *map(str, files), "--vehicle", str(bench.vehicle), "--out", str(tmp_path / "out"), "--verbose"]
     result = RUNNER.invoke(
         app,
         [

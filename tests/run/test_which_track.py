@@ -83,6 +83,28 @@ def test_codes_that_do_not_fit_give_no_decision() -> None:
     assert track_posterior(tracks, [bad], arms_m=(0.0,), errors=StandstillErrors()).decision(risk=1e-2) == ""
 
 
+@pytest.mark.parametrize("sigma", [0.25, 0.4, 0.6])
+def test_an_antenna_between_tracks_is_on_neither(sigma: float) -> None:
+    """The map is displaced by half the spacing: whichever the track is, nothing is decided."""
+    tracks = made_tracks(2, 0.0, np.zeros(2), 0)
+    for place in (0.45 * SPACING_M, 0.5 * SPACING_M):
+        posterior = track_posterior(tracks, [_fix((place, 0.0), sigma)], arms_m=(0.0,), errors=StandstillErrors())
+        assert posterior.decision(risk=1e-3) in ("", "none")
+
+
+def test_a_place_far_from_its_track_in_standard_deviations_decides_nothing() -> None:
+    """One track alone, with little prior of another: the codes' place lies 5 sigma beside it, then 1."""
+    tracks = made_tracks(1, 0.0, np.zeros(2), 0)
+    errors = StandstillErrors(map_sigma_m=0.0, unmapped_prior=1e-9)
+    beside = track_posterior(tracks, [_fix((1.0, 0.0), 0.2)], arms_m=(0.0,), errors=errors)
+    assert beside.probability[0] > 1.0 - 1e-3
+    assert beside.misfit_sigmas[0] == pytest.approx(5.0, abs=0.05)
+    assert beside.decision(risk=1e-3) == ""
+    near = track_posterior(tracks, [_fix((0.2, 0.0), 0.2)], arms_m=(0.0,), errors=errors)
+    assert near.misfit_sigmas[0] == pytest.approx(1.0, abs=0.05)
+    assert near.decision(risk=1e-3) == "T1"
+
+
 def test_mean_noise_is_that_of_a_gauss_markov_process() -> None:
     errors = StandstillErrors(code_noise_m=1.0, correlation_s=30.0)
     rng = np.random.default_rng(4)
@@ -342,7 +364,11 @@ def _last(folder: Path, **shares: float) -> Path:
     path = folder / "last.json"
     names = tuple(shares)
     posterior = TrackPosterior(
-        names=names, probability=np.array([*shares.values()]), with_rising=np.zeros(len(names) - 1), fits=True
+        names=names,
+        probability=np.array([*shares.values()]),
+        with_rising=np.zeros(len(names) - 1),
+        fits=True,
+        misfit_sigmas=np.zeros(len(names)),
     )
     write_last_place(posterior, np.datetime64("2024-01-01"), path)
     return path

@@ -158,9 +158,9 @@ def test_a_note_says_where_a_screen_cannot_judge(tmp_path: Path) -> None:
     write_observations(silent, tmp_path / "front.rnx")
     inputs = RunInputs(front=(tmp_path / "front.rnx",), nav=(DEMO / "nav.rnx.gz",), track=(DEMO / "track.csv",))
     notes = run_files(inputs, out=tmp_path / "out").notes
-    assert any("screen doppler has judged nothing; it needs the Doppler" in note for note in notes)
+    assert any("screen doppler tested nothing; it needs the Doppler" in note for note in notes)
     for name in ("antenna_pair", "antenna_spacing"):
-        assert any(f"screen {name}: inactive; it needs two antennas" in note for note in notes)
+        assert any(f"screen {name} was not run: it needs two antennas" in note for note in notes)
     assert not any("screen elevation" in note for note in notes)
 
 

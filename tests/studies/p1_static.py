@@ -1,6 +1,6 @@
 """P1 3.2 on the simulated test line: standing still with two and with three satellites.
 
-The part ``static`` of `p1_experiment`: a train stands every few metres of the made test line, and each pair and
+The part ``static`` of `p1_experiment`: a train stands every few metres of the simulated test line, and each pair and
 each triple of the satellites above the mask is taken as all there is.
 """
 

@@ -31,7 +31,6 @@ from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS, UNITS, Column
 from railfix.pipeline.tables import PASSING_COLUMNS, SMOOTHED_COLUMNS, TRAIN_COLUMNS
-from railfix.run.batch_check import BATCH_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
 
@@ -202,7 +201,6 @@ def run_columns() -> str:
     lines += _columns("`positions.csv`, `positions.parquet`", POSITION_COLUMNS, without=common)
     lines += _columns("`train.csv`, `train.parquet`", TRAIN_COLUMNS, without=common)
     lines += _columns("`train.*` with `--smooth`", SMOOTHED_COLUMNS)
-    lines += _columns("`train.*` with `--check batch`", BATCH_COLUMNS)
     lines += _columns("`passings.csv`, `passings.parquet`", PASSING_COLUMNS, without=("antenna", "speed_mps"))
     lines += _columns("`positions.*` and `train.*` on a network", ON_TRACK_COLUMNS)
     lines += _columns("`tracks.csv`, `tracks.parquet`", TRACK_COLUMNS)

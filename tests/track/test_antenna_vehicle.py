@@ -59,9 +59,10 @@ class Line:
     gradient: float = 0.0
     vertical_radius: float = 4000.0
     breaks: tuple[float, ...] = (0.0, 60.0, 110.0, 170.0, 220.0, 280.0)
+    shares: tuple[float, ...] = (0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
 
     def share(self, s: Floats) -> Floats:
-        return np.interp(s, self.breaks, [0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+        return np.interp(s, self.breaks, self.shares)
 
     @cached_property
     def _plan(self) -> tuple[Floats, Floats, Floats]:
@@ -88,7 +89,7 @@ class Line:
         curvature = self.curvature * self.share(s)
         with np.errstate(divide="ignore"):
             radius = np.where(curvature == 0.0, np.inf, -1.0 / curvature)  # right is positive
-        return Track.from_ecef(to_ecef(self.sampled(s)), cant_m=self.cant * self.share(s), radius_m=radius)
+        return Track.from_ecef(to_ecef(self.sampled(s)), cant_m=self.cant * np.abs(self.share(s)), radius_m=radius)
 
 
 def rigid_body(line: Line, car: Vehicle, offset: AntennaOffset, middle: float) -> Floats:
@@ -112,6 +113,40 @@ def rigid_body(line: Line, car: Vehicle, offset: AntennaOffset, middle: float) -
         ],
     )
     return np.asarray((rear + front) / 2.0 + rotation.apply([offset.along_m, -offset.across_m, offset.up_m]))
+
+
+#: A curve of 300 m with ramps of 60 m, and a reverse curve whose ramp goes from one side to the other.
+CURVES = {
+    "ramps": Line(curvature=1 / 300.0, cant=0.12, breaks=(0.0, 87.0, 147.0, 230.0, 290.0, 400.0)),
+    "reverse": Line(
+        curvature=-1 / 300.0, cant=0.12, breaks=(0.0, 80.0, 140.0, 210.0, 330.0, 410.0, 470.0, 560.0),
+        shares=(0.0, 0.0, 1.0, 1.0, -1.0, -1.0, 0.0, 0.0),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.requirement("A2")
+@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize(("spacing_m", "radii"), [(20.0, "of the map"), (10.0, "of the map"), (5.0, "none")])
+@pytest.mark.parametrize("start_m", [0.0, 3.0, 7.0])
+def test_the_path_follows_the_curve_between_sparse_points(
+    name: str, spacing_m: float, radii: str, start_m: float
+) -> None:
+    """Within 1 cm with points every 20 m where the map has radii and cant, every 5 m where it has no radii."""
+    line, car = CURVES[name], vehicle()
+    s = np.arange(start_m, line.breaks[-1], spacing_m)
+    with np.errstate(divide="ignore"):
+        radius = -1.0 / (line.curvature * line.share(s))
+    track = Track.from_ecef(
+        to_ecef(line.sampled(s)),
+        cant_m=line.cant * np.abs(line.share(s)),
+        radius_m=radius if radii == "of the map" else np.full(len(s), np.nan),
+    )
+    path = antenna_trajectory(track, car, reference="centre")
+    grid = np.arange(s[0] + 10.0, s[-1] - 10.0, 0.5)
+    expected = np.array([rigid_body(line, car, OFFSET, middle) for middle in grid])
+    _, _, apart = path._nearest(to_ecef(expected))
+    assert apart.max() < 0.01
 
 
 @pytest.mark.requirement("A2")

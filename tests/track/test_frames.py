@@ -15,8 +15,9 @@ from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track import Track, read_track
-from railfix.track.crs import WORKING_FRAME, frame_degrees, kind_of_frame
+from railfix.track.crs import WORKING_FRAME, kind_of_frame
 from railfix.track.frames import decimal_year, track_at
+from railfix.track.georeference import georeference
 from railfix.track.track import Provenance
 
 pytestmark = pytest.mark.requirement("A9")
@@ -156,9 +157,12 @@ def test_kinds_and_older_datums() -> None:
     kinds = {crs: kind_of_frame(crs) for crs in ("EPSG:4326", "EPSG:25831", "EPSG:9989", "EPSG:31370", "EPSG:6677")}
     assert list(kinds.values()) == ["wgs84", "moves with its plate", "dynamic", "older datum", "moves with its plate"]
     # Belgian Lambert 72 goes to ETRS89, so that the rest of the way to the ITRF follows.
-    latitude, longitude, frame = frame_degrees("EPSG:31370", np.array([150_000.0]), np.array([170_000.0]), path="map")
-    assert frame == "EPSG:4937"
-    assert (latitude[0], longitude[0]) == (pytest.approx(50.84, abs=0.02), pytest.approx(4.37, abs=0.02))
+    place = georeference("EPSG:31370", np.array([150_000.0]), np.array([170_000.0]), path="map")
+    assert (place.frame, place.accuracy_m) == ("EPSG:4937", 0.2)
+    assert (place.latitude_deg[0], place.longitude_deg[0]) == (
+        pytest.approx(50.84, abs=0.02),
+        pytest.approx(4.37, abs=0.02),
+    )
 
 
 def test_what_is_refused(tmp_path: Path) -> None:

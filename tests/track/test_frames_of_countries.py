@@ -8,8 +8,9 @@ from pyproj import CRS, Transformer
 
 from frame_cases import FRAMES, ITRF, MOTION, TIME, YEAR, moved
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.crs import HELD, REALISATIONS, SAME, frame_degrees, kind_of_frame, older_datum_note
+from railfix.track.crs import HELD, REALISATIONS, SAME, kind_of_frame
 from railfix.track.frames import points_at
+from railfix.track.georeference import georeference
 
 pytestmark = pytest.mark.requirement("A9")
 
@@ -69,7 +70,7 @@ def test_an_ensemble_and_a_frame_of_another_name_say_what_they_are_taken_for() -
         ("EPSG:4618", "EPSG:4989"),  # SAD69: South America
         ("EPSG:4272", "EPSG:4959"),  # NZGD49
         ("EPSG:4162", "EPSG:4927"),  # Korean 1985, not Japan
-        ("EPSG:4269", "EPSG:6319"),  # NAD83 as of 1986
+        ("EPSG:4269", "EPSG:4326"),  # NAD83 as of 1986: PROJ has none to NAD83(2011) without its grids
         ("EPSG:31370", "EPSG:4937"),  # Belgian Lambert 72
         ("EPSG:30169", "EPSG:4326"),  # Tokyo: PROJ has none to JGD2011 without its grid, and Korea's is not meant
     ],
@@ -81,8 +82,9 @@ def test_an_older_datum_goes_to_the_modern_frame_of_its_region(crs: str, frame: 
     y = np.array([(area.south + area.north) / 2.0])
     if CRS(crs).is_projected:
         x, y = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(x, y)
-    assert frame_degrees(crs, x, y, path="map")[2] == frame
-    assert "transformed to" in older_datum_note(crs)[0]
+    place = georeference(crs, x, y, path="map")
+    assert place.frame == frame
+    assert "transformed to" in place.notes[0]
 
 
 @pytest.mark.slow

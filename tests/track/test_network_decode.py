@@ -220,7 +220,7 @@ def test_a_short_track_of_a_switch_is_not_passed_over(begin: float) -> None:
         time=np.datetime64("2024-01-01", "ns") + np.arange(len(x)) * np.timedelta64(400, "ms"),
         latitude_deg=latitude,
         longitude_deg=longitude,
-        sigma_m=np.full(len(x), np.nan),
+        sigma_m=np.full(len(x), 2.0),
     )
     matched = match(net, log)
     on_it = (x > 500.0) & (x < 521.0)

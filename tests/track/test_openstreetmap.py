@@ -15,8 +15,9 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.io.position_log import PositionLog
 from railfix.track import Track
-from railfix.track.frames import geoid_heights
+from railfix.track.georeference import Georeference
 from railfix.track.height_source import with_heights
+from railfix.track.heights import egm96_heights, geoid_heights
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 from railfix.track.read import read_segments, track_of_segments
@@ -160,7 +161,7 @@ def test_a_clipped_way_is_two_and_one_without_nodes_a_sentence(tmp_path: Path) -
     assert [len(s.latitude_deg) for s in read_segments(path, MapReading())] == [3, 2, 3]
     bare = [{"type": "way", "id": 11, "tags": TAGS[11], "nodes": [101, 102]}]
     path.write_text(json.dumps({"elements": bare}))
-    with pytest.raises(InputFileError, match=r"way/11: the file has 0 of its 2 nodes; ask Overpass"):
+    with pytest.raises(InputFileError, match=r"way/11 \(the file has 0 of its 2 nodes\); ask Overpass"):
         read_segments(path, MapReading())
 
 
@@ -218,7 +219,7 @@ def test_all_that_a_map_without_heights_needs_is_asked_for_at_once(tmp_path: Pat
         read_segments(path, MapReading())[:1],
         heights=raster, height_datum="orthometric", geoid="egm96", sigma_height_m=3.0,
     )  # fmt: skip
-    geoid, _ = geoid_heights("egm96", track.latitude_deg, track.longitude_deg, path="map")
+    geoid = egm96_heights(track.latitude_deg, track.longitude_deg)
     np.testing.assert_allclose(track.height_m, 100.0 + geoid, atol=1e-3)
     assert track.sigma_height_m == 3.0
 
@@ -235,13 +236,21 @@ EGM96: Final = (
 
 
 def test_geoid_of_the_world_is_the_published_one() -> None:
-    pytest.importorskip("sidereon")
     latitude, longitude, published = np.array(EGM96).T
-    heights, name = geoid_heights("egm96", latitude, longitude, path="map")
-    assert np.abs(heights - published).max() < 0.5
-    assert "EGM96" in name
+    model = geoid_heights("egm96", Georeference(latitude_deg=latitude, longitude_deg=longitude), path="map")
+    assert np.abs(model.height_m - published).max() < 0.005
+    assert "EGM96" in model.name
+    assert model.accuracy_m == 1.0
+
+
+def test_geoid_of_the_world_is_that_of_another_package_at_whole_degrees() -> None:
+    sidereon = pytest.importorskip("sidereon")
+    latitude, longitude = (v.ravel() for v in np.meshgrid(np.arange(-89.0, 90.0, 7.0), np.arange(-179.0, 181.0, 9.0)))
+    expected = sidereon.egm96_undulations_deg(np.ascontiguousarray(np.stack([latitude, longitude], axis=-1)))
+    assert np.abs(egm96_heights(latitude, longitude) - expected).max() < 1e-6
 
 
 def test_a_geoid_that_is_not_installed_names_its_grid_and_the_command() -> None:
+    place = Georeference(latitude_deg=np.array([50.0]), longitude_deg=np.array([5.0]))
     with pytest.raises(SettingsError, match=r"projsync --file .*us_nga_egm08_25.tif"):
-        geoid_heights("EPSG:3855", np.array([50.0]), np.array([5.0]), path="map")
+        geoid_heights("EPSG:3855", place, path="map")

@@ -132,7 +132,7 @@ def test_geoid_from_a_grid_file_of_pyproj(tmp_path: Path) -> None:
             SettingsError,
             "the grid is not installed",
         ),
-        (GOOD.replace("height_m", "elevation_m"), {"geoid": "EPSG:3855"}, SettingsError, "the grid is not installed"),
+        (GOOD.replace("height_m", "elevation_m"), {"geoid": "EPSG:3855"}, SettingsError, "not installed (projsync"),
         (GOOD.replace("height_m", "elevation_m"), {"geoid": "EPSG:6677"}, SettingsError, "no height datum"),
         (GOOD, {"geoid": "japan"}, SettingsError, "ellipsoidal already"),
         (GOOD, {"height_datum": "orthometric"}, InputFileError, "height_m is ellipsoidal"),

@@ -181,13 +181,13 @@ def test_the_summary_of_a_run_has_the_level_of_the_filter(tmp_path: Path) -> Non
     options = [word for name, path in files.items() for word in (f"--{name}", path)]
     done = CliRunner().invoke(
         app,
-        ["run", *options, "--end", "2024-03-05T03:10:10", "--out", str(tmp_path / "out")],
+        ["run", *options, "--end", "2024-03-05T03:10:10", "--out", str(tmp_path / "out"), "--verbose"],
         env={"COLUMNS": "100"},
     )
     assert done.exit_code == 0, done.output
     train = pl.read_parquet(tmp_path / "out" / "train.parquet")["protection_level_m"]
     finite = train.filter(train.is_finite())
-    summary = done.output.split("Filter along the track")[1]
+    summary = done.output.split("Filter along the track (train.csv)")[1]
     assert re.search(rf"indicative protection level, p50 │ +{finite.quantile(0.5):.2f} m", summary)
     assert len(finite) > 50
     assert f"{len(finite)} │" in summary.split("with a level")[1]

@@ -28,6 +28,7 @@ from railfix.track import (
     read_track,
     write_track_csv,
 )
+from railfix.track.quality import needed_spacing_m
 
 app = command_group(
     "map", help="Check a track map, make one from positions or of a network, and put positions on a network."
@@ -138,12 +139,12 @@ def features(
 
     from railfix.motion.features import line_series, map_features
     from railfix.run.locate import centre_features, find_features, read_measured
-    from railfix.track.trajectory import Trajectory
+    from railfix.track.curves import curved_line
 
     tables = [folder / "train.parquet" for folder in run or ()]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=[*tracks, *tables])
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    trajectory = Trajectory.from_antenna_path(track)
+    trajectory = curved_line(track)
     series = line_series(trajectory)
     found = map_features(series)
     if run:
@@ -258,6 +259,12 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
         f"spacing {spacing.min():.2f} / {np.median(spacing):.2f} / {spacing.max():.2f} m (least, median, largest); "
         + (f"mid-chord deviation up to {deviation.max():.3f} m" if len(deviation) else "no mid-chord deviation")
     )
+    needed = needed_spacing_m(quality)
+    if needed < spacing.max():
+        console.print(
+            f"chords of the sharpest curve stay within 1 cm with points every {needed:.1f} m; between points the "
+            "antenna's path follows the arc"
+        )
     show_notes(console, track.provenance.notes)
     rows = []
     for finding in quality.findings:

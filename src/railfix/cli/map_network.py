@@ -75,7 +75,10 @@ class MatchOptions(Settings):
     """How far from a track positions are expected, and what is written of them."""
 
     sigma: float | None = option(
-        "Sigma of the distance from the track, map included; else that of LOG, or 2 m.", None, metavar="M", gt=0.0
+        "Sigma of the distance from the track, map included; else that of LOG, or one estimated by it, or 4 m.",
+        None,
+        metavar="M",
+        gt=0.0,
     )
     within: float | None = option(
         "Farthest track considered; else 30 m, farther where LOG states larger sigmas, to 100 m.",
@@ -276,7 +279,10 @@ def match_command(
         f"{len(on)} positions, {on.sum()} on a track ({on.mean():.1%}), {(np.abs(matched.offset_m) <= 5.0).mean():.1%} "
         f"within 5 m of it; {(matched.probability < 0.9).sum()} with a probability below 0.9"
     )
-    show_notes(console, [*net.notes, *notes])
+    show_notes(
+        console,
+        dict.fromkeys([*net.notes, *(note for track in net.tracks for note in track.notes), *notes, *matched.notes]),
+    )
     if picture is not None:
         from railfix.report.plots.network import plot_network
 

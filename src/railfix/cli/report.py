@@ -27,7 +27,7 @@ _SATELLITES: Final[Sequence[Column]] = (
     ("satellite", "satellite", str), ("signal", "signal", str), ("elevation", "elevation_deg", partial(digits, 1)),
     ("C/N0", "cn0_dbhz", partial(digits, 1)), ("sigma m", "sigma_m", partial(digits, 2)),
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
-    ("sigma then m", "without_sigma_m", partial(digits, 2)), ("fate", "reason_text", str),
+    ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
 #: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the size from which on an array has pages of its own [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)
@@ -116,7 +116,7 @@ def explain(
     html: Annotated[Path | None, typer.Option(metavar="HTML", help="Write a page with the sky as well.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Explain one epoch: its place, every satellite and its fate, what set sigma, level and status.
+    """Explain one epoch: its position, every satellite and its outcome, what set sigma, level and status.
 
     Of each satellite that was used it says how far the position of the single epoch would move along the line without
     it. The epoch nearest to the time is taken, a minute away at most.

@@ -1,4 +1,4 @@
-"""Files from receivers and archives: plain, gzip, compress (.Z), each also Hatanaka-compressed; commit of the source.
+"""Files from receivers and archives: plain, gzip, compress (.Z), bzip2, xz, zstd, zip; Hatanaka; commit of the source.
 
 The first bytes of a file decide how it is read, never its name. Memory is bounded: plain and gzip are streamed,
 compress is unpacked to a temporary file by `ncompress`, Hatanaka is piped through ``crx2rnx`` (a packed CRX file by a
@@ -13,12 +13,14 @@ import hashlib
 import importlib.resources
 import io
 import json
+import lzma
 import os
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
+import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
@@ -30,6 +32,7 @@ from typing import IO, Any, Final, Literal, cast
 import ncompress
 
 from railfix.core.errors import InputFileError, OutputError
+from railfix.core.packed import COMPRESS, STREAMS, ZIP, open_zip, zip_member
 
 FilePath = str | PathLike[str]
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
@@ -39,16 +42,7 @@ Reader = Literal["railfix", "georinex"]  #: What reads RINEX observation files.
 #: Last clause of the error of a broken line: how to go on.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
-_GZIP: Final = b"\x1f\x8b"
-_COMPRESS: Final = b"\x1f\x9d"
-#: First bytes of archives that are not read, and their names in messages.
-_ARCHIVES: Final = {
-    b"PK\x03\x04": "a zip archive",
-    b"BZh": "a bzip2 archive",
-    b"\xfd7zXZ": "an xz archive",
-    b"7z\xbc\xaf": "a 7-zip archive",
-    b"(\xb5/\xfd": "a zstd archive",
-}
+_SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")  #: Endings of packed files before which the kind stands.
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
@@ -78,9 +72,9 @@ class ByteStream(io.BufferedIOBase):
         try:
             return self._source.read(-1 if size is None else size)
         except EOFError as error:
-            raise InputFileError(self.path, "the gzip data end early; copy or download it again") from error
-        except (zlib.error, gzip.BadGzipFile) as error:
-            raise InputFileError(self.path, f"the gzip data are damaged ({error}); download it again") from error
+            raise InputFileError(self.path, "the packed data end early; copy or download it again") from error
+        except (zlib.error, gzip.BadGzipFile, lzma.LZMAError, zipfile.BadZipFile) as error:
+            raise InputFileError(self.path, f"the packed data are damaged ({error}); download it again") from error
         except OSError as error:
             raise InputFileError(self.path, f"cannot be read ({error.strerror or error})") from error
 
@@ -144,15 +138,22 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
         source = held.enter_context(closing(_open_plain(path)))
         head = source.read(_HEAD_BYTES)
         source.seek(0)
-        if archive := next((name for magic, name in _ARCHIVES.items() if head.startswith(magic)), None):
-            raise InputFileError(path, f"is {archive}; unpack it first (.gz and .Z are read as they are)")
-        if head.startswith(_GZIP):
-            source = held.enter_context(closing(cast("IO[bytes]", gzip.GzipFile(fileobj=source, mode="rb"))))
+        if head.startswith(b"7z\xbc\xaf"):
+            raise InputFileError(path, "is a 7-zip archive; unpack it first (.gz, .Z, .bz2, .xz, .zst, .zip are read)")
+        disk = source
+        if head.startswith(ZIP):
+            archive = held.enter_context(open_zip(path, source))
+            source = held.enter_context(archive.open(zip_member(path, archive)))
+        while True:
             with ByteStream(path, source, ExitStack()) as unpacked:
                 head = unpacked.read(_HEAD_BYTES)
             source.seek(0)
-        elif head.startswith(_COMPRESS):
-            source = _unpack_compress(path, source, held)
+            unpack = next((opened for magic, opened in STREAMS.items() if head.startswith(magic)), None)
+            if unpack is None:
+                break
+            source = held.enter_context(closing(cast("IO[bytes]", unpack(source))))
+        if head.startswith(COMPRESS):
+            source = disk = _unpack_compress(path, source, held)
             head = source.read(_HEAD_BYTES)
             source.seek(0)
         if not head.strip():
@@ -165,7 +166,37 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             return _decode_hatanaka(path, source, held)
         if content == "text" and head.startswith(codecs.BOM_UTF8):
             source.seek(len(codecs.BOM_UTF8))
-        return ByteStream(path, source, held.pop_all())
+        return ByteStream(path, source, held.pop_all(), disk=disk)
+
+
+@contextmanager
+def unpacked_file(path: FilePath) -> Iterator[Path]:
+    """Yield a file on disk with the unpacked content, for programs that open files themselves.
+
+    A file that is not packed is itself; all files of a zip archive are unpacked beside each other.
+    """
+    with _open_plain(path) as source:
+        head = source.read(_HEAD_BYTES)
+    if not head.startswith((ZIP, COMPRESS, *STREAMS)) or (head.startswith(ZIP) and _is_document(path)):
+        yield Path(path)
+        return
+    with tempfile.TemporaryDirectory(prefix="railfix-") as folder:
+        if head.startswith(ZIP):
+            with _open_plain(path) as source, open_zip(path, source) as archive:
+                member = zip_member(path, archive)
+                archive.extractall(folder)
+            yield Path(folder) / member
+            return
+        name = Path(Path(path).name)
+        target = Path(folder) / (name.stem if name.suffix.lower() in _SUFFIXES else name.name)
+        with open_stream(path, content="bytes") as stream, target.open("wb") as file:
+            shutil.copyfileobj(stream, file, _COPY_BYTES)
+        yield target
+
+
+def _is_document(path: FilePath) -> bool:
+    """Return whether a zip archive is a document of its own (a spreadsheet), by its name."""
+    return Path(path).suffix.lower() in (".xlsx", ".ods")
 
 
 def read_bytes(path: FilePath) -> bytes:
@@ -198,13 +229,16 @@ def text_lines(path: FilePath) -> Iterator[str]:
 
 
 def ending(path: FilePath) -> str:
-    """Return the ending of a file name in lower case, ignoring ``.gz`` and ``.Z``.
+    """Return the ending of a file name in lower case, ignoring those of packed files; of a zip archive its file's.
 
     >>> ending("Line.GeoJSON.gz")
     '.geojson'
     """
     name = Path(Path(path).name.lower())
-    return name.with_suffix("").suffix if name.suffix in (".gz", ".z") else name.suffix
+    if name.suffix in (".zip", ".kmz") and zipfile.is_zipfile(path):
+        with _open_plain(path) as source, open_zip(path, source) as archive:
+            return ending(zip_member(path, archive))
+    return name.with_suffix("").suffix if name.suffix in _SUFFIXES else name.suffix
 
 
 def file_sha256(path: FilePath) -> str:
@@ -315,7 +349,7 @@ def hatanaka_program(name: str) -> AbstractContextManager[Path]:
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
     """Start the decoder on an open source and take over the resources in `held`."""
-    if isinstance(source, gzip.GzipFile):
+    if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:
             shutil.copyfileobj(unpacked, spool, _COPY_BYTES)

@@ -17,11 +17,11 @@ from railfix.core.settings import misspelt
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, fails, read_named_columns, with_usual_names
 
-_SIGMAS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
+SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
 #: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds; geodetic or ECEF.
 CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
-    "z_m", "quality", "ratio", *_SIGMAS,
+    "z_m", "quality", "ratio", *SIGMA_COLUMNS,
 )  # fmt: skip
 #: Largest Unix time that is taken for seconds, in 2100.
 _LAST_UNIX_S: Final = 4.1e9
@@ -105,7 +105,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
         time=positions_times(table),
         ecef_m=values if cartesian else ecef_from_geodetic(*values.T),
         quality=np.where(np.isfinite(quality), quality, -1.0).astype(np.int64),
-        sigma_m=np.stack([numbers_or_nan(table, name) for name in _SIGMAS], axis=-1),
+        sigma_m=np.stack([numbers_or_nan(table, name) for name in SIGMA_COLUMNS], axis=-1),
         line=table.line,
         notes=notes,
         ratio=numbers_or_nan(table, "ratio") if "ratio" in table else None,

@@ -77,7 +77,7 @@ class FilterState(NotebookTable):
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
-            return "<FilterState: no place yet>"
+            return "<FilterState: no position yet>"
         return f"<FilterState: {plural(self.track.hypotheses, 'place')}, the most probable at {self._place()} m>"
 
     def _place(self) -> str:

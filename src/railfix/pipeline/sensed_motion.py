@@ -35,6 +35,7 @@ from railfix.motion.slip import (
 )
 from railfix.motion.tachometer import TachometerLimits, distance_m, faults_until, pulse_acceleration, pulse_speeds
 from railfix.track import Track
+from railfix.track.curves import curved_line
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
@@ -59,7 +60,7 @@ class LineFeatures:
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
         """Return the features of a track for the body that carries an antenna."""
-        line = Trajectory.from_antenna_path(track)
+        line = curved_line(track)
         series = line_series(line)
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])

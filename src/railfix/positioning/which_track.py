@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field
 from scipy.special import chdtrc, logsumexp
 
-from railfix.core.arrays import Floats, Masks, Strings
+from railfix.core.arrays import Floats, Strings
 from railfix.core.settings import Settings, option
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 
@@ -26,6 +26,12 @@ _ALONG_M: Final = 0.25
 _ACROSS_M: Final = 0.3
 #: Tracks lie no nearer to each other than this [m]: a track that the map does not have keeps it from those it has.
 _CLEARANCE_M: Final = 3.0
+#: A train nearer to a track than that is beside it where the map is displaced: less likely by this than a track that
+#: the map lacks, and no nearer than the second [m].
+_BETWEEN_SHARE: Final = 0.1
+_BETWEEN_M: Final = 1.2
+#: A place farther than this from the most likely track, in standard deviations, decides nothing.
+_LARGEST_MISFIT: Final = 4.0
 #: Part of a track about the train that is integrated over, either side [m].
 _REACH_M: Final = 40.0
 _LEAST_ELEVATION_DEG: Final = 10.0
@@ -160,11 +166,15 @@ class TrackPosterior:
     probability: Floats  #: Shape (tracks + 1,).
     with_rising: Floats  #: Probability that the train stands on the track and faces its direction, shape (tracks,).
     fits: bool  #: Whether the codes agree with the error model.
+    #: Distance of the codes' place from each track, in its standard deviations; shape (tracks + 1,), NaN for `NONE`.
+    misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
         """Return the name of the track whose probability exceeds one minus the risk; empty while undecided."""
         best = int(np.argmax(self.probability))
-        return self.names[best] if self.fits and 1.0 - self.probability[best] < risk else ""
+        if not self.fits or self.misfit_sigmas[best] > _LARGEST_MISFIT:
+            return ""
+        return self.names[best] if 1.0 - self.probability[best] < risk else ""
 
 
 def track_posterior(
@@ -191,7 +201,8 @@ def track_posterior(
     half = _UNMAPPED_WIDTH_M / 2.0
     shifts = np.arange(-half, half + _ACROSS_M / 2.0, _ACROSS_M)
     width = len(shifts)
-    shifts = shifts[_clear(shifts, tracks, nearest, fixes[0].east_north_m)]
+    likely = _shift_weights(shifts, tracks, nearest, fixes[0].east_north_m)
+    shifts, likely = shifts[likely > 0.0], likely[likely > 0.0]
     # hypotheses: each track, and shifts of the nearest one; each with both ways to face
     lines = [*((track, np.zeros(1)) for track in tracks), (tracks[nearest], shifts)]
     found = [
@@ -200,6 +211,10 @@ def track_posterior(
     ]
     if phases:
         found = _with_phases(found, fixes, phases, errors)
+    found[-1] = [
+        replace(item, log_evidence=item.log_evidence + np.log(likely)) if len(item.log_evidence) else item
+        for item in found[-1]
+    ]
     with np.errstate(divide="ignore"):
         log_prior = np.log([*weights, errors.unmapped_prior / width])
     logs = np.array(
@@ -217,6 +232,7 @@ def track_posterior(
         probability=shares.sum(axis=1),
         with_rising=shares[:-1, 0],
         fits=all(fix.fits for fix in fixes),
+        misfit_sigmas=np.array([*(min(float(item.misfit) for item in row) for row in found[:-1]), np.nan]),
     )
 
 
@@ -276,8 +292,10 @@ def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks
     return np.asarray(covariance + 1e-6 * np.eye(2 * len(fixes)))
 
 
-def _clear(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Masks:
-    """Return shifts of the nearest track, about the place of the train, that keep clear of all tracks of the map."""
+def _shift_weights(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Floats:
+    """Return the weight of each shift of the nearest track about the place of the train: 1 clear of all tracks of the
+    map, less between them, 0 on one.
+    """
     points = tracks[nearest].points_m
     start, step = points[:-1], np.diff(points, axis=0)
     share = np.clip(((place_m - start) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)
@@ -286,7 +304,7 @@ def _clear(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m:
     right = np.array([step[k, 1], -step[k, 0]]) / np.linalg.norm(step[k])
     places = foot[k] + shifts_m[:, None] * right
     nearest_m = np.min([_distances(track.points_m, places) for track in tracks], axis=0)
-    return np.asarray(nearest_m >= _CLEARANCE_M, dtype=np.bool_)
+    return np.where(nearest_m >= _CLEARANCE_M, 1.0, np.where(nearest_m >= _BETWEEN_M, _BETWEEN_SHARE, 0.0))
 
 
 def _distance(points_m: Floats, place_m: Floats) -> float:
@@ -308,6 +326,7 @@ class _Places:
     log_evidence: Floats  #: Likelihood integrated over the place along the track, shape (U,).
     expected_m: Floats  #: Most likely places of the antennas, shape (U, A, 2).
     heading: Floats  #: Unit vectors along the track there, shape (A, 2).
+    misfit: float = np.inf  #: Least distance of the places from the hypotheses in standard deviations.
 
 
 def _places(
@@ -343,4 +362,5 @@ def _places(
         + np.log(_ALONG_M),
         expected_m=chosen,
         heading=np.stack(headings, axis=1)[likeliest[len(shifts_m) // 2]],
+        misfit=float(np.sqrt(-2.0 * exponent.max())),
     )

@@ -1,4 +1,5 @@
-"""One epoch of a run explained: its place, each satellite and its fate, what set sigma and level, what would change it.
+"""One epoch of a run explained: its position, each satellite and its outcome, what set sigma and level, what would
+change it.
 
 Everything is read from the tables of the run. What the position would be without a satellite is computed from them:
 weighted least squares of the residuals in the place along, across and above the line, the map's error as a prior, and
@@ -48,9 +49,9 @@ FILTER_STATUS: Final[Mapping[str, str]] = {
     "several_branches": "several places are possible; one of the most probable is given",
     "coasting": "predicted: no measurement of this epoch is believed",
     "lost": "measurements contradict the track: places are sought again",
-    "expired": "no place: predicted too far",
-    "not_started": "no place yet: no epoch so far had redundant codes",
-    "off_map": "no place: the satellites have put the train away from the line for some time",
+    "expired": "no position: dead reckoning for too long",
+    "not_started": "no position yet: no epoch so far had redundant codes",
+    "off_map": "no position: the satellites have put the train away from the line for some time",
     "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
     "antennas_disagree": "not as far from the other antenna's place as the antennas are apart",
     "doubtful": "measurements contradict the place, or what bounds it: nothing bounds its error",
@@ -75,7 +76,7 @@ class Explanation:
     #: Rows of ``positions`` and ``train``; `track` is empty where the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
-    #: Every observation, those used first, with its elevation, residual and fate, the weight and innovation that the
+    #: Every observation, those used first, with its elevation, residual and outcome, the weight and innovation that the
     #: filter gave it, and for those used how far the single position would move along the line without it, and its
     #: standard deviation then [m]; null where it would have none.
     satellites: pl.DataFrame
@@ -189,19 +190,20 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
     lines = []
     if track:
         text = f"filter: {_place(track)}; {track['status']}: {FILTER_STATUS.get(track['status'], 'see the reference')}"
-        lines.append(f"{text}; from {track['sources'] or 'the prediction alone'}")
+        lines.append(f"{text}; from {track['sources'] or 'dead reckoning'}")
         if track["hypotheses"]:
             count = track["hypotheses"]
-            places = "one place is possible" if count == 1 else f"{count} places are possible"
-            lines.append(f"filter: {places}, this one with a probability of {track['branch_probability']:.3f}")
+            positions = "one position is possible" if count == 1 else f"{count} positions are possible"
+            lines.append(f"filter: {positions}, this one with a probability of {track['branch_probability']:.3f}")
         lines.append(f"filter's level: {_level_of_filter(track)}")
     status = single["status"]
     lines.append(f"single epoch: {_place(single)}; {status}: {SINGLE_STATUS.get(status, 'see the reference')}")
     if single["along_sigma_m"] is not None and single["noise_scale"] is not None:
         own, whole = single["own_sigma_m"], single["along_sigma_m"]
         lines.append(
-            f"sigma: {own:.2f} m from the codes of the epoch alone, whose noise is {single['noise_scale']:.2f} of that "
-            f"of the weights so far; {whole:.2f} m with satellites, atmosphere, the map and other places"
+            f"sigma: {own:.2f} m from the codes of this epoch alone, with an observed noise of "
+            f"{single['noise_scale']:.2f} times the assumed one; "
+            f"{whole:.2f} m with satellite, atmospheric and map errors and other possible positions"
         )
     if "protection_level_m" in single:
         lines.append(f"single epoch's level: {_level_of_single(single)}")
@@ -210,8 +212,8 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
         if single["raim_statistic"] is not None:
             text += f", statistic {single['raim_statistic']:.1f} against a threshold of {single['raim_threshold']:.1f}"
         lines.append(text)
-    fates = satellites.group_by("reason_text").len().sort("len", "reason_text", descending=[True, False])
-    lines.append("satellites: " + ", ".join(f"{count} {fate}" for fate, count in fates.iter_rows()))
+    outcomes = satellites.group_by("reason_text").len().sort("len", "reason_text", descending=[True, False])
+    lines.append("satellites: " + ", ".join(f"{count} {outcome}" for outcome, count in outcomes.iter_rows()))
     weighty = satellites.filter(pl.col(WITHOUT[0]).is_not_null()).sort(pl.col(WITHOUT[0]).abs(), descending=True)
     if len(weighty):
         name, shift, sigma = (weighty[column][0] for column in ("satellite", *WITHOUT))
@@ -221,7 +223,7 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
 
 def _place(row: Mapping[str, Any]) -> str:
     if row["chainage_m"] is None:
-        return "no place"
+        return "no position"
     return f"chainage {row['chainage_m']:.2f} m, standard deviation {row['along_sigma_m']:.2f} m"
 
 
@@ -229,9 +231,9 @@ def _level_of_filter(track: Mapping[str, Any]) -> str:
     level, noise, apart = (track[f"protection_{name}_m"] for name in ("level", "noise", "separation"))
     if noise is None:
         return "none"
-    parts = f"noise alone requires {noise:.1f} m"
+    parts = f"{noise:.1f} m covers noise"
     if apart is not None:
-        parts += f", the sub-filters without one source each lie up to {apart:.1f} m away"
+        parts += f"; omitting any one source moves the result by at most {apart:.1f} m"
     if level is None or not np.isfinite(level):
         ground = track["protection_level_ground_m"]
         held = "" if ground is None or not np.isfinite(ground) else f"; on the ground {ground:.1f} m"

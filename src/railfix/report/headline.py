@@ -86,18 +86,17 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
     )
     worst, other_worst = float(compared.on_map_m.max()), float(compared.conventional_m.max())
     filtered = _filter_errors(run, antenna)
-    whose = "an epoch by itself" if filtered else "the train"
+    whose = "Single epochs have" if filtered else "The train has"
     verdict = (
-        f"At {share(compared.rate, 1)} of the epochs with satellite signals {whose} has a position on the line that "
-        f"passed every check; 95 % of these are within {number(float(wide), 1)} m of the true place along the line, "
-        f"and the worst is {number(worst, 1)} m off (conventional: {number(float(other_wide), 1)} m and "
-        f"{number(other_worst, 1)} m)."
+        f"{whose} a position on the line that passed every check in {share(compared.rate, 1)} of the epochs with "
+        f"satellite signals; 95 % of these errors are below {number(float(wide), 1)} m, and the largest is "
+        f"{number(worst, 1)} m (conventional: {number(float(other_wide), 1)} m and {number(other_worst, 1)} m)."
     )
     if filtered:
         verdict = (
-            f"The train has a position at {share(filtered['rate'], 1)} of all epochs, those without satellites "
-            f"included, by the filter along the track: 95 % are within {number(filtered['p95'], 1)} m of the true "
-            f"place along the line, and the worst is {number(filtered['max'], 1)} m off. {verdict}"
+            f"The filter along the track has a position in {share(filtered['rate'], 1)} of all epochs, including those "
+            f"without satellites; 95 % of its errors are below {number(filtered['p95'], 1)} m, and the largest is "
+            f"{number(filtered['max'], 1)} m. {verdict}"
         )
     lengths = (
         ("median error", "p50", middle, other_middle),
@@ -180,7 +179,7 @@ def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> I
             yield (
                 f"The longest of {len(passed)} stretches without satellites ({row['environment']}, "
                 f"{number(row['duration_s'], 1)} s and {number(row['travelled_m'], 0)} m, carried by "
-                f"{row['carried_by'].replace('+', ' and ') or 'prediction alone'}) is passed with at most "
+                f"{row['carried_by'].replace('+', ' and ') or 'dead reckoning'}) is passed with at most "
                 f"{number(row['outage_max_m'], 2)} m of error, {number(row['end_error_m'], 2)} m at its end with a "
                 f"stated sigma of {number(row['end_sigma_m'], 1)} m."
             )

@@ -65,15 +65,13 @@ def convert_logs(
         }
         write_observations(pieces, out, version=version, observables=observables, header=header)
         lines.append(f"wrote {out}: {epochs:,} epochs, RINEX {version}")
-        lines += [f"passed over: {count:,} {what}" for what, count in sorted(skipped.items())]
+        lines += [f"skipped {count:,} {what}" for what, count in sorted(skipped.items())]
     if nav_out is not None:
         navigation, left_out = with_written_messages(read_navigation(logs, **reading.arguments), version)
         write_navigation(navigation, nav_out, version=version)
         records = len(navigation.kepler) + len(navigation.glonass)
         lines.append(f"wrote {nav_out}: {records:,} ephemerides, RINEX {version}")
-        lines += [
-            f"passed over: {count:,} {what}" for what, count in sorted({**navigation.skipped, **left_out}.items())
-        ]
+        lines += [f"skipped {count:,} {what}" for what, count in sorted({**navigation.skipped, **left_out}.items())]
     return lines
 
 

@@ -9,19 +9,21 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
+from railfix.core.errors import NoPositionError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
-from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.state import State
 from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
@@ -37,9 +39,7 @@ from railfix.run.verdict import Verdict, judge_run
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
 from railfix.track.quality import error_note
-
-if TYPE_CHECKING:
-    from railfix.run.batch_check import BatchCheck
+from railfix.track.vehicle import read_vehicle
 
 
 class Progress(Protocol):
@@ -101,7 +101,6 @@ def run_files(
         rows = ResultRows(
             folder=folder, line=line, observations=options.observations == "write",
             checks=SensorChecks() if sensors else None,
-            batches=_batches(logs, line) if options.check == "batch" else {},
             passings=balises is not None, replays={name: Replays() for name in logs} if options.smooth == "on" else {},
         )  # fmt: skip
         tally = _position(logs, (sensors, base), processor, rows, beside, progress)
@@ -116,7 +115,6 @@ def run_files(
             *_notes_of_levels(config, tally),
             *_notes_of_sensors(rows.checks, sensors, units, line, config),
             *shorten_notes(rows.balise_notes),
-            *rows.compare_batches(),
         )
         sources = [entry.result() for entry in entries]
         folder.end_parquet(_footer(sources, notes))
@@ -129,11 +127,14 @@ def run_files(
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
+        verdict = judge_run(record)
+        if not any(antenna.leading.positions for antenna in verdict.antennas):
+            raise NoPositionError(f"not one position is promised: {'; '.join(verdict.lines())}")
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
-    return RunSummary(tally=tally, record=record, verdict=judge_run(record), files=files, wall_s=wall)
+    return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
 
 
 def open_inputs(
@@ -156,10 +157,11 @@ def open_inputs(
 
     from railfix.run.route import LogPositions
 
-    paths = next(iter(inputs.logs.values()))
+    antenna, paths = next(iter(inputs.logs.items()))
+    offset = None if inputs.vehicle is None else read_vehicle(inputs.vehicle).antennas.get(antenna)
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
-        reading=options.track,
+        reading=options.track, antenna_up_m=0.0 if offset is None else offset.up_m,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
@@ -224,18 +226,11 @@ def _position(
     return tally
 
 
-def _batches(logs: Iterable[Antenna], line: OpenedLine) -> dict[str, BatchCheck]:
-    """Return the checks of each antenna; loaded when asked for: 0.03 s."""
-    from railfix.run.batch_check import BatchCheck
-
-    return {name: BatchCheck(trajectory=line.trajectories[name]) for name in logs}
-
-
 def _screen_chunks(
     chunks: Iterator[dict[str, Observations]],
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
-) -> Iterator[ScreenedChunk]:
+) -> Iterator[Chunk]:
     """Yield the screened ranges of chunks, each with what sensors and base station measured up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
@@ -247,11 +242,11 @@ def _screen_chunks(
         yield screened
 
 
-def _single_epochs(screened: Iterator[ScreenedChunk], processor: EpochProcessor) -> Iterator[SolvedChunk]:
+def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iterator[Chunk]:
     """Yield the single epochs of chunks."""
     state = State()
     for chunk in screened:
-        solved, state = processor.single_epochs(chunk, state)
+        solved, state = processor.position(chunk, state)
         yield solved
 
 
@@ -313,7 +308,7 @@ def collect_notes(
     notes += tally.all_notes
     for name, antenna in tally.antennas.items():
         notes += [
-            f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
+            f"{name}: screen {screen.name} tested nothing; it needs {screen.needs}"
             for screen in SCREENS
             if antenna.judged.get(screen.name) is False
         ]
@@ -323,7 +318,7 @@ def collect_notes(
         for by, counts in (("single epochs", antenna.lasting), ("the filter", antenna.left_out)):
             notes += [
                 f"{name}: {by} left out the codes of {satellite} at {count} epochs from {str(first)[:19]} on: "
-                "over a minute they contradict all others"
+                "inconsistent with the others for over a minute"
                 for satellite, (count, first) in sorted(counts.items(), key=lambda item: -item[1][0])[:_NAMED]
             ]
         offset = antenna.map_offset
@@ -349,8 +344,8 @@ def _describe_detectable(detectable_m: Floats) -> str:
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
     return (
-        f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
-        f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
+        f"map errors smaller than {across:.0f} m laterally or {up:.0f} m in height cannot be detected; where the "
+        f"ranges are worst, smaller than {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
     )
 
 

@@ -382,18 +382,13 @@ class RunOptions(Settings):
         "off",
         name="--smooth",
     )
-    check: Literal["off", "batch"] = option(
-        "batch: fit codes and Dopplers of the whole log without the filter, write the places beside its own and say "
-        "where the two differ.",
-        "off",
-    )
     track: TrackReading = Field(default_factory=TrackReading)
     logs: LogReading = Field(default_factory=LogReading)
 
     @property
     def of_filter(self) -> list[str]:
         """Options given that need the filter along the track."""
-        return [*(["smooth"] if self.smooth == "on" else []), *(["check batch"] if self.check == "batch" else [])]
+        return ["smooth"] if self.smooth == "on" else []
 
     @field_validator("start", "end")
     @classmethod

@@ -7,7 +7,7 @@ sequence of tracks is the route on which positions are computed, and every other
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -267,6 +267,7 @@ class LogPositions:
     config: Config
     time: np.datetime64 | None  #: Of the epoch of frames; None without a navigation record.
     reading: TrackReading
+    antenna_up_m: float = 0.0  #: Height of the antenna above the rails, where the vehicle is known [m].
 
     @cached_property
     def positions(self) -> PositionLog:
@@ -291,9 +292,9 @@ class LogPositions:
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         own = self.positions
-        positions, _ = plan_log(self.path, own.time, own.ecef_m, own.sigma_m).transform_to(
-            network, **self.reading.motion
-        )
+        of_antenna = plan_log(self.path, own.time, own.ecef_m, own.sigma_m)
+        on_rails = replace(of_antenna, height_m=np.asarray(of_antenna.height_m) - self.antenna_up_m)
+        positions, _ = on_rails.transform_to(network, **self.reading.motion)
         matched = match(network, positions)
         used = np.flatnonzero(np.isfinite(matched.probability))
         positions, matched = positions.take(used), matched.take(used)

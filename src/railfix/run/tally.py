@@ -39,8 +39,6 @@ from railfix.tracking import Line
 if TYPE_CHECKING:
     import polars as pl
 
-    from railfix.run.batch_check import BatchCheck
-
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
@@ -306,8 +304,6 @@ class ResultRows:
     observations: bool  #: Whether rows of observations are wanted.
     checks: SensorChecks | None  #: Takes those of the first antenna, where there are sensors.
     replays: Mapping[str, Replays]  #: Keeps what the filter was given, by antenna; empty where nothing is smoothed.
-    #: The same, of the epochs that a batch is compared with.
-    batches: Mapping[str, BatchCheck] = field(default_factory=dict)
     passings: bool = False  #: Whether rows of balises and virtual ones are wanted.
     #: Balises so far that were missed, or read where they are not.
     balise_notes: list[str] = field(default_factory=list)
@@ -326,9 +322,6 @@ class ResultRows:
             self.balise_notes.extend(balise_notes(name, own.passings))
         if self.passings:
             tables["passings"] = passing_table(result)
-        for name, check in self.batches.items():
-            if name in result.fusion:
-                check.take(result.fusion[name])
         for name, kept in self.replays.items():
             if name in result.fusion:
                 kept.keep(result.fusion[name].replay)
@@ -340,14 +333,6 @@ class ResultRows:
             self.folder.append_parquet(f"{name}.parquet", table)
             if name != "observations":
                 self.folder.append_csv(f"{name}.csv", round_floats(table))
-
-    def compare_batches(self) -> list[str]:
-        """Compare the filter with the batches after the last chunk; return a note an antenna."""
-        if not self.batches:
-            return []
-        from railfix.run.batch_check import add_batch
-
-        return add_batch(self.batches, self.folder)
 
 
 #: Notes on balises that a run gives.

@@ -39,6 +39,7 @@ _SAME_PLACE_M: Final = 1.0
 #: What the distance moved may be wrong by: share, and constant part [m].
 _ODOMETER_SHARE: Final = 0.05
 _ODOMETER_M: Final = 10.0
+_NOTED_MISFIT: Final = 2.5  #: Distances from the most likely track in standard deviations that are noted.
 #: Least probability of a track that the map does not have.
 _LEAST_UNMAPPED: Final = 1e-9
 
@@ -304,6 +305,13 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
         least_s=options.least_s,
         prior=prior,
     )
+    last = decision.posteriors[-1]
+    best = int(np.argmax(last.probability))
+    if last.misfit_sigmas[best] > _NOTED_MISFIT:
+        notes.append(
+            f"the codes' place lies {last.misfit_sigmas[best]:.1f} standard deviations from {last.names[best]}, the "
+            "most likely track; beyond 4 nothing is decided: is the map displaced, or a track missing?"
+        )
     return replace(decision, notes=tuple(notes))
 
 

@@ -138,7 +138,7 @@ def _length_m(given: dict[str, Any]) -> float:
 class LineSettings(ScenarioSettings):
     """The line and the spacing of its map."""
 
-    name: str = "made test line"
+    name: str = "simulated test line"
     #: The pattern of P1's test line; `elements` and `gradients`; `generated`; or `file`.
     kind: Literal["pattern", "elements", "generated", "file"] = "pattern"
     #: First point; ellipsoidal height. Not used for a file.

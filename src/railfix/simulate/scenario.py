@@ -92,7 +92,7 @@ class VehicleSettings(ScenarioSettings):
     70 mm wider than the gauge.
     """
 
-    name: str = "made test car"
+    name: str = "simulated test car"
     bogie_distance_m: Positive = 13.8
     gauge_m: Positive = 1.067
     front: Three = (9.1, 0.25, 3.95)

@@ -13,11 +13,12 @@ from typing import Any, Final, Literal
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
+from pyproj.datadir import get_user_data_dir  # type: ignore[attr-defined]
 from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Floats, Masks
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.errors import SettingsError
 from railfix.core.files import FilePath
 
 #: Three-dimensional codes of the realisations of the ITRF.
@@ -148,6 +149,7 @@ SAME: Final = {
 }
 
 
+TRANSIT: Final = "WGS 84 (Transit)"  #: The first realisation of WGS 84, 0.8 m from the later ones.
 #: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
 WORKING_FRAME: Final = "EPSG:9989"
 #: Frames that maps of a region are usually in: name, three-dimensional code. The first of a place is the likelier one.
@@ -159,13 +161,13 @@ REGIONAL: Final = {
 MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
 #: Largest scale of a grid that is the one of a line, less 1: grids of countries have up to 0.005.
 LARGEST_SCALE: Final = 0.01
-#: Projections of web maps and of the world, whose scale is none of a survey.
-_UNEVEN: Final = (
-    "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
-)  # fmt: skip
-_COVERED: Final = 0.5  #: Share of the area of use of an older datum that a modern frame of its region covers.
 MODERN_M: Final = 0.5  #: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
 
+Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
+#: Operations of a worse accuracy are not used [m]; 999 in the EPSG dataset is none.
+WORST_M: Final = 100.0
+#: Parts of the name of an operation of PROJ that change no datum.
+_NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
 Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
 
@@ -176,7 +178,7 @@ def kind_of_frame(crs: str) -> Kind:
     name = geodetic.name
     if name in REALISATIONS:
         return "dynamic"
-    if name.startswith("WGS 84"):
+    if name.startswith("WGS 84") and name != TRANSIT:
         return "wgs84"
     if name in HELD:
         return "moves with its plate"
@@ -239,7 +241,9 @@ def get_geodetic_frame(crs: str) -> CRS:
     geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
-    return geodetic
+    # a CRS without names, such as +proj=utm +zone=32 +datum=WGS84, is that of its datum
+    authority = geodetic.to_authority() if geodetic.name == "unknown" else None
+    return geodetic if authority is None else CRS.from_authority(*authority)
 
 
 @lru_cache(maxsize=32)
@@ -248,145 +252,86 @@ def find_operation(crs: str) -> Transformer | None:
     source = get_geodetic_frame(crs)
     sources = [source] if source.name not in SAME else [source, CRS.from_user_input(SAME[source.name][0])]
     for frame in sources:
-        usable = [t for t in _operations(frame.to_3d(), CRS.from_user_input(WORKING_FRAME)) if t.accuracy <= MODERN_M]
-        if usable:
-            return usable[0]
+        for operation in find_operations(frame.to_3d(), CRS.from_user_input(WORKING_FRAME)).usable:
+            if 0.0 <= operation.accuracy <= MODERN_M:
+                return operation
     return None
 
 
-def operations_between(source: CRS, target: CRS | str, area: Any = None) -> TransformerGroup:
-    """Return what PROJ knows between two systems over an area; grids that are not installed are no warning."""
+@dataclass(frozen=True, kw_only=True)
+class Operations:
+    """What PROJ knows between two systems over a box: usable operations, best first, and those that lack grids."""
+
+    usable: tuple[Transformer, ...]
+    lacking: tuple[Any, ...] = ()
+
+    def describe_lacking(self, crs: str | None = None) -> str:
+        """Return the most accurate operation that lacks a grid, and how to get that; empty without one."""
+        if not self.lacking:
+            return ""
+        best = min(self.lacking, key=lambda o: (not _is_served(o), known_accuracy_m(o.accuracy)))
+        grids = [grid for grid in best.grids if not grid.available]
+        names = " and ".join(grid.short_name for grid in grids)
+        get = (
+            "; ".join(f"projsync --file {g.short_name}" for g in grids)
+            if _is_served(best)
+            else f"put it in {get_user_data_dir()}"
+        )
+        accuracy = f" ({best.accuracy:g} m)" if best.accuracy >= 0.0 else ""
+        name = name_operation(best.name, crs)
+        return f"{name!r}{accuracy} needs the grid{'s' * (len(grids) > 1)} {names}, not installed ({get})"
+
+
+def _is_served(operation: Any) -> bool:
+    """Return whether PROJ's content delivery network has all grids of an operation."""
+    return all(grid.available or "cdn.proj.org" in grid.url for grid in operation.grids)
+
+
+def name_operation(description: str, crs: str | None = None) -> str:
+    """Return the name of an operation of PROJ from a CRS without the steps that change no datum."""
+    system = None if crs is None else find_crs(crs).to_2d()
+    conversion = None if system is None else system.coordinate_operation
+    left_out = (*_NO_DATUM_CHANGE, *([f"Inverse of {conversion.name}"] if conversion is not None else []))
+    parts = [part for part in description.split(" + ") if not part.startswith(left_out)]
+    return " + ".join(parts) or description
+
+
+def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operations:
+    """Find PROJ's operations between two systems, never a ballpark one; over a box those whose area of use contains it,
+    best first.
+    """
+    area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
+        warnings.simplefilter("ignore", UserWarning)  # of grids that are not installed, which are named here
+        try:
+            group = TransformerGroup(source, target, always_xy=True, allow_ballpark=False, area_of_interest=area)
+        except (ProjError, IndexError):  # IndexError: pyproj cannot make an operation that is known at one epoch alone
+            return Operations(usable=())
+    if box is None:
+        return Operations(usable=tuple(group.transformers), lacking=tuple(group.unavailable_operations))
+    usable = [t for t in group.transformers if contains(t.area_of_use, box) and t.accuracy <= WORST_M]
+    lacking = [o for o in group.unavailable_operations if contains(o.area_of_use, box) and o.grids]
+    return Operations(usable=tuple(sorted(usable, key=rank_operation)), lacking=tuple(lacking))
 
 
-def _operations(source: CRS, target: CRS, *, over: CRS | None = None) -> list[Transformer]:
-    """Transformations of known accuracy that PROJ has between two frames, over the area of use of a third CRS."""
-    area = None if over is None else over.area_of_use
-    within = None if area is None else AreaOfInterest(*area.bounds)
-    try:
-        group = operations_between(source, target, within)
-    except (ProjError, IndexError):  # IndexError: pyproj cannot make an operation that is known at one epoch alone
-        return []
-    return [t for t in group.transformers if t.accuracy >= 0.0]
+def rank_operation(operation: Transformer) -> tuple[bool, float]:
+    """Order operations: those for land, where railways are, first, then by accuracy; ties keep PROJ's order."""
+    area = "" if operation.area_of_use is None else operation.area_of_use.name
+    return "offshore" in area and "onshore" not in area, known_accuracy_m(operation.accuracy)
 
 
-def frame_degrees(crs: str, x: Floats, y: Floats, *, path: str) -> tuple[Floats, Floats, str]:
-    """Return latitude and longitude of map coordinates, and the frame; of an older datum its modern one."""
-    kind = kind_of_frame(crs)
-    frame = _modern_frame(crs)[0] if kind == "older datum" else _find_frame(crs)
-    longitude, latitude = (np.asarray(v, np.float64) for v in _in_plan(crs, frame).transform(x, y))
-    _check_area(crs, latitude, longitude, path=path)
-    if find_crs(crs).is_projected:
-        _check_scale(crs, frame, np.stack([x, y], axis=-1), latitude, longitude, path=path)
-    return latitude, longitude, frame
+def known_accuracy_m(accuracy_m: float) -> float:
+    """Return an accuracy of PROJ, infinite where it is unknown (negative)."""
+    return accuracy_m if accuracy_m >= 0.0 else np.inf
 
 
-def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
-    """Reject points outside the area of use of a CRS's frame, of which a projection may be used beyond its own."""
-    south, north, west, east = _bounds(crs)
-    of_latitude = south <= latitude_deg.min() and latitude_deg.max() <= north
-    if of_latitude and west <= longitude_deg.min() and longitude_deg.max() <= east:
-        return
-    finite = np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90.0)
-    if not finite.all():
-        raise InputFileError(
-            path, f"some coordinates lie outside the CRS {crs}; give the right one (--crs), in the unit of the file"
-        )
-    geodetic = get_geodetic_frame(crs)
-    outside, area = ~is_in_area(geodetic, latitude_deg, longitude_deg, margin_deg=MARGIN_DEG), geodetic.area_of_use
-    if area is None or not outside.any():
-        return
-    lat, lon = latitude_deg[outside][:1], longitude_deg[outside][:1]
-    swapped = find_crs(crs).is_geographic and is_in_area(geodetic, lon, lat, margin_deg=MARGIN_DEG).all()
-    raise InputFileError(
-        path,
-        f"latitude {lat[0]:.4f}, longitude {lon[0]:.4f} is outside the area of use of {geodetic.name} (latitude "
-        f"{area.south:g} to {area.north:g}, longitude {area.west:g} to {area.east:g}); "
-        + ("latitude and longitude are swapped" if swapped else f"is {crs} the right CRS?"),
-    )
-
-
-@lru_cache(maxsize=64)
-def _bounds(crs: str) -> tuple[float, float, float, float]:
-    """South, north, west and east of the area of use of a CRS's frame, with the margin; nothing lies in it without."""
-    area = get_geodetic_frame(crs).area_of_use
+def contains(area: Any, box: Box) -> bool:
+    """Return whether an area of use contains a box; True for no area."""
     if area is None:
-        return (np.inf, -np.inf, np.inf, -np.inf)
-    return (area.south - MARGIN_DEG, area.north + MARGIN_DEG, area.west - MARGIN_DEG, area.east + MARGIN_DEG)
-
-
-def _check_scale(crs: str, frame: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
-    """Reject points of a grid whose unit of length there is not that of the ground: they are of another grid."""
-    system = find_crs(crs)
-    method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
-    if len(xy) < 2 or method in _UNEVEN:
-        return
-    unit = system.axis_info[0].unit_conversion_factor
-    grid = float(np.hypot(*np.diff(xy, axis=0).T).sum()) * unit
-    ellipsoid = CRS.from_user_input(frame).get_geod()
-    ground = float(ellipsoid.line_length(longitude, latitude)) if ellipsoid is not None else grid
-    if ground > 0.0 and abs(grid / ground - 1.0) > LARGEST_SCALE:
-        raise InputFileError(
-            path,
-            f"the line is {grid:.0f} m long in {system.name}, on the ground there {ground:.0f} m; the "
-            "coordinates are of another grid (--crs)",
-        )
-
-
-@lru_cache(maxsize=32)
-def _in_plan(crs: str, frame: str) -> Transformer:
-    source, target = (CRS.from_user_input(name).to_2d() for name in (crs, frame))
-    return Transformer.from_crs(source, target, always_xy=True)
-
-
-@lru_cache(maxsize=32)
-def _find_frame(crs: str) -> str:
-    geodetic = get_geodetic_frame(crs)
-    authority = geodetic.to_authority()
-    return geodetic.to_wkt() if authority is None else ":".join(authority)
-
-
-@lru_cache(maxsize=32)
-def _modern_frame(crs: str) -> tuple[str, float]:
-    """Return the modern frame that PROJ reaches best (else WGS 84), and how well [m] (NaN without)."""
-    whole, source = CRS.from_user_input(crs), get_geodetic_frame(crs).to_2d()
-    found = []
-    for code in REGIONAL.values():
-        target = CRS.from_user_input(code)
-        if _share_covered(whole, target) >= _COVERED:
-            found += [(code, t.accuracy) for t in _operations(source, target.to_2d(), over=whole)[:1]]
-    world = [("EPSG:4326", t.accuracy) for t in _operations(source, CRS.from_user_input(4326), over=whole)[:1]]
-    return min(found + world, key=lambda item: item[1], default=("EPSG:4326", np.nan))
-
-
-def _share_covered(crs: CRS, other: CRS) -> float:
-    """Return the share of the area of use of a CRS, in degrees, that another's covers; 0 where either is unknown."""
-    area, by = crs.area_of_use, other.area_of_use
-    if area is None or by is None:
-        return 0.0
-    width, span = (area.east - area.west) % 360.0, (by.east - by.west) % 360.0
-    start = (by.west - area.west) % 360.0
-    common = max(0.0, min(width, start + span) - start) + max(0.0, min(width, start + span - 360.0))
-    high = max(0.0, min(area.north, by.north) - max(area.south, by.south))
-    return (common * high) / max(width * (area.north - area.south), 1e-9)
-
-
-@lru_cache(maxsize=32)
-def older_datum_note(crs: str | None) -> tuple[str, ...]:
-    """Return a note on the transformation of a map in an older datum; none for other maps."""
-    if crs is None or kind_of_frame(crs) != "older datum":
-        return ()
-    code, accuracy = _modern_frame(crs)
-    name, to = get_geodetic_frame(crs).name, CRS.from_user_input(code).name
-    size = f"with an accuracy of {accuracy:g} m" if np.isfinite(accuracy) else "with unknown accuracy"
-    older = "is an older datum, transformed" if not accuracy <= MODERN_M else "is transformed"
-    grid = ""
-    plan = get_geodetic_frame(crs).to_2d(), CRS.from_user_input(code).to_2d()
-    if not accuracy <= MODERN_M and operations_between(*plan).unavailable_operations:
-        grid = "; a grid that PROJ knows of would be better and is not installed (projsync)"
-    return (f"map: {name} {older} to {to} by PROJ {size}{grid}",)
+        return True
+    south, north, west, east = box
+    corners = np.array([south, north]), np.array([west, east])
+    return bool(_in_bounds((area.south, area.north, area.west, area.east), *corners, 1e-6).all())
 
 
 def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_deg: float) -> Masks:
@@ -394,8 +339,14 @@ def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_
     area = crs.area_of_use
     if area is None:
         return np.ones(len(latitude_deg), dtype=bool)
-    inside = (latitude_deg >= area.south - margin_deg) & (latitude_deg <= area.north + margin_deg)
-    width = (area.east - area.west) % 360.0 if area.east - area.west < 360.0 else 360.0
+    return _in_bounds((area.south, area.north, area.west, area.east), latitude_deg, longitude_deg, margin_deg)
+
+
+def _in_bounds(bounds: Box, latitude_deg: Floats, longitude_deg: Floats, margin_deg: float) -> Masks:
+    """Return which points lie within bounds, also across the date line, with a margin."""
+    south, north, west, east = bounds
+    inside = (latitude_deg >= south - margin_deg) & (latitude_deg <= north + margin_deg)
+    width = (east - west) % 360.0 if east - west < 360.0 else 360.0
     with np.errstate(invalid="ignore"):  # outside a grid there is no longitude
-        from_west = (longitude_deg - area.west + margin_deg) % 360.0
+        from_west = (longitude_deg - west + margin_deg) % 360.0
     return np.asarray(inside & (from_west <= width + 2.0 * margin_deg))

@@ -9,17 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from pyproj import CRS, Transformer
+from scipy.integrate import cumulative_simpson
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
-from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, frame_degrees, is_in_area, unit_of_grid
-from railfix.track.frames import heights_of_file
+from railfix.track.crs import LARGEST_SCALE, MARGIN_DEG, is_in_area, unit_of_grid
+from railfix.track.georeference import Georeference, georeference
+from railfix.track.heights import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
+from railfix.track.transitions import OrdinateElement
 
 #: Share of the change of curvature or cant at a share t of the element, and its integral from 0 (IFC 4.3.2).
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
@@ -44,6 +48,7 @@ _PIECE_RAD: Final = 0.5  #: Longest piece of one quadrature [rad of direction]; 
 #: Steps of points of an alignment: chords stay within 1 cm of arcs down to 100 m radius.
 _CHORD_M: Final = 0.01
 _LONGEST_M: Final = 25.0
+_CLOTHOID_POINTS: Final = 2001  #: Points of a clothoid of the profile, between which it is linear within 1 um.
 _JOINT_M: Final = 0.01  #: Elements that begin further than this from the end of the one before are reported [m].
 
 
@@ -93,9 +98,35 @@ class PlanElement:
         return np.stack([(half * _WEIGHTS * part(direction)).sum(axis=1) for part in (np.cos, np.sin)], axis=-1)
 
 
+#: An element in plan: by a law of the curvature over its length, or by ordinates over the tangent.
+Plan = PlanElement | OrdinateElement
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Kilometrage of an alignment: places in plan with the station just before and just after each, rising [m]."""
+
+    rows: tuple[tuple[float, float, float], ...]
+    last_sign: float = 1.0  #: 1 where stations rise after the last row, -1 where they fall.
+    jump_m: float = 0.05  #: Half the length over which the kilometrage of points jumps.
+
+    @property
+    def places_m(self) -> Floats:
+        """Places in plan of points on both sides of each jump."""
+        place = np.array([row[0] for row in self.rows[1:]])
+        return np.concatenate([place - self.jump_m, place + self.jump_m])
+
+    def at(self, place_m: Floats) -> Floats:
+        """Return the stations at places in plan."""
+        place, _, ahead = np.array(self.rows).T
+        row = np.clip(np.searchsorted(place, place_m, side="right") - 1, 0, len(place) - 1)
+        signs = [*(np.sign(b[1] - a[2]) or 1.0 for a, b in pairwise(self.rows)), self.last_sign]
+        return np.asarray(ahead[row] + np.array(signs)[row] * (place_m - place[row]))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ProfileElement:
-    """One element of the profile: gradient, circular arc or parabola."""
+    """One element of the profile: gradient, circular arc, parabola or clothoid."""
 
     #: Place and length in plan.
     start_m: float
@@ -104,7 +135,9 @@ class ProfileElement:
     #: Gradient at the ends [m/m].
     first: float
     last: float
-    arc: str = "parabola"  #: ``"circle"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
+    #: ``"circle"``, ``"clothoid"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
+    arc: str = "parabola"
+    bend: float = 0.0  #: Of a clothoid: curvature at the start, positive in a sag [1/m].
 
     def height_at(self, place_m: Floats) -> Floats:
         """Return the height [m] at places in plan."""
@@ -112,6 +145,9 @@ class ProfileElement:
         if self.arc == "parabola" or self.first == self.last:
             bend = (self.last - self.first) * way**2 / (2.0 * self.length_m)
             return np.asarray(self.height_m + self.first * way + bend)
+        if self.arc == "clothoid":
+            place, height, _ = self._clothoid
+            return np.asarray(self.height_m + np.interp(way, place, height))
         sine = _sine(self.first) + (_sine(self.last) - _sine(self.first)) * way / self.length_m
         radius = self.length_m / (_sine(self.last) - _sine(self.first))
         return np.asarray(self.height_m - radius * (np.sqrt(1.0 - sine**2) - np.sqrt(1.0 - _sine(self.first) ** 2)))
@@ -121,8 +157,23 @@ class ProfileElement:
         share = (place_m - self.start_m) / self.length_m
         if self.arc == "parabola" or self.first == self.last:
             return np.asarray(self.first + (self.last - self.first) * share)
+        if self.arc == "clothoid":
+            place, _, gradient = self._clothoid
+            return np.asarray(np.interp(share * self.length_m, place, gradient))
         sine = _sine(self.first) + (_sine(self.last) - _sine(self.first)) * share
         return np.asarray(sine / np.sqrt(1.0 - sine**2))
+
+    @cached_property
+    def _clothoid(self) -> tuple[Floats, Floats, Floats]:
+        """Places, heights over the start and gradients of a clothoid: its angle turns by a square of its length."""
+        start, turn = np.arctan(self.first), np.arctan(self.last) - np.arctan(self.first)
+        length = self.length_m
+        for _ in range(20):  # the length along the curve whose projection is that in plan
+            way = np.linspace(0.0, length, _CLOTHOID_POINTS)
+            angle = start + self.bend * way + (turn - self.bend * length) * (way / length) ** 2
+            place, height = (cumulative_simpson(part(angle), x=way, initial=0.0) for part in (np.cos, np.sin))
+            length *= self.length_m / place[-1]
+        return np.asarray(place), np.asarray(height), np.tan(angle)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +210,7 @@ class AlignmentPoints:
 
 
 def alignment_at(
-    place_m: Floats, plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
+    place_m: Floats, plan: Sequence[Plan], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
 ) -> AlignmentPoints:
     """Return points of an alignment at lengths in plan (n,), each by the first point of its own element."""
     starts = plan_starts(plan)
@@ -181,7 +232,7 @@ def alignment_at(
     )
 
 
-def plan_starts(plan: Sequence[PlanElement]) -> Floats:
+def plan_starts(plan: Sequence[Plan]) -> Floats:
     """Return the length in plan at the start of each element, shape (elements,) [m]."""
     return np.cumsum([0.0, *(element.length_m for element in plan)])[:-1]
 
@@ -195,12 +246,17 @@ def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[M
 
 
 def alignment_points(
-    plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
+    plan: Sequence[Plan],
+    profile: Sequence[ProfileElement],
+    cant: Sequence[CantElement],
+    at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Points of an alignment such that chords stay within 1 cm of its arcs, and notes on joints that do not meet."""
+    """Points of an alignment such that chords stay within 1 cm of its arcs, and some places more; notes on joints that
+    do not meet.
+    """
     starts = plan_starts(plan)
     length = starts[-1] + plan[-1].length_m
-    places = [np.array([0.0, length])]
+    places = [np.array([0.0, length]), np.asarray(at_m, dtype=np.float64)]
     for element, start in zip(plan, starts, strict=True):
         bend = max(abs(element.first), abs(element.last))
         step = min(_LONGEST_M, np.sqrt(8.0 * _CHORD_M / bend)) if bend else _LONGEST_M
@@ -221,24 +277,33 @@ def alignment_points(
 _PROFILE_BEYOND_M: Final = 50.0  #: Longest part of an alignment to which its profile is extended [m].
 
 
+@dataclass(frozen=True, kw_only=True)
+class Design:
+    """Elements of one alignment, in the order of the line, and its stations."""
+
+    plan: Sequence[Plan]
+    profile: Sequence[ProfileElement] = ()
+    cant: Sequence[CantElement] = ()
+    stations: Stations | None = None
+
+
 def segment_of_design(
     *,
     path: str,
     name: str,
-    plan: Sequence[PlanElement],
-    profile: Sequence[ProfileElement],
-    cant: Sequence[CantElement],
+    design: Design,
     reading: MapReading,
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
     """Return the points of one alignment; `grid`: easting, northing, height, cosine, sine, scale of the file."""
+    plan, profile, stations = design.plan, design.profile, design.stations
     if not plan:
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
     crs = reading.crs
     if crs is None:
         raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give --crs")
-    points, joints = alignment_points(plan, profile, cant)
+    points, joints = alignment_points(plan, profile, design.cant, at_m=() if stations is None else stations.places_m)
     xy, up, scale = points.xy_m, 0.0, 1.0
     unit = unit_of_grid(crs, path=path)
     if grid is not None:
@@ -248,21 +313,21 @@ def segment_of_design(
         xy = np.array([east, north]) + scale * xy @ np.array([[cosine, sine], [-sine, cosine]])
     xy /= unit
     curvature = points.curvature
-    if grid is None and _within(crs, xy[:, ::-1]) and not _within(crs, xy):
+    if grid is None and is_within(crs, xy[:, ::-1]) and not is_within(crs, xy):
         # northing before easting turns the plane over, so a curve to the left in the file is one to the right
         xy, curvature = xy[:, ::-1], -curvature
         joints = (*joints, f"{name}: the file has northing before easting")
     source, heights = f"{path} ({name})", None
-    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1], path=source)
-    _check_length(plan, frame, latitude, longitude, path=source)
+    place = georeference(crs, xy[:, 0], xy[:, 1], path=source)
+    _check_length(plan, place, path=source)
     if profile:
         joints += _check_profile(plan, profile, path=source)
-        heights = heights_of_file(points.height_m + up, latitude, longitude, reading, path=path)
-    radius = np.full(len(latitude), np.inf)
+        heights = heights_of_file(points.height_m + up, place, reading, path=path)
+    radius = np.full(len(xy), np.inf)
     bent = np.abs(curvature) > 1e-9
     radius[bent] = -1.0 / curvature[bent] * scale
     return make_segment(
-        (latitude, longitude, frame),
+        place,
         heights,
         source=source,
         file=path,
@@ -273,11 +338,12 @@ def segment_of_design(
             "cant_m": points.cant_m * _side_of_curve(curvature, bent),
             "radius_m": radius,
             "gradient_permille": points.gradient * 1e3,
+            **({} if stations is None else {"kilometrage_m": stations.at(points.place_m)}),
         },
     )
 
 
-def _check_profile(plan: Sequence[PlanElement], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
+def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
     """Reject a profile that leaves out more of the plan than `_PROFILE_BEYOND_M`; note what it leaves out."""
     length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
     high = max(element.start_m + element.length_m for element in profile)
@@ -288,11 +354,11 @@ def _check_profile(plan: Sequence[PlanElement], profile: Sequence[ProfileElement
     return (f"{path}: {where}; its last gradients go on",) if left_out > 1.0 else ()
 
 
-def _check_length(plan: Sequence[PlanElement], frame: str, latitude: Floats, longitude: Floats, *, path: str) -> None:
+def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> None:
     """Reject an alignment whose length on the map is not that of its design: its grid is another one."""
     designed = sum(element.length_m for element in plan)
-    geod = CRS.from_user_input(frame).get_geod()
-    found = float(geod.line_length(longitude, latitude)) if geod is not None else designed
+    geod = CRS.from_user_input(place.frame).get_geod()
+    found = float(geod.line_length(place.longitude_deg, place.latitude_deg)) if geod is not None else designed
     if abs(found - designed) > LARGEST_SCALE * designed + 0.5:
         raise InputFileError(
             path,
@@ -312,7 +378,7 @@ def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
     return np.asarray(np.sign(curvature[bent])[np.where(nearer, before, nearest)])
 
 
-def _within(crs: str, xy: Floats) -> bool:
+def is_within(crs: str, xy: Floats) -> bool:
     """Return whether coordinates lie in the area of use of a CRS; True where it has none."""
     system = CRS.from_user_input(crs)
     if system.area_of_use is None:

@@ -23,6 +23,13 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 #: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 _TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
+#: Positions beside those before and after, within a time [s], by more than a distance [m] and this many medians of such
+#: distances are outliers; they are looked for anew without them, in some rounds, where there are enough positions.
+_NEAR_S: Final = 2.5
+_BESIDE_M: Final = 5.0
+_BESIDE_MEDIANS: Final = 6.0
+_ROUNDS: Final = 20
+_ENOUGH: Final = 10
 _STANDING_WINDOW_S: Final = 3.0  #: Half of the window of the displacement.
 
 
@@ -85,6 +92,8 @@ def thin(
     rows = np.flatnonzero(good)
     reachable = _reachable(time[rows], ecef_m[rows], limits)
     rows, out_of_reach = rows[reachable], int(np.count_nonzero(~reachable))
+    beside = _outliers(time[rows], ecef_m[rows])
+    rows, wrong = rows[~beside], int(np.count_nonzero(beside))
     stands = stationary(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=_STANDING_WINDOW_S)
     stands = _with_short_moves(ecef_m[rows], stands, limits.spacing_m)
     moving = rows[~stands]
@@ -104,6 +113,7 @@ def thin(
             "without a position": int((~finite).sum()),
             "of insufficient quality": int((finite & ~good).sum()),
             "out of reach of the others": out_of_reach,
+            "beside those before and after": wrong,
             "standing still": int(stands.sum()),
             "nearer than the spacing": len(moving) - len(kept),
         },
@@ -141,6 +151,32 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
         if possible(end - 1, low):
             kept[first:end], low = True, first
     return kept
+
+
+def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
+    """Flag positions beside the line between those before and after them, no more than `_NEAR_S` away: by more than
+    `_BESIDE_M` and `_BESIDE_MEDIANS` medians of all such distances, the farthest first.
+    """
+    wrong = np.zeros(len(time), dtype=np.bool_)
+    if len(time) < _ENOUGH or np.isnat(time).any():
+        return wrong
+    elapsed = seconds(time - time[0])
+    for _ in range(_ROUNDS):
+        rows = np.flatnonzero(~wrong)
+        if len(rows) < _ENOUGH:
+            break
+        t, points = elapsed[rows], ecef_m[rows]
+        before, after = t[1:-1] - t[:-2], t[2:] - t[1:-1]
+        share = (before / np.maximum(before + after, 1e-9))[:, None]
+        off = np.linalg.norm(points[1:-1] - points[:-2] * (1.0 - share) - points[2:] * share, axis=1)
+        off[np.maximum(before, after) > _NEAR_S] = 0.0
+        limit = max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(off)))
+        around = np.pad(off, 1)
+        farthest = (off > limit) & (off >= around[:-2]) & (off > around[2:])
+        if not farthest.any():
+            break
+        wrong[rows[1:-1][farthest]] = True
+    return wrong
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:

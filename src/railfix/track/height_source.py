@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
 from railfix.core.arrays import Floats, places_in_groups
 from railfix.core.errors import InputFileError, SettingsError
@@ -17,8 +17,9 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
-from railfix.track.frames import GEOIDS, ellipsoidal_heights, own_height_datum
 from railfix.track.from_positions import SIGMA_OF_QUALITY
+from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference, to_map
+from railfix.track.heights import GEOIDS, ellipsoidal_heights, own_height_datum
 from railfix.track.track import SIGMA_HEIGHT_M, Track
 from railfix.track.trajectory import NearestOnPolyline
 
@@ -124,11 +125,9 @@ def _from_raster(
     """Return the heights of a raster at the points of the track, linear between the middles of its cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
     with _open_raster(path) as (raster, crs):
-        height_datum, geoid = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
-        to_raster = Transformer.from_crs(
-            CRS.from_user_input(track.provenance.frame).to_2d(), crs.to_2d(), always_xy=True
-        )
-        x, y = (np.asarray(v) for v in to_raster.transform(track.longitude_deg, track.latitude_deg))
+        datum, model = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
+        place = _place(track)
+        x, y = to_map(crs.to_2d().to_wkt(), place, path=str(path))
         turn = ~raster.transform
         column, row = turn.a * x + turn.b * y + turn.c, turn.d * x + turn.e * y + turn.f
         heights = _sample(raster, np.stack([row, column]) - 0.5)
@@ -139,13 +138,12 @@ def _from_raster(
             f"{len(missing)} of {len(track)} points of the map have no height, the first at chainage "
             f"{track.chainage_m[missing[0]]:.0f} m; give a raster of the whole line",
         )
-    degrees = track.latitude_deg, track.longitude_deg
-    height, model = ellipsoidal_heights(heights, *degrees, datum=str(height_datum), geoid=geoid, path=str(path))
+    above = ellipsoidal_heights(heights, place, datum=str(datum), geoid=model, path=str(path))
     note = (
         f"heights of the raster {path}, sigma {sigma_m or 0.0:.2f} m: those of the ground, which on bridges and in "
         "tunnels are not the track's"
     )
-    return _replace(track, height, float(sigma_m or 0.0), str(height_datum), model, note)
+    return _replace(track, above, float(sigma_m or 0.0), note)
 
 
 def _sample(raster: Any, place: Floats) -> Floats:
@@ -181,16 +179,18 @@ def _from_profile(track: Track, table: NamedColumns, geoid: str | None, sigma_m:
             f"the profile runs from {known[0]:g} to {known[-1]:g} m, the map from {places.min():.1f} to "
             f"{places.max():.1f} m",
         )
-    heights, degrees = np.interp(places, known, heights), (track.latitude_deg, track.longitude_deg)
-    height, model = ellipsoidal_heights(heights, *degrees, datum=datum, geoid=geoid, path=table.path)
+    heights = np.interp(places, known, heights)
+    above = ellipsoidal_heights(heights, _place(track), datum=datum, geoid=geoid, path=table.path)
     if sigma_m is not None:
         sigma = sigma_m
     elif "sigma_m" in table:
         sigma = float(np.max(table.numbers("sigma_m")))
     else:
         sigma = float(table.metadata.get("sigma_m", SIGMA_HEIGHT_M))
+    if sigma_m is None and above.accuracy_m >= NEGLIGIBLE_M:
+        sigma = float(np.hypot(sigma, above.accuracy_m))
     note = f"heights of the profile {table.path} by {by}, sigma {sigma:.2f} m"
-    return _replace(track, height, sigma, datum, model, note)
+    return _replace(track, above, sigma, note)
 
 
 def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, reach_m: float) -> Track:
@@ -220,7 +220,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
         f"heights of the antenna positions {log.path}, sigma {spread:.2f} m: use the map without a vehicle file, or "
         "lower it by the height of that antenna"
     )
-    return _replace(track, fitted, spread, "ellipsoidal", "", note)
+    return _replace(track, EllipsoidalHeights(height_m=fitted, datum="ellipsoidal"), spread, note)
 
 
 def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, reach_m: float) -> Floats:
@@ -258,6 +258,14 @@ def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, 
     return fitted
 
 
-def _replace(track: Track, height: Floats, sigma: float, datum: str, geoid: str, note: str) -> Track:
-    provenance = replace(track.provenance, height_datum_used=datum, geoid=geoid, notes=(*track.provenance.notes, note))
-    return replace(track, height_m=height, sigma_height_m=sigma, provenance=provenance)
+def _place(track: Track) -> Georeference:
+    """Return the points of a track in plan."""
+    return Georeference(
+        latitude_deg=track.latitude_deg, longitude_deg=track.longitude_deg, frame=track.provenance.frame
+    )
+
+
+def _replace(track: Track, heights: EllipsoidalHeights, sigma: float, note: str) -> Track:
+    notes = (*track.provenance.notes, note, *heights.notes)
+    provenance = replace(track.provenance, height_datum_used=heights.datum, geoid=heights.geoid, notes=notes)
+    return replace(track, height_m=heights.height_m, sigma_height_m=sigma, provenance=provenance)

@@ -11,8 +11,17 @@ import numpy as np
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, read_text
 from railfix.track.crs import LARGEST_SCALE, choose_crs
-from railfix.track.elements import CantElement, PlanElement, ProfileElement, plan_starts, segment_of_design
+from railfix.track.elements import (
+    CantElement,
+    Design,
+    Plan,
+    PlanElement,
+    ProfileElement,
+    plan_starts,
+    segment_of_design,
+)
 from railfix.track.route import MapReading, Segment
+from railfix.track.transitions import cubic_of_length
 
 _LAWS: Final = {
     "LINE": "linear",
@@ -23,10 +32,14 @@ _LAWS: Final = {
     "SINECURVE": "sine",
     "HELMERTCURVE": "helmert",
     "VIENNESEBEND": "viennese",
+    "CUBIC": "cubic",
     "CONSTANTCANT": "linear",
     "LINEARTRANSITION": "linear",
 }
-_ARCS: Final = {"CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle"}
+_ARCS: Final = {
+    "CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle", "CLOTHOID": "clothoid",
+}  # fmt: skip
+_SIMILAR_M: Final = 1e-3  #: A form of the cubic parabola whose end is nearer to the next element by more is taken [m].
 _TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
 _PREFIX: Final = {"None": 1.0, "MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "DECA": 10.0, "HECTO": 100.0, "KILO": 1e3}
 
@@ -115,7 +128,7 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
         try:
             plan = [_plan(step, e, scale, angle) for e in elements["IFCALIGNMENTHORIZONTAL"]]
             heights = [e.values[7] for e in elements["IFCALIGNMENTHORIZONTAL"]]
-            profile = [_profile(step, e, scale) for e in elements.get("IFCALIGNMENTVERTICAL", [])]
+            profile = _with_bends([_profile(step, e, scale) for e in elements.get("IFCALIGNMENTVERTICAL", [])])
             cant = [_cant(step, e, scale) for e in elements.get("IFCALIGNMENTCANT", [])]
             if cant:
                 gauge = step.at(layouts["IFCALIGNMENTCANT"], what="IFCALIGNMENTCANT").values[-1] * scale
@@ -125,21 +138,24 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
                 path, f"alignment {name!r}: a segment lacks a number that IFC 4.3 requires, or it is none"
             ) from None
         uneven = sum(_is_uneven(e) for e in elements.get("IFCALIGNMENTCANT", []))
-        notes = (
-            (f"{uneven} segments of constant cant have two values and are taken as linear transitions",)
-            if uneven
-            else ()
-        )
+        notes: tuple[str, ...] = ()
+        if uneven:
+            notes = (f"{uneven} segments of constant cant have two values and are taken as linear transitions",)
+        graded = sum(_is_graded(e) for e in elements.get("IFCALIGNMENTVERTICAL", []))
+        if graded:
+            notes += (f"{graded} segments of constant gradient have two values, of which the first is taken",)
         xy, system = _map_conversion(step, scale)
         placement = _place(step, alignment, step.at(layouts["IFCALIGNMENTHORIZONTAL"], what="a layout"), scale)
-        plan, profile = _move(plan, profile, placement)
+        moved, profile = _move(_with_cubics(plan, path=str(path), name=str(name)), profile, placement)
         segments.append(
             segment_of_design(
                 path=str(path),
                 name=str(name),
-                plan=[p for p in plan if p.length_m > 0.0],
-                profile=[p for p in profile if p.length_m > 0.0],
-                cant=[c for c in cant if c.length_m > 0.0],
+                design=Design(
+                    plan=[p for p in moved if p.length_m > 0.0],
+                    profile=[p for p in profile if p.length_m > 0.0],
+                    cant=[c for c in cant if c.length_m > 0.0],
+                ),
                 reading=replace(reading, crs=choose_crs(path, reading.crs, system)),
                 grid=xy,
                 notes=notes,
@@ -228,9 +244,44 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
     return found
 
 
-def _move(
-    plan: list[PlanElement], profile: list[ProfileElement], at: _Placement
-) -> tuple[list[PlanElement], list[ProfileElement]]:
+def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]:
+    """Return the elements, cubic parabolas as ordinates over the tangent: that of IFC 4.3 (``y = x^3 / (6 R L)``), or
+    the one of the projected length or of Japan's correction where the next element begins at its end.
+    """
+    result: list[Plan] = []
+    for element, after in zip(plan, [*plan[1:], None], strict=True):
+        if element.law != "cubic" or element.length_m <= 0.0:
+            result.append(element)
+            continue
+        if (element.first == 0.0) == (element.last == 0.0):
+            raise InputFileError(path, f"alignment {name!r}: a cubic transition between two curves is not read")
+        own = {key: getattr(element, key) for key in ("x_m", "y_m", "direction_rad", "first", "last", "length_m")}
+        forms = [cubic_of_length(**own, variant=variant) for variant in ("length", "tangent", "corrected")]
+        gaps = [0.0] * len(forms)
+        if after is not None:
+            ends = [form.place_at(np.array([form.length_m]))[0] for form in forms]
+            gaps = [float(np.hypot(*(end - (after.x_m, after.y_m)))) for end in ends]
+        best = int(np.argmin(gaps))
+        result.append(forms[best] if gaps[best] < gaps[0] - _SIMILAR_M else forms[0])
+    return result
+
+
+def _with_bends(profile: list[ProfileElement]) -> list[ProfileElement]:
+    """Return the elements, clothoids with the curvature of the element before them at their start."""
+    result: list[ProfileElement] = []
+    bend = 0.0
+    for element in profile:
+        turn = np.arctan(element.last) - np.arctan(element.first)
+        if element.arc == "clothoid":
+            result.append(replace(element, bend=bend))
+            bend = 2.0 * turn / element.length_m - bend
+        else:
+            result.append(element)
+            bend = turn / element.length_m if element.length_m > 0.0 else bend
+    return result
+
+
+def _move(plan: list[Plan], profile: list[ProfileElement], at: _Placement) -> tuple[list[Plan], list[ProfileElement]]:
     """Return the elements in the coordinates of the project."""
     moved = []
     for element in plan:
@@ -280,6 +331,8 @@ def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement
 def _profile(step: _Step, entity: _Entity, scale: float) -> ProfileElement:
     start, length, height, first, last = entity.values[2:7]
     arc = _law(step, entity, _ARCS)
+    if entity.values[-1] == ".CONSTANTGRADIENT.":
+        last = first
     return ProfileElement(
         start_m=start * scale, length_m=length * scale, height_m=height * scale, first=first, last=last, arc=arc
     )
@@ -295,6 +348,10 @@ def _cant(step: _Step, entity: _Entity, scale: float) -> CantElement:
         right_m=(right * scale, (right if right_end is None else right_end) * scale),
         law=law,
     )
+
+
+def _is_graded(entity: _Entity) -> bool:
+    return bool(entity.values[-1] == ".CONSTANTGRADIENT." and entity.values[5] != entity.values[6])
 
 
 def _is_uneven(entity: _Entity) -> bool:

@@ -23,8 +23,9 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
 from railfix.io.mate import mate_table, read_mate
 from railfix.io.named_columns import read_named_columns
-from railfix.track.crs import choose_crs, frame_degrees
-from railfix.track.elements import CantElement, PlanElement, ProfileElement, plan_starts, segment_of_design
+from railfix.track.crs import choose_crs
+from railfix.track.elements import CantElement, Design, PlanElement, ProfileElement, plan_starts, segment_of_design
+from railfix.track.georeference import EllipsoidalHeights, georeference
 from railfix.track.route import MapReading, Segment, make_segment
 
 #: CRS of coordinates in degrees with their ellipsoidal height (ETRS89).
@@ -51,8 +52,8 @@ def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapRe
     crs = reading.crs or _ETRS89
     source, radius = f"{path} ({edge})", values["RADIUS"]
     return make_segment(
-        frame_degrees(crs, values["LONGITUDE_ETRS89"], values["LATITUDE_ETRS89"], path=source),
-        (values["ALTITUDE_ETRS89"], "", "ellipsoidal"),
+        georeference(crs, values["LONGITUDE_ETRS89"], values["LATITUDE_ETRS89"], path=source),
+        EllipsoidalHeights(height_m=values["ALTITUDE_ETRS89"], datum="ellipsoidal"),
         source=source,
         file=str(path),
         crs=crs,
@@ -90,9 +91,8 @@ def read_mate_segments(path: FilePath, reading: MapReading) -> list[Segment]:
         plan = _plan(str(path), edge, rows)
         profile = [_profile(str(path), row) for row in gradients.get(edge, [])]
         cant = [_cant(str(path), row, plan) for row in cants.get(edge, [])]
-        found.append(
-            segment_of_design(path=str(path), name=edge, plan=plan, profile=profile, cant=cant, reading=of_edge)
-        )
+        design = Design(plan=plan, profile=profile, cant=cant)
+        found.append(segment_of_design(path=str(path), name=edge, design=design, reading=of_edge))
     return found
 
 

@@ -178,6 +178,11 @@ class Network:
         """Standard deviation of the tracks in plan: the worst that the files state, else that of a surveyed map."""
         return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
 
+    @cached_property
+    def datum_plan_m(self) -> float:
+        """Standard deviation of the transformation of the tracks from their datum, in the one above [m]."""
+        return max(track.datum_plan_m for track in self.tracks)
+
     @property
     def named(self) -> bool:
         """Whether the files name the frame."""

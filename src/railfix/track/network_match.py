@@ -20,7 +20,15 @@ from railfix.track.network import Candidates, Network
 from railfix.track.network_decode import Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M
 
-SIGMA_M: Final = 2.0  #: Standard deviation of the distance of a position from its track where its log states none [m].
+#: Standard deviation of the distance of a position from its track where its log states none and none can be estimated,
+#: and the least that is estimated [m].
+SIGMA_M: Final = 4.0
+_LEAST_SIGMA_M: Final = 1.0
+_ALONE_M: Final = 15.0  #: Distance of the next track from a position by which sigmas are estimated [m].
+#: Positions farther from the track than this, and than their noise so many times, are beside it for another reason [m].
+_LARGEST_LEVEL_M: Final = 5.0
+_BESIDE: Final = 3.0
+_ENOUGH: Final = 30  #: Positions that an estimate needs.
 #: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map, antenna height.
 _COMMON_M: Final = 2.0
 _COMMON_UP_M: Final = 4.0
@@ -39,13 +47,14 @@ _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
 #: What stands where a position was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
+_STEP_S: Final = 0.4  #: Time between positions that state none, or one before the last [s].
 _MOST_TRACKS: Final = 16  #: Tracks near a position that are looked at.
 _APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each other for which heights count [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLog(RowArrays):
-    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None without any."""
+    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None or NaN without any."""
 
     path: str
     time: Datetimes
@@ -97,7 +106,7 @@ def _check_region(network: Network, log: PlanLog) -> None:
 class Matched:
     """Positions on a network, n rows; `track` is the most probable sequence (-1: none), `offset_m` in plan, positive to
     the right; `probability` is given the whole log, NaN without or with a wrong position; `probabilities`, shape (n,
-    m), of each candidate, the rest to 1 of no mapped track.
+    m), of each candidate, the rest to 1 of no mapped track; `notes` say what was assumed of the log.
     """
 
     track: Indices
@@ -106,6 +115,7 @@ class Matched:
     probability: Floats
     candidates: Candidates
     probabilities: Floats
+    notes: tuple[str, ...] = ()
 
     def take(self, rows: Indices) -> Matched:
         """Return some of the positions."""
@@ -162,8 +172,7 @@ def match(
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):
         raise MismatchError(f"{log.path}: has no position")
-    sigma = np.full(len(given), sigma_m) if sigma_m is not None else np.hypot(log.sigma_m[given], network.sigma_plan_m)
-    sigma = np.where(np.isfinite(sigma), sigma, SIGMA_M)
+    sigma, notes = _sigma(network, log, given, sigma_m)
     if within_m is None:
         within_m = float(np.clip(_WITHIN_SIGMAS * np.quantile(sigma, 1.0 - _BEST), _WITHIN_M, _FARTHEST_M))
     candidates = _candidates(network, log.latitude_deg[given], log.longitude_deg[given], within_m)
@@ -186,8 +195,49 @@ def match(
         probability=gamma[rows, path],
         candidates=candidates,
         probabilities=gamma[:, :most],
+        notes=(*notes, *_time_notes(log, given)),
     )
     return found if len(given) == len(log.time) else _spread(found, given, len(log.time))
+
+
+def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None) -> tuple[Floats, tuple[str, ...]]:
+    """Return standard deviations of the distances of positions from their track, and a note where they are assumed."""
+    if sigma_m is not None:
+        return np.full(len(given), sigma_m), ()
+    stated = np.isfinite(log.sigma_m[given])
+    sigma = np.hypot(log.sigma_m[given], network.sigma_plan_m)
+    if stated.all():
+        return sigma, ()
+    estimate, how = _estimate_sigma(network, log, given[~stated])
+    note = f"{log.path}: {int((~stated).sum())} positions state no sigma, {estimate:.1f} m is taken{how} (--sigma)"
+    return np.where(stated, sigma, estimate), (note,)
+
+
+def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
+    """Return the standard deviation of distances by their median where one track alone is near, and how it was found.
+
+    Where tracks lie beside each other, errors of the positions cannot be told from another track.
+    """
+    latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
+    near = network.near(latitude, longitude, within_m=_FARTHEST_M, most=2)
+    first, second = np.abs(near.offset_m[:, 0]), np.abs(near.offset_m[:, -1])
+    alone = np.isfinite(first) & (second > first + _ALONE_M) if near.offset_m.shape[1] > 1 else np.isfinite(first)
+    if alone.sum() < _ENOUGH:
+        return SIGMA_M, ", for too few lie where one track alone is near"
+    own = near.offset_m[alone, 0]
+    level, noise = (float(np.median(np.abs(v))) / _NORMAL_MEDIAN for v in (own, np.diff(own) / np.sqrt(2.0)))
+    if level > max(_LARGEST_LEVEL_M, _BESIDE * noise):
+        return max(noise, SIGMA_M / 2.0), ", for they lie beside the tracks"
+    return max(level, _LEAST_SIGMA_M, network.sigma_plan_m), ", by their distances where one track alone is near"
+
+
+def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
+    """Return a note on times that step back."""
+    back = np.flatnonzero(np.diff(log.time[given]) < np.timedelta64(0))
+    if not len(back):
+        return ()
+    first = log.time[given[back[0] + 1]]
+    return (f"{log.path}: the time steps back {len(back)} times, first to {first}; rows are taken in their order",)
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
@@ -261,7 +311,8 @@ def _residuals(
     spread = np.nanmax(above, axis=1, initial=-np.inf) - np.nanmin(above, axis=1, initial=np.inf)
     counts = not np.isnan(network.height_m).any() and bool((spread > _APART_UP_M).any())
     seconds = np.concatenate([[0.0], np.diff(log.time[given]) / np.timedelta64(1, "s")])
-    seconds = np.round(np.where(np.isfinite(seconds), seconds, 0.4), 1).astype(np.float64)
+    # no time, or one that steps back: rows are in the order of travel
+    seconds = np.round(np.where(seconds >= 0.0, seconds, _STEP_S), 1).astype(np.float64)
     weight = np.clip(seconds / correlation_s, 1e-3, 1.0)
     weight[0] = 1.0
     sigma_up = np.full(len(given), np.nan) if log.sigma_up_m is None else log.sigma_up_m[given]
@@ -277,7 +328,8 @@ def _residuals(
         sigma_up_m=sigma_up,
         weight=weight,
         seconds=seconds,
-        common_m=float(min(_COMMON_SHARE * np.quantile(sigma_m, _BEST), _COMMON_M)),
+        # that of the transformation of the map is one of all positions, too
+        common_m=float(np.hypot(min(_COMMON_SHARE * np.quantile(sigma_m, _BEST), _COMMON_M), network.datum_plan_m)),
         common_up_m=max(_COMMON_SHARE * float(np.quantile(sigma_up, _BEST)), _COMMON_UP_M) if counts else 0.0,
     )
 
@@ -292,4 +344,4 @@ def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
 
     own = {name: over(values, _NO_MATCH[name]) for name, values in vars(matched).items() if name in _NO_MATCH}
     near = {name: over(values, _NO_TRACK[name]) for name, values in vars(matched.candidates).items()}
-    return Matched(**own, candidates=Candidates(**near))
+    return Matched(**own, candidates=Candidates(**near), notes=matched.notes)

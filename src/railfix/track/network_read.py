@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Final
 
 import networkx as nx
@@ -18,7 +19,7 @@ from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
 from railfix.track.read import read_segments
 from railfix.track.route import MapReading, Segment, first_gap, orient
-from railfix.track.vector_file import read_layers
+from railfix.track.vector_file import CROSSING, read_layers
 from railfix.track.xml_files import FORMATS as RDF_FORMATS
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
@@ -41,9 +42,44 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
+    if all(track.nodes for track in tracks):
+        return _of_nodes(tracks)
     network, cuts = _divide(Network(tracks=tuple(tracks), links=()), tolerance_m)
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
+
+
+def _of_nodes(tracks: list[Segment]) -> Network:
+    """Connect ways of OpenStreetMap at the nodes that they share, inner ones too, and nowhere else."""
+    used = Counter(node for track in tracks for node in track.nodes)
+    parts: list[Segment] = []
+    divided = 0
+    whole = Network(tracks=tuple(tracks), links=())
+    way_of_part: list[int] = []
+    for k, track in enumerate(tracks):
+        inner = [i for i, node in enumerate(track.nodes[1:-1], start=1) if used[node] > 1]
+        divided += bool(inner)
+        along = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
+        bounds = [0, *inner, len(track.nodes) - 1]
+        for number, (low, high) in enumerate(pairwise(bounds), start=1):
+            part = _part(track, along, float(along[low]), float(along[high]), number) if inner else track
+            parts.append(replace(part, nodes=track.nodes[low : high + 1]))
+            way_of_part.append(k)
+    network = Network(tracks=tuple(parts), links=())
+    ends: dict[str, list[tuple[int, int]]] = {}
+    for k, part in enumerate(parts):
+        for end in (0, 1):
+            ends.setdefault(part.nodes[-end], []).append((k, end))
+    _, outward = end_points(network)
+    links = []
+    for node, meeting in ends.items():
+        for (a, first), (b, second) in combinations(meeting, 2):
+            ahead = float(outward[a, first] @ outward[b, second]) < -np.cos(_LARGEST_TURN_RAD)
+            crosses = node.startswith(CROSSING) and way_of_part[a] != way_of_part[b]
+            navigable = ahead and a != b and not crosses
+            links.append(Link(first=a, first_end=first, second=b, second_end=second, navigable=navigable))
+    note = f"connections at the nodes that ways share; {divided} ways divided at inner nodes"
+    return network.connect(tuple(links), note)
 
 
 def _relations(path: FilePath) -> list[Relation]:
@@ -92,6 +128,10 @@ def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tupl
     """Connections of ends that lie within a tolerance; navigable where the direction changes by less than 60 deg."""
     ends, outward = end_points(network)
     pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")
+    level = np.array([track.metadata.get("level", "") for track in network.tracks])
+    # a bridge and a tunnel whose ends meet in plan are not connected; the ground meets either
+    apart = (level[pairs[:, 0] // 2] != level[pairs[:, 1] // 2]) & (level[pairs // 2] != "").all(axis=1)
+    pairs = pairs[~apart]
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     a, b = pairs.T
     facing = np.einsum("ij,ij->i", outward.reshape(-1, 3)[a], outward.reshape(-1, 3)[b])
@@ -119,7 +159,8 @@ def _divide(whole: Network, tolerance_m: float) -> tuple[Network, int]:
     cuts: dict[int, list[float]] = {}
     for end, column in zip(*np.nonzero(near.track >= 0), strict=True):
         other, place = int(near.track[end, column]), float(near.chainage_m[end, column])
-        if other != end // 2 and tolerance_m < place < whole.length_m[other] - tolerance_m:
+        levels = {tracks[k].metadata.get("level", "") for k in (other, end // 2)} - {""}
+        if other != end // 2 and len(levels) < 2 and tolerance_m < place < whole.length_m[other] - tolerance_m:
             cuts.setdefault(other, []).append(place)
     if not cuts:
         return whole, 0

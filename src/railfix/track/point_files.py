@@ -16,8 +16,9 @@ from railfix.core.files import FilePath, read_text, write_whole
 from railfix.core.settings import misspelt
 from railfix.core.tables import plural
 from railfix.io.named_columns import NamedColumns, read_named_columns, with_usual_names
-from railfix.track.crs import choose_crs, find_crs, frame_degrees, unit_of_heights
-from railfix.track.frames import HEIGHT_DATUMS, check_height_datum, ellipsoidal_heights, own_height_datum
+from railfix.track.crs import choose_crs, find_crs, unit_of_heights
+from railfix.track.georeference import EllipsoidalHeights, Georeference, georeference
+from railfix.track.heights import HEIGHT_DATUMS, check_height_datum, ellipsoidal_heights, own_height_datum
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment, make_segment
 from railfix.track.track import Track
 from railfix.track.vector_file import (
@@ -84,8 +85,10 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
 
 
 def _is_no_line(feature: dict[str, Any]) -> bool:
-    """Return whether one of several features is a point or an area, such as a station."""
+    """Return whether one of several features is a point, an area such as a station, or has no geometry."""
     geometry = feature.get("geometry")
+    if geometry is None and "geometry" in feature:
+        return True
     return isinstance(geometry, dict) and geometry.get("type") in ("Point", "MultiPoint", "Polygon", "MultiPolygon")
 
 
@@ -160,8 +163,8 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
         raise InputFileError(path, "the 'crs' member has no properties.name; give --crs") from None
 
 
-def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]:
-    """Return the latitude, longitude and frame of coordinates in easting-northing or longitude-latitude order."""
+def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
+    """Return the places of coordinates in easting-northing or longitude-latitude order."""
     if find_crs(crs, path=path).is_geographic:
         over = np.abs(values[:, 1]) > 90.0
         if over.any() or (np.abs(values[:, 0]) > 360.0).any():
@@ -171,7 +174,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]
                 f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; are they swapped, or is the CRS a "
                 "projected one (give --crs)?",
             )
-    return frame_degrees(crs, values[:, 0], values[:, 1], path=path)
+    return georeference(crs, values[:, 0], values[:, 1], path=path)
 
 
 def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
@@ -192,7 +195,15 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     of_openstreetmap = any(is_of_openstreetmap(line.feature) for line in lines)
     reasons = [no_track(line.feature, of_openstreetmap=of_openstreetmap) for line in lines]
     segments = [_segment(line, used, reading) for line, why in zip(lines, reasons, strict=True) if not why]
-    return with_left_out(path, segments, Counter(why for why in reasons if why))
+    empty = [f"feature {k} without geometry" for k in _without_geometry(document)]
+    return with_left_out(path, segments, Counter([*empty, *(why for why in reasons if why)]))
+
+
+def _without_geometry(document: dict[str, Any]) -> list[int]:
+    """Return the numbers of features whose geometry is null (RFC 7946, 3.2) and that are no connections."""
+    features = [f if isinstance(f, dict) else {} for f in document.get("features") or ()]
+    empty = [f.get("geometry", ...) is None and RELATION not in (f.get("properties") or {}) for f in features]
+    return [number for number, without in enumerate(empty, start=1) if without]
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
@@ -200,7 +211,7 @@ def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> li
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
-        plan_segment(way.points_deg, of_file, path=path, name=own["name"], stated=own)
+        plan_segment(way.points_deg, of_file, path=path, name=own["name"], stated=own, nodes=way.nodes)
         for way, why in ways
         if not why and (own := get_metadata(way.row))
     ]
@@ -217,11 +228,12 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
             f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
             "'railfix map check' lists them all"
         )
-    degrees = _in_frame(line.source, crs, line.coordinates)
+    place = _in_frame(line.source, crs, line.coordinates)
     of_way = get_metadata(line.feature)
     return make_segment(
-        degrees,
-        _heights(line, crs, *degrees[:2], reading) if line.coordinates.shape[1] > 2 else None,
+        place,
+        # heights that are all 0 are none, as in files of other formats
+        _heights(line, crs, place, reading) if line.coordinates[:, 2:].any() else None,
         source=f"{line.path} ({of_way['name']})" if "name" in of_way else line.source,
         file=line.path,
         crs=crs,
@@ -230,10 +242,8 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     )
 
 
-def _heights(
-    line: _GeojsonLine, crs: str, latitude: Floats, longitude: Floats, reading: MapReading
-) -> tuple[Floats, str, str]:
-    """Return the ellipsoidal heights of a line, the geoid used, and the datum of the file."""
+def _heights(line: _GeojsonLine, crs: str, place: Georeference, reading: MapReading) -> EllipsoidalHeights:
+    """Return the ellipsoidal heights of a line."""
     stated = line.text("height_datum")
     if stated is not None and stated not in HEIGHT_DATUMS:
         raise line.error(f"height_datum is {stated!r}; expected 'ellipsoidal' or 'orthometric'")
@@ -245,15 +255,12 @@ def _heights(
     if datum is None:
         raise line.error(f"the height datum is missing; {_DATUM_HELP}")
     geoid_m = line.array("geoid_m", np.nan) if datum == "orthometric" else None
-    if geoid_m is not None and geoid == crs:
+    if geoid_m is not None and not isinstance(geoid, str):
         geoid = None  # of the compound CRS, in place of which the map has its own
     if geoid is None and datum == "orthometric" and geoid_m is None:
         geoid = line.text("geoid")
     stated_m = line.coordinates[:, 2] * unit_of_heights(crs)
-    height, model = ellipsoidal_heights(
-        stated_m, latitude, longitude, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source
-    )
-    return height, model, datum
+    return ellipsoidal_heights(stated_m, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source)
 
 
 #: Attribute of the track, factor, and value of an empty cell, by column of the file.
@@ -303,18 +310,15 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
             "'railfix map check' lists them all",
         )
     crs = choose_crs(path, reading.crs, table.metadata.get("crs"))
-    degrees = _check_degrees(crs, latitude, longitude, path=table.path)
+    place = _place(crs, latitude, longitude, path=table.path)
     geoid, geoid_m = reading.geoid, None
     if datum == "orthometric" and "geoid_m" in table:
         geoid_m = table.numbers("geoid_m")
     elif datum == "orthometric" and geoid is None:
         geoid = table.metadata.get("geoid")
-    height, model = ellipsoidal_heights(
-        heights, *degrees[:2], datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path
-    )
     return make_segment(
-        degrees,
-        (height, model, datum),
+        place,
+        ellipsoidal_heights(heights, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path),
         source=table.path,
         file=table.path,
         crs=crs,
@@ -393,10 +397,10 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
         raise table.error(0, "all coordinates lie within a few degrees of 0, 0: radians were given, degrees expected")
 
 
-def _check_degrees(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats, str]:
-    """Return the degrees of a geographic system, and the modern frame they are in."""
+def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> Georeference:
+    """Return the places of degrees in a geographic system."""
     if crs is None:
-        return latitude, longitude, "EPSG:4979"
+        return Georeference(latitude_deg=latitude, longitude_deg=longitude)
     system = find_crs(crs, path=path)
     if not system.is_geographic:
         raise SettingsError(
@@ -406,7 +410,7 @@ def _check_degrees(crs: str | None, latitude: Floats, longitude: Floats, *, path
     unit = system.axis_info[0].unit_name
     if unit != "degree":
         raise SettingsError(f"{path}: {crs} is {system.name}, in {unit}s, but the columns are in degrees")
-    return frame_degrees(crs, longitude, latitude, path=path)
+    return georeference(crs, longitude, latitude, path=path)
 
 
 def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = None) -> None:

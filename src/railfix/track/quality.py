@@ -21,6 +21,9 @@ Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
 _LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere was meant to be in another unit [m].
 _NEAR_DUPLICATE_M: Final = 0.10  #: Points nearer than this are the same point measured twice.
+_CURVED_1PM: Final = 1 / 3000  #: Curvature of less than this is straight [1/m].
+_ADVERSE_M: Final = 0.005  #: Cant of less than this has no side [m].
+_CENTIMETRE_M: Final = 0.01  #: Distance of a chord from its arc that `needed_spacing_m` is for [m].
 #: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
 _KINK_DEG: Final = 3.0
 _SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, else a warning.
@@ -146,6 +149,11 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
         "error",
         "cant of {value:.2g} m, and nowhere more; is it in metres, where millimetres were expected?",
     ),
+    "cant side": (
+        "error",
+        "cant of {value:.3f} m is negative in curves; it is the height of the outer rail above the inner one, positive "
+        "in curves to either side",
+    ),
     "radius": ("error", "radius of {value:.1f} m (limit {limit:g} m)"),
     "radius side": (
         "error",
@@ -213,6 +221,28 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
     yield from _runs(track, kink & ~too_sharp, "kink", turn, _KINK_DEG)
 
 
+def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
+    """Yield curves whose cant is negative: errors where that is so of all curves, or of all to one side; else warnings,
+    for turnouts in curves have such.
+    """
+    of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
+    of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))
+    side = np.where(np.isnan(track.radius_m), of_points, of_map)
+    curved = (side != 0.0) & (np.abs(track.cant_m) > _ADVERSE_M)
+    negative = curved & (track.cant_m < 0.0)
+    sides = [curved & (side == of) for of in (1.0, -1.0)]
+    signed = any(own.any() and negative[own].all() for own in sides)
+    yield from _runs(track, negative, "cant side", track.cant_m, severity="error" if signed else "warning")
+
+
+def needed_spacing_m(quality: TrackQuality) -> float:
+    """Return the spacing of points whose chords stay within 1 cm of the sharpest curve [m]; infinite without curves."""
+    geometry = quality.geometry
+    bend = np.where(np.isnan(geometry.map_curvature), geometry.point_curvature, geometry.map_curvature)
+    sharpest = float(np.nanmax(np.abs(bend), initial=0.0))
+    return float(np.sqrt(8.0 * _CENTIMETRE_M / sharpest)) if sharpest > 0.0 else np.inf
+
+
 def _kilometrage(track: Track) -> Iterator[Finding]:
     kilometrage = track.kilometrage_m
     if np.isnan(kilometrage).all():
@@ -247,11 +277,12 @@ def _attributes(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator
     cant = np.abs(track.cant_m)
     with np.errstate(invalid="ignore"):
         yield from _runs(track, cant > limits.cant_m, "cant", track.cant_m, limits.cant_m)
+        yield from _cant_side(track, geometry)
         small = (cant > 0.0) & (np.nanmax(cant, initial=0.0) < _LEAST_CANT_M)
         yield from _runs(track, small, "small cant", track.cant_m)
         sharp = np.abs(track.radius_m) < limits.least_radius_m
         radius = np.where(np.isfinite(track.radius_m), track.radius_m, 0.0)
         yield from _runs(track, sharp, "radius", radius, limits.least_radius_m)
         opposite = geometry.map_curvature * geometry.point_curvature < 0.0
-        opposite &= (np.abs(geometry.map_curvature) > 1 / 3000) & (np.abs(geometry.point_curvature) > 1 / 3000)
+        opposite &= (np.abs(geometry.map_curvature) > _CURVED_1PM) & (np.abs(geometry.point_curvature) > _CURVED_1PM)
     yield from _runs(track, opposite, "radius side")

@@ -13,8 +13,8 @@ import numpy as np
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending
 from railfix.io.mate import mate_table
-from railfix.track.frames import GEOIDS, check_height_datum
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
+from railfix.track.heights import GEOIDS, check_height_datum
 from railfix.track.point_files import read_csv_segment, read_geojson_segments
 from railfix.track.route import MAX_GAP_M, NO_HEIGHTS, MapOptions, MapReading, Segment, join
 from railfix.track.track import SIGMA_PLAN_M, Track
@@ -144,7 +144,12 @@ def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of one map file in their order; a file without heights gives segments without."""
     segments = _read_segments(file, reading)
     if (given := reading.sigma_plan_m) is not None:
-        return [_with_accuracy(segment, given) for segment in segments]
+        return [_with_given_accuracy(segment, given) for segment in segments]
+    if unknown := [s for s in segments if np.isnan(s.datum_plan_m)]:
+        raise SettingsError(
+            f"{unknown[0].source}: the accuracy of the transformation from its CRS is unknown; give that of the map "
+            "with it (--plan-sigma)"
+        )
     return [s if "sigma_plan_m" in s.metadata else _with_usual_accuracy(s, Path(file).name) for s in segments]
 
 
@@ -154,6 +159,13 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
     usual = "" if drawn else ", that of an aerial survey"
     note = f"map: {source} states no accuracy, {sigma_m:g} m in plan is taken{usual} (--plan-sigma)"
     return _with_accuracy(segment, sigma_m, note)
+
+
+def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
+    """Return a segment with an accuracy in plan that holds for all, the transformation from its datum included."""
+    note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
+    notes = [note] if segment.datum_plan_m > given_m else []
+    return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)
 
 
 def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.crs import older_datum_note
+from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference
 from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, Provenance, Track
 
 NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights; they are NaN, or come from a second source.
@@ -70,19 +70,25 @@ class Segment:
     geoid: str
     metadata: dict[str, str]  #: Name, accuracy and origin, where the file has them.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates here.
+    #: Standard deviations of the transformations that led to them, beside the map's own accuracy [m]; NaN if unknown.
+    datum_plan_m: float = 0.0
+    datum_height_m: float = 0.0
     notes: tuple[str, ...] = ()
+    nodes: tuple[str, ...] = ()  #: Ids of the points as nodes of OpenStreetMap; empty where the file has none.
 
     def reverse(self) -> Segment:
         """Return the segment in the opposite direction; the signs of radius and gradient change."""
         names = ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)
         turned = {name: getattr(self, name)[::-1] for name in names}
         turned |= {name: -turned[name] for name in ("radius_m", "gradient_permille")}
-        return replace(self, **turned, notes=(*self.notes, f"{self.source} {BACKWARDS}"))
+        return replace(
+            self, **turned, notes=(*self.notes, f"{self.source} {BACKWARDS}"), nodes=tuple(reversed(self.nodes))
+        )
 
 
 def make_segment(
-    degrees: tuple[Floats, Floats, str],
-    heights: tuple[Floats, str, str] | None,
+    place: Georeference,
+    heights: EllipsoidalHeights | None,
     *,
     source: str,
     file: str,
@@ -91,14 +97,15 @@ def make_segment(
     notes: tuple[str, ...] = (),
     attributes: Mapping[str, Floats] = MappingProxyType({}),
 ) -> Segment:
-    """Return a segment of latitude, longitude and their frame; of heights, geoid and datum, where it has any."""
-    latitude, longitude, frame = degrees
-    absent = np.full(len(latitude), np.nan)
-    height, geoid, datum = heights or (absent, "", NO_HEIGHTS)
+    """Return a segment of points in plan and, where it has any, of heights."""
+    absent = np.full(len(place.latitude_deg), np.nan)
+    of_points: dict[str, Any] = {**dict.fromkeys(ATTRIBUTES, absent), **attributes}
+    above = heights or EllipsoidalHeights(height_m=absent, datum=NO_HEIGHTS)
     return Segment(
-        source=source, file=file, latitude_deg=latitude, longitude_deg=longitude, height_m=height, crs=crs or UNNAMED,
-        frame=frame, height_datum=datum, geoid=geoid, metadata=metadata, notes=(*notes, *older_datum_note(crs)),
-        **{**dict.fromkeys(ATTRIBUTES, absent), **attributes},
+        source=source, file=file, latitude_deg=place.latitude_deg, longitude_deg=place.longitude_deg,
+        height_m=above.height_m, crs=crs or UNNAMED, frame=place.frame, height_datum=above.datum, geoid=above.geoid,
+        datum_plan_m=place.accuracy_m, datum_height_m=above.accuracy_m, metadata=metadata,
+        notes=(*notes, *place.notes, *above.notes), **of_points,
     )  # fmt: skip
 
 
@@ -209,15 +216,20 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the worst accuracy that the files state, else the default of P1 4.1(3)."""
-    stated: list[float] = []
+    """Return the worst accuracy of the pieces: as the files state it, else the default of P1 4.1(3), with that of the
+    transformation from their datum.
+    """
+    sigmas: list[float] = []
     for piece in pieces:
+        stated = default
         if key in piece.metadata:
             try:
-                stated.append(float(piece.metadata[key]))
+                stated = float(piece.metadata[key])
             except ValueError:
                 message = f"{key} is {piece.metadata[key]!r}; a number in metres was expected"
                 raise InputFileError(piece.source, message) from None
-            if not 0.0 < stated[-1] < np.inf:
-                raise InputFileError(piece.source, f"{key} is {stated[-1]:g}; a positive number was expected")
-    return max(stated, default=default)
+            if not 0.0 < stated < np.inf:
+                raise InputFileError(piece.source, f"{key} is {stated:g}; a positive number was expected")
+        datum = piece.datum_plan_m if key == "sigma_plan_m" else piece.datum_height_m
+        sigmas.append(float(np.hypot(stated, datum)) if datum >= NEGLIGIBLE_M else stated)
+    return max(sigmas, default=default)

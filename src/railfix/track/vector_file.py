@@ -11,7 +11,7 @@ import json
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Final
@@ -21,9 +21,10 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending, open_stream
-from railfix.track.crs import choose_crs, frame_degrees, unit_of_heights
-from railfix.track.frames import check_height_datum, heights_of_file
+from railfix.core.files import FilePath, ending, open_stream, unpacked_file
+from railfix.track.crs import choose_crs, unit_of_heights
+from railfix.track.georeference import georeference
+from railfix.track.heights import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 
 #: Standard deviation in plan of a track of OpenStreetMap, drawn from aerial pictures, if its file has none [m].
@@ -44,12 +45,19 @@ _ID: Final = re.compile(r"\W*(way|relation|[wr])?\W*(\d+)\)?")
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
+CROSSING: Final = "x"  #: Begins the id of a node at which tracks cross without a connection.
+_LEFT_OUT: Final = "@left out"  #: Why a way is left out, beside its tags.
+
+
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """A way of an own file: id, tags, and points of shape (n, 2), longitude and latitude [deg]."""
+    """A way of an own file: id, tags, points of shape (n, 2), longitude and latitude [deg], and the ids of its nodes,
+    empty where the file has none; those at which tracks cross without a connection begin with `CROSSING`.
+    """
 
     row: dict[str, Any]
     points_deg: np.ndarray[Any, np.dtype[np.float64]]
+    nodes: tuple[str, ...] = ()
 
 
 def get_tags(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,6 +90,8 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
     """Return why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
+    if row.get(_LEFT_OUT):
+        return str(row[_LEFT_OUT])
     railway = get_tags(row).get("railway")
     railway = railway if isinstance(railway, str) and railway else None
     if railway in _RAILWAYS or not (of_openstreetmap or railway in _OTHERS):
@@ -98,8 +108,18 @@ def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
     if found is None:
         return ORIGIN
     kind = "relation" if str(found[1]).startswith("r") else "way"
+    level = {"level": str(find_level(tags))} if find_level(tags) else {}
     words = [f"{kind}/{found[2]}", *(str(tags[key]) for key in ("name", "ref") if tags.get(key))]
-    return {"name": " ".join(words[:2]), **ORIGIN}
+    return {"name": " ".join(words[:2]), **ORIGIN, **level}
+
+
+def find_level(tags: Mapping[str, Any]) -> int:
+    """Return the level of a way by its tags layer, bridge and tunnel; 0 on the ground."""
+    try:
+        return int(str(tags.get("layer") or ""))
+    except ValueError:
+        above = tags.get("bridge") not in (None, "", "no")
+        return int(above) - int(tags.get("tunnel") not in (None, "", "no"))
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
@@ -115,6 +135,7 @@ def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]
 def read_osm_xml(path: FilePath) -> list[Way]:
     """Read the railway ways of an OSM XML file, in any order of its elements; InputFileError."""
     nodes: dict[str, tuple[float, float]] = {}
+    crossings: set[str] = set()
     ways: list[tuple[dict[str, Any], list[Any]]] = []
     try:
         with open_stream(path, content="bytes") as stream:
@@ -122,6 +143,8 @@ def read_osm_xml(path: FilePath) -> list[Way]:
                 kind = element.tag
                 if kind == "node":
                     nodes[str(element.get("id"))] = _place(path, element.get("lon"), element.get("lat"))
+                    if any(_is_crossing({tag.get("k"): tag.get("v")}) for tag in element.iterfind("tag")):
+                        crossings.add(str(element.get("id")))
                 elif kind == "way":
                     row = {str(tag.get("k")): tag.get("v") for tag in element.iterfind("tag")}
                     if row.get("railway"):
@@ -132,7 +155,12 @@ def read_osm_xml(path: FilePath) -> list[Way]:
                     element.clear()
     except ParseError as error:
         raise InputFileError(path, f"this is not XML ({error})") from None
-    return _ways(path, ways, nodes)
+    return _ways(path, ways, nodes, crossings)
+
+
+def _is_crossing(tags: Mapping[Any, Any]) -> bool:
+    """Return whether a node is a crossing of tracks without a connection."""
+    return tags.get("railway") == "railway_crossing"
 
 
 def read_overpass(path: str, elements: Any) -> list[Way]:
@@ -140,6 +168,7 @@ def read_overpass(path: str, elements: Any) -> list[Way]:
     if not isinstance(elements, list) or not all(isinstance(e, dict) for e in elements):
         raise InputFileError(path, "elements is not a list of objects, as Overpass writes them")
     nodes = {str(e["id"]): _place(path, e.get("lon"), e.get("lat")) for e in elements if e.get("type") == "node"}
+    crossings = {str(e["id"]) for e in elements if e.get("type") == "node" and _is_crossing(e.get("tags") or {})}
     ways = []
     for element in elements:
         if element.get("type") != "way" or not (element.get("tags") or {}).get("railway"):
@@ -148,7 +177,7 @@ def read_overpass(path: str, elements: Any) -> list[Way]:
         if geometry := element.get("geometry"):
             points = [None if p is None else _place(path, p.get("lon"), p.get("lat")) for p in geometry]
         ways.append((element["tags"] | {"@id": f"way/{element.get('id')}"}, points))
-    return _ways(path, ways, nodes)
+    return _ways(path, ways, nodes, crossings)
 
 
 def _place(path: FilePath, lon: Any, lat: Any) -> tuple[float, float]:
@@ -165,22 +194,28 @@ def _ways(
     path: FilePath,
     ways: Iterable[tuple[dict[str, Any], list[Any]]],
     nodes: Mapping[str, tuple[float, float]],
+    crossings: Set[str],
 ) -> list[Way]:
-    """Ways with their points, in parts where some lie outside the extract; InputFileError where a way has no two."""
-    found = []
+    """Ways with their points, in parts where some lie outside the extract; those without two points are left out.
+
+    InputFileError: no way has two.
+    """
+    found, short = [], []
     for row, refs in ways:
-        points = [nodes.get(ref) if isinstance(ref, str) else ref for ref in refs]
-        parts = [[p for p in part if p] for inside, part in groupby(points, key=lambda p: p is not None) if inside]
+        points = [(ref, nodes.get(ref)) if isinstance(ref, str) else ("", ref) for ref in refs]
+        parts = [list(part) for inside, part in groupby(points, key=lambda p: p[1] is not None) if inside]
         if not any(len(part) > 1 for part in parts):
-            raise InputFileError(
-                path,
-                f"{row['@id']}: the file has {sum(map(len, parts))} of its {len(refs)} nodes; ask Overpass for them, "
-                "too (out geom;)",
-            )
-        found += [Way(row=row, points_deg=np.array(part, dtype=np.float64)) for part in parts if len(part) > 1]
+            why = f"{row['@id']} (the file has {sum(map(len, parts))} of its {len(refs)} nodes)"
+            short.append(Way(row={**row, _LEFT_OUT: why}, points_deg=np.empty((0, 2))))
+        for part in (part for part in parts if len(part) > 1):
+            ids = tuple(f"{CROSSING}{ref}" if ref in crossings else ref for ref, _ in part)
+            places = np.array([place for _, place in part], dtype=np.float64)
+            found.append(Way(row=row, points_deg=places, nodes=ids if all(ids) else ()))
+    if not found and short:
+        raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; ask Overpass for them, too (out geom;)")
     if not found:
         raise InputFileError(path, "there is no way with a tag railway in this file")
-    return found
+    return [*found, *short]
 
 
 #: Endings of files that are read here.
@@ -202,10 +237,11 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are no heights and not read
-            found = [
-                pyogrio.raw.read(path, layer=layer, read_geometry=geometry != "none")
-                for layer, _ in pyogrio.list_layers(path)
-            ]
+            with unpacked_file(path) as file:
+                found = [
+                    pyogrio.raw.read(file, layer=layer, read_geometry=geometry != "none")
+                    for layer, _ in pyogrio.list_layers(file)
+                ]
         for meta, _, blob, values in found:
             if blob is None and geometry != "none":
                 continue
@@ -242,9 +278,9 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     check_height_datum(reading.height_datum)
     segments: list[Segment] = []
     left_out: Counter[str] = Counter()
-    for named, rows, parts in _features(path):
+    for named, rows, parts, nodes in _features(path):
         of_layer = replace(reading, crs=choose_crs(path, reading.crs, named))
-        for row, lines in zip(rows, parts, strict=True):
+        for row, lines, own_nodes in zip(rows, parts, nodes, strict=True):
             if why := no_track(row, of_openstreetmap=is_of_openstreetmap(row)):
                 left_out[why] += 1
                 continue
@@ -252,19 +288,26 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
             own = stated.get("name") or get_name(row, fallback=f"line {len(segments) + 1}")
             for k, points in enumerate(lines):
                 name = own + (f", part {k + 1}" if k else "")
-                segments.append(plan_segment(points, of_layer, path=str(path), name=name, stated=stated))
+                segments.append(
+                    plan_segment(points, of_layer, path=str(path), name=name, stated=stated, nodes=own_nodes)
+                )
     return with_left_out(path, segments, left_out)
 
 
-def _features(path: FilePath) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]]]]:
-    """Yield CRS, columns and lines of the features of each layer; of OSM XML without GDAL, which needs sorted nodes."""
+def _features(
+    path: FilePath,
+) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]], list[tuple[str, ...]]]]:
+    """Yield CRS, columns, lines and ids of nodes of the features of each layer; of OSM XML without GDAL, which needs
+    sorted nodes.
+    """
     if ending(path) == ".osm":
         ways = read_osm_xml(path)
-        yield "EPSG:4326", [way.row for way in ways], [[way.points_deg] for way in ways]
+        yield "EPSG:4326", [way.row for way in ways], [[way.points_deg] for way in ways], [way.nodes for way in ways]
         return
     for named, rows, shapes in read_layers(path, geometry="LineString"):
         lines = [s.geoms if s.geom_type.startswith("Multi") else [s] for s in shapes]
-        yield named, rows, [[np.array(part.coords, dtype=np.float64) for part in own] for own in lines]
+        points = [[np.array(part.coords, dtype=np.float64) for part in own] for own in lines]
+        yield named, rows, points, [()] * len(points)
 
 
 def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
@@ -274,7 +317,13 @@ def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def plan_segment(
-    coordinates: Floats, reading: MapReading, *, path: str, name: str, stated: Mapping[str, str] | None = None
+    coordinates: Floats,
+    reading: MapReading,
+    *,
+    path: str,
+    name: str,
+    stated: Mapping[str, str] | None = None,
+    nodes: tuple[str, ...] = (),
 ) -> Segment:
     """Return a segment of coordinates in map order, shape (n, 2 or 3), without points repeated in plan."""
     source = f"{path} ({name})"
@@ -288,7 +337,7 @@ def plan_segment(
     if crs is None and (np.abs(values[:, :2]) > (360.0, 90.0)).any():
         raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give --crs")
     used = crs or "EPSG:4326"
-    latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1], path=source)
+    place = georeference(used, values[:, 0], values[:, 1], path=source)
     heights = None
     known = np.isfinite(values[:, 2]) if values.shape[1] == 3 else np.zeros(len(values), dtype=np.bool_)
     if known.any() and not known.all():
@@ -298,10 +347,11 @@ def plan_segment(
             "mend them, or write the line without heights",
         )
     if known.any() and values[:, 2].any():
-        heights = heights_of_file(values[:, 2] * unit_of_heights(crs), latitude, longitude, reading, path=source)
-    degrees = latitude, longitude, frame if crs else "EPSG:4979"
+        heights = heights_of_file(values[:, 2] * unit_of_heights(crs), place, reading, path=source)
+    place = place if crs else replace(place, frame="EPSG:4979")
     metadata = {**(stated or {}), "name": name}
-    return make_segment(degrees, heights, source=source, file=path, crs=crs, metadata=metadata)
+    segment = make_segment(place, heights, source=source, file=path, crs=crs, metadata=metadata)
+    return replace(segment, nodes=tuple(id_ for id_, own in zip(nodes, kept, strict=True) if own)) if nodes else segment
 
 
 def get_name(row: Mapping[str, Any], *, fallback: str) -> str:

@@ -17,6 +17,7 @@ from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import FilePath
 from railfix.core.geodesy import axes_at, enu_axes
 from railfix.core.settings import Settings, load_settings
+from railfix.track.curves import centre_curve, with_breaks
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory, joins_m
@@ -25,9 +26,10 @@ Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 
 #: Distance between the contact points of the wheels minus the gauge [m]: about the width of a rail head.
 RAIL_HEAD_M: Final = 0.070
-PATH_TOLERANCE_M: Final = 0.02  #: Largest deviation of the antenna's path from the chord between two points [m].
+PATH_TOLERANCE_M: Final = 0.004  #: Largest deviation of the antenna's path from the chord between two points [m].
+_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Shares of a segment at which its chord is compared with the path.
 #: Shortest segment of the path [m].
-_SHORTEST_M: Final = 1.0
+_SHORTEST_M: Final = 0.25
 _MAX_ITERATIONS: Final = 200
 _CONVERGED_M: Final = 1e-7
 
@@ -112,13 +114,13 @@ class _VehicleLine:
         if not (step > 0).all():
             i = int(np.argmin(step))
             raise ValueError(f"points {i} and {i + 1} of the track are equal")
-        self.tangent = np.diff(self.points, axis=0) / step[:, None]
+        self.curve = centre_curve(track)
         cant, self.notes = _sign_cant(track)
         if (np.abs(cant) >= contact_spacing_m).any():
             raise MismatchError(
                 f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; is it in mm?"
             )
-        self.roll = np.arcsin(cant / contact_spacing_m)
+        self.ramps = with_breaks(track.chainage_m, np.arcsin(cant / contact_spacing_m))
         self.joins = joins_m(self.chainage, self.points)
 
     @property
@@ -141,8 +143,7 @@ class _VehicleLine:
         return points
 
     def _straight_on(self, chainage: Floats) -> Floats:
-        index = np.clip(np.searchsorted(self.chainage, chainage, side="right") - 1, 0, len(self.tangent) - 1)
-        return np.asarray(self.points[index] + (chainage - self.chainage[index])[:, None] * self.tangent[index])
+        return self.curve.at(chainage)
 
     def roll_at(self, chainage: Floats) -> Floats:
         """Return the roll by cant, shape (n,) [rad]; that of the end beyond an open end."""
@@ -151,7 +152,7 @@ class _VehicleLine:
         open_start, open_end = self.open_ends
         there = np.where((chainage < 0.0) & (not open_start), before + chainage, chainage)
         there = np.where((chainage > last) & (not open_end), after + chainage - last, there)
-        return np.interp(there, self.chainage, self.roll)
+        return np.interp(there, *self.ramps)
 
 
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
@@ -264,12 +265,13 @@ def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaO
         if not at.size:
             return middle
         centre = (middle[at] + middle[at + 1]) / 2.0
-        true = _place(_pose(line, track, vehicle, centre), vehicle, offset)
+        inner = (middle[at, None] + (middle[at + 1] - middle[at])[:, None] * _INNER).ravel()
+        true = _place(_pose(line, track, vehicle, inner), vehicle, offset).reshape(len(at), len(_INNER), 3)
         chord = places[at + 1] - places[at]
         chord /= np.linalg.norm(chord, axis=1, keepdims=True)
-        off = true - places[at]
-        off -= np.einsum("vi,vi->v", off, chord)[:, None] * chord
-        bent = np.linalg.norm(off, axis=1) > PATH_TOLERANCE_M
+        off = true - places[at, None]
+        off -= np.einsum("vki,vi->vk", off, chord)[..., None] * chord[:, None]
+        bent = np.linalg.norm(off, axis=2).max(axis=1) > PATH_TOLERANCE_M
         fine[at[~bent]] = True
         fine = np.insert(fine, at[bent], False)
         middle = np.insert(middle, at[bent] + 1, centre[bent])

@@ -97,7 +97,7 @@ class RiskBudget(Settings):
     #: Elevation up to which satellites count as low: of a wall as high as it is away.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
     #: Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are called
-    #: indicative in every output: they carry no risk an hour. "measured" needs `local_prior` and `side_prior` to be
+    #: indicative in every output: no hourly risk is claimed. "measured" needs `local_prior` and `side_prior` to be
     #: given.
     priors: Literal["assumed", "measured"] = "assumed"
     #: Probability of a fault that many satellites of a constellation share; a constellation that is not named has none,

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Integers
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import FilePath, open_stream
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
@@ -362,8 +362,10 @@ def _navigation(
 def scan_pieces(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[LogPiece]:
-    """Yield pieces of a receiver log; `date` within half a week is for RTCM 3, `progress` gets the share read."""
-    state = StreamState() if date is None else StreamState(time=date.astype("datetime64[ns]"))
+    """Yield pieces of a receiver log; `date` within half a week is for RTCM 3 without ephemerides, whose week the log
+    does not tell; `progress` gets the share read. MismatchError: the ephemerides contradict the date.
+    """
+    state = StreamState(time=_week_of_log(path, date))
     with open_stream(path, content="bytes") as stream:
         while True:
             block = stream.read(_BLOCK_BYTES)
@@ -373,6 +375,28 @@ def scan_pieces(
             yield piece
             if not block:
                 return
+
+
+#: Date and ephemerides that are farther apart belong to different weeks.
+_SAME_WEEK: Final = np.timedelta64(5, "D")
+
+
+def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
+    """Return a time near the log for RTCM 3: that of its first ephemerides, else `date`, else NaT."""
+    own: np.datetime64 = np.datetime64("NaT", "ns")
+    rest = b""
+    with open_stream(path, content="bytes") as stream:
+        while np.isnat(own) and (block := stream.read(_BLOCK_BYTES)):
+            frames = find_frames(np.frombuffer(rest + block, dtype=np.uint8), at_end=False)
+            if not len(frames.of("rtcm3")):
+                break
+            own, rest = rtcm.ephemeris_date(frames), frames.data[frames.consumed :].tobytes()
+    if date is None or np.isnat(own):
+        return own if date is None else date.astype("datetime64[ns]")
+    if abs(own - date) > _SAME_WEEK:
+        what = f"its ephemerides are of {str(own)[:10]}, the date given (--date) is {str(date)[:10]}"
+        raise MismatchError(f"{path}: {what}; leave the date out, or correct it")
+    return own
 
 
 def at_station(observations: Observations, station: tuple[float, float, float] | None) -> Observations:

@@ -11,9 +11,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.timescale import bdt_to_gpst, gpst_to_utc, nearest_week, utc_to_gpst
+from railfix.core.timescale import bdt_to_gpst, from_week, gpst_to_utc, nearest_week, utc_to_gpst
 from railfix.gnss.observations import frequency_by_name_hz
 from railfix.io.receiver import nav_messages
 from railfix.io.receiver.framing import Field, Frames, fields, read_signed, read_unsigned
@@ -47,6 +47,8 @@ _LAYOUT: Final = {
 MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAYOUT)
 #: Count of messages that no week can be resolved for.
 UNDATED: Final = "RTCM 3 observations without a date"
+IN_GPS_TIME: Final = "BeiDou messages in GPS time, read as such"
+_BEIDOU_LATE_S: Final = 14  #: GPS time is ahead of BeiDou time [s].
 _MOSCOW_S: Final = 10_800.0
 _GLONASS_RANGE: Final = range(-7, 7)
 
@@ -94,7 +96,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     """Decode all MSM4 to MSM7 messages, and where each epoch begins; `near` is within half a week of the first."""
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
-        (order, rows, np.full(len(order), SYSTEMS[number // 10] == "R"))
+        (order, rows, np.full(len(order), SYSTEMS[number // 10]))
         for number in (() if np.isnat(near) else MSM_NUMBERS)
         for order, rows in _of_number(frames, number, near, channels)
     ]
@@ -106,8 +108,10 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
     rows = join_measurements([rows for _, rows, _ in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
-    glonass = np.concatenate([g for _, _, g in parts])[by_stream]
-    time = _glonass_days(_in_rising_weeks(rows.time[by_stream], glonass), glonass)
+    letter = np.concatenate([letters for _, _, letters in parts])[by_stream]
+    glonass = letter == "R"
+    time, shifted = _beidou_time(rows.time[by_stream], letter)
+    time = _glonass_days(_in_rising_weeks(time, glonass), glonass)
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
@@ -116,7 +120,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
-        skipped=_count_unused(frames, messages, len(order)),
+        skipped={**_count_unused(frames, messages, len(order)), **({IN_GPS_TIME: shifted} if shifted else {})},
     )
     return measurements, order[by_stream][starts]
 
@@ -128,6 +132,20 @@ def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int
     empty = int(np.count_nonzero(~take_bits(frames, messages, 137)[:, 73:137].any(axis=1)))
     counts = {"MSM without satellites": empty, "broken MSM": len(messages) - used - empty}
     return {what: number for what, number in counts.items() if number}
+
+
+def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
+    """Move BeiDou times that an encoder sent in GPS time (14 s late) to the others'; return how many were moved."""
+    beidou, others = np.flatnonzero(letter == "C"), np.flatnonzero(np.isin(letter, list("GEJ")))
+    if not len(beidou) or not len(others):
+        return time, 0
+    at = others[np.maximum(np.searchsorted(others, beidou) - 1, 0)]
+    late_s = (time[beidou] - time[at]) / np.timedelta64(1, "s")
+    if not abs(float(np.median(late_s)) - _BEIDOU_LATE_S) < 0.5:
+        return time, 0
+    moved = time.copy()
+    moved[beidou] -= np.timedelta64(_BEIDOU_LATE_S, "s")
+    return moved, len(beidou)
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
@@ -341,3 +359,25 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
         table = fields(take_bits(frames, chosen, needed), sent)
         for k, place in enumerate(frames.frame_start[chosen].tolist()):
             yield place, number, {name: float(values[k]) for name, values in table.items()}
+
+
+#: Weeks of ephemeris messages: that of the origin of the system in GPS weeks, and how many weeks the field counts.
+_WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
+
+
+def ephemeris_date(frames: Frames) -> np.datetime64:
+    """Return the time of the ephemerides of a log, which tells the week of its observations; NaT without any.
+
+    The weeks of Galileo and BeiDou are unique; that of GPS, modulo 1024, is the latest one that is not to come.
+    """
+    found: dict[int, list[np.datetime64]] = {}
+    for _, number, values in ephemeris_fields(frames):
+        if number in _WEEKS:
+            origin, cycle = _WEEKS[number]
+            week = int(values["week"]) + origin
+            if cycle == 1024:
+                today = int((np.datetime64("now", "D") - np.datetime64("1980-01-06", "D")) / np.timedelta64(7, "D"))
+                week += (today - week) // cycle * cycle
+            found.setdefault(cycle, []).append(from_week([week], [values["toe_sow_s"]])[0])
+    times = found.get(4096) or found.get(8192) or found.get(1024)
+    return np.datetime64("NaT", "ns") if not times else np.sort(np.array(times))[len(times) // 2]

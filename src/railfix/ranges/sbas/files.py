@@ -278,9 +278,9 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
         else:
             broken += 1
             if broken == 1:
-                gathered.notes.append(f"{item}; passed over")
+                gathered.notes.append(f"{item}; skipped")
     if broken > 1:
-        gathered.notes.append(f"{path}: {broken} lines were passed over")
+        gathered.notes.append(f"{path}: {broken} lines were skipped")
     gathered.rejected["line"] += broken
 
 

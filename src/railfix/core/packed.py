@@ -1,0 +1,67 @@
+"""Forms in which files are packed, by their first bytes: gzip, bzip2, xz, zstd, compress, zip."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import IO, Any, Final
+
+from railfix.core.errors import InputFileError
+
+FilePath = str | PathLike[str]
+
+
+def read_zstd(source: IO[bytes]) -> IO[bytes]:
+    """Return a reader of zstd data, by the standard library (3.14) or the package zstandard."""
+    for module in ("compression.zstd", "backports.zstd"):
+        with suppress(ModuleNotFoundError):
+            reader: IO[bytes] = import_module(module).ZstdFile(source)
+            return reader
+    try:
+        data = import_module("zstandard").ZstdDecompressor().stream_reader(source).read()
+    except ModuleNotFoundError:
+        name = getattr(source, "name", "the file")
+        raise InputFileError(str(name), "is packed by zstd; pip install zstandard, or unpack it") from None
+    return io.BytesIO(data)
+
+
+def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
+    """Return an open zip archive; InputFileError where it is damaged."""
+    try:
+        return zipfile.ZipFile(source)
+    except zipfile.BadZipFile as error:
+        raise InputFileError(path, f"the zip archive is damaged ({error}); download it again") from None
+
+
+def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
+    """Return the name of the one file of a zip archive, or its KML; InputFileError where there are several."""
+    names = [
+        item.filename
+        for item in archive.infolist()
+        if not item.is_dir() and "__MACOSX" not in item.filename and not Path(item.filename).name.startswith(".")
+    ]
+    maps = [name for name in names if name.lower().endswith((".kml", ".shp"))]
+    if len(names) == 1 or len(maps) == 1:
+        return maps[0] if maps else names[0]
+    shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+    raise InputFileError(path, f"is a zip archive of {len(names)} files ({shown}); unpack it, and name the files")
+
+
+#: First bytes of a compress (.Z) file, and of a zip archive.
+COMPRESS: Final = b"\x1f\x9d"
+ZIP: Final = b"PK\x03\x04"
+#: First bytes of files that are read as streams, with what opens them.
+STREAMS: Final[dict[bytes, Callable[[IO[bytes]], Any]]] = {
+    b"\x1f\x8b": lambda source: gzip.GzipFile(fileobj=source, mode="rb"),
+    b"BZh": bz2.BZ2File,
+    b"\xfd7zXZ": lzma.LZMAFile,
+    b"(\xb5/\xfd": read_zstd,
+}

@@ -1,0 +1,166 @@
+"""Curve of a centreline between its points: arcs and clothoids in plan, parabolas in height, ramps of the cant.
+
+Between two points the curve is a cubic over their chord, given by its directions at both. The direction at a point is
+the mean of those that the chords on either side have there with a curvature that is linear between points: that of the
+map's radii, else of the circle through each point and its neighbours. Arcs, clothoids and parabolas are followed within
+millimetres so; every point lies on the curve, and chainages stay those of the chords.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, places_in_groups
+from railfix.core.geodesy import axes_at
+from railfix.track.track import Track
+from railfix.track.trajectory import Trajectory
+
+#: Curvatures of the map are used where they move the middle of a chord by no more than this beside those of the points
+#: and their neighbours [m]; elsewhere the radius is of another place, or of the other side.
+_AGREES_M: Final = 0.03
+_CORNER_RAD: Final = 0.25  #: Points at which the line turns by more than this are corners, which no curve rounds [rad].
+#: Ends of ramps are looked for between points, not at them: in this share of the gap from either, and where the values
+#: of the two lines differ by this much over it.
+_BREAK_SHARE: Final = 1e-3
+_LEAST_BREAK: Final = 1e-4
+_CHORD_M: Final = 2e-3  #: Chords of the points of `curved_line` leave the curve by no more than this [m].
+
+
+@dataclass(frozen=True, kw_only=True)
+class CentreCurve:
+    """Curve through the V points of a track."""
+
+    chainage_m: Floats  #: Of the points, shape (V,).
+    points_m: Floats  #: ECEF, shape (V, 3).
+    #: Slopes against the chord at the start and the end of each segment, to the right and upward, (V - 1, 2) [rad].
+    to_right: Floats
+    to_top: Floats
+
+    @cached_property
+    def length_m(self) -> Floats:
+        """Length of each chord, shape (V - 1,)."""
+        return np.diff(self.chainage_m)
+
+    @cached_property
+    def _axes(self) -> Floats:
+        """Unit vectors along, to the right and upward of each chord, shape (V - 1, 3, 3)."""
+        along = np.diff(self.points_m, axis=0) / self.length_m[:, None]
+        right = np.cross(along, axes_at((self.points_m[1:] + self.points_m[:-1]) / 2.0)[:, 2])
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        return np.stack([along, right, np.cross(right, along)], axis=1)
+
+    def at(self, chainage_m: Floats) -> Floats:
+        """Return points of the curve, shape (n, 3) ECEF [m]; beyond the ends the chords go straight on."""
+        last = len(self.length_m) - 1
+        segment = np.clip(np.searchsorted(self.chainage_m, chainage_m, side="right") - 1, 0, last)
+        along = chainage_m - self.chainage_m[segment]
+        parts = np.stack([along, *(self._offset(v, segment, along) for v in (self.to_right, self.to_top))], axis=-1)
+        return np.asarray(self.points_m[segment] + np.einsum("ni,nij->nj", parts, self._axes[segment]))
+
+    def _offset(self, slopes: Floats, segment: Indices, along_m: Floats) -> Floats:
+        """Return the distance of the curve from its chord by the slopes at its ends."""
+        share = np.clip(along_m / self.length_m[segment], 0.0, 1.0)
+        first, last = slopes[segment].T
+        return np.asarray(self.length_m[segment] * share * (1.0 - share) * (first * (1.0 - share) - last * share))
+
+    def chords_m(self, within_m: float) -> Floats:
+        """Return chainages, those of the points among them, whose chords stay within a distance of the curve."""
+        # a cubic leaves its chord by an eighth of the change of direction, and more where its slopes differ in size
+        turn = np.abs(self.to_right).sum(axis=1) + np.abs(self.to_top).sum(axis=1)
+        pieces = np.maximum(np.ceil(np.sqrt(self.length_m * turn / (6.0 * within_m))), 1.0).astype(np.int64)
+        start, piece = places_in_groups(pieces)
+        return np.append(self.chainage_m[start] + piece / pieces[start] * self.length_m[start], self.chainage_m[-1])
+
+
+def centre_curve(track: Track) -> CentreCurve:
+    """Return the curve through the points of a track, which are all different."""
+    step = np.diff(track.ecef_m, axis=0)
+    axes = axes_at(track.ecef_m)
+    before, after = (np.einsum("vij,vj->vi", axes[1:-1], part) for part in (step[:-1], step[1:]))
+    (x0, y0, z0), (x1, y1, z1) = before.T, after.T
+    flat_before, flat_after = np.hypot(x0, y0), np.hypot(x1, y1)
+    turn = np.arctan2(y0 * x1 - x0 * y1, x0 * x1 + y0 * y1)
+    circle = 2.0 * np.sin(turn) / np.maximum(np.hypot(x0 + x1, y0 + y1), 1e-9)
+    rise = z1 / np.maximum(flat_after, 1e-9) - z0 / np.maximum(flat_before, 1e-9)
+    corner = (np.abs(turn) > _CORNER_RAD) | (np.abs(rise) > _CORNER_RAD)
+    bend = _with_radii(track, _to_ends(np.where(corner, 0.0, circle)))
+    sag = _to_ends(np.where(corner, 0.0, 2.0 * rise / (flat_before + flat_after)))
+    length = np.diff(track.chainage_m)
+    return CentreCurve(
+        chainage_m=track.chainage_m,
+        points_m=track.ecef_m,
+        to_right=_slopes(bend, turn, length, corner),
+        to_top=_slopes(sag, rise, length, corner),
+    )
+
+
+def _to_ends(inner: Floats) -> Floats:
+    """Return values of the inner points with those of their neighbours at both ends, shape (V,)."""
+    return np.concatenate([inner[:1], inner, inner[-1:]]) if len(inner) else np.zeros(2)
+
+
+def _with_radii(track: Track, of_points: Floats) -> Floats:
+    """Return the curvature at each point: of the map where it agrees with the points, else theirs."""
+    with np.errstate(divide="ignore"):
+        of_map = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
+    around = np.stack([np.roll(of_points, 1), of_points, np.roll(of_points, -1)])
+    around[0, 0], around[2, -1] = of_points[0], of_points[-1]
+    step = np.diff(track.chainage_m)
+    margin = 8.0 * _AGREES_M / np.maximum(np.append(step, 0.0), np.append(0.0, step)) ** 2
+    agrees = (of_map > around.min(axis=0) - margin) & (of_map < around.max(axis=0) + margin)
+    return np.where(agrees, of_map, of_points)
+
+
+def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -> Floats:
+    """Return the slopes against the chord at both ends of each segment, shape (V - 1, 2): those of a curvature that is
+    linear between the points (V,), brought together at each inner point, at which the chords turn (V - 2,).
+    """
+    first, last = curvature[:-1], curvature[1:]
+    start, end = -length_m * (2.0 * first + last) / 6.0, length_m * (first + 2.0 * last) / 6.0
+    gap = np.where(corner, 0.0, turn + start[1:] - end[:-1]) / 2.0
+    start[1:] -= gap
+    end[:-1] += gap
+    start[1:][corner], end[:-1][corner] = 0.0, 0.0
+    return np.stack([start, end], axis=-1)
+
+
+def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Return places and values of a function that is linear in pieces, with the ends of pieces between the points.
+
+    Where the lines through the two points before and the two after a gap meet in it, the end of a ramp lies there.
+    """
+    if len(place_m) < 4:
+        return place_m, values
+    slope = np.diff(values) / np.diff(place_m)
+    before, after, low, high = slope[:-2], slope[2:], place_m[1:-2], place_m[2:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        meet = (values[2:-1] - values[1:-2] + before * low - after * high) / (before - after)
+        inside = (meet > low + _BREAK_SHARE * (high - low)) & (meet < high - _BREAK_SHARE * (high - low))
+    inside &= np.abs(before - after) * (high - low) > _LEAST_BREAK
+    where = np.flatnonzero(inside)
+    return (
+        np.insert(place_m, where + 2, meet[where]),
+        np.insert(values, where + 2, values[where + 1] + before[where] * (meet[where] - low[where])),
+    )
+
+
+def curved_line(track: Track) -> Trajectory:
+    """Return the centreline of a track as a trajectory of points on its curve, close enough for its chords."""
+    curve = centre_curve(track)
+    chainage = curve.chords_m(_CHORD_M)
+    cant = np.interp(chainage, track.chainage_m, np.where(np.isnan(track.cant_m), 0.0, track.cant_m))
+    return Trajectory(
+        name=track.name,
+        ecef_m=curve.at(chainage),
+        chainage_m=chainage,
+        kilometrage_m=track.kilometrage_at(chainage),
+        cant_m=np.full_like(cant, np.nan) if np.isnan(track.cant_m).all() else cant,
+        roll_deg=np.zeros(len(chainage)),
+        sigma_plan_m=track.sigma_plan_m,
+        sigma_height_m=track.sigma_height_m,
+        notes=track.provenance.notes,
+    )

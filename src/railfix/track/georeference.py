@@ -1,0 +1,309 @@
+"""Coordinates of a map in degrees of a modern frame, the operation that led there, and its accuracy, in one value.
+
+Operations are those of PROJ (https://proj.org) whose area of use contains the map and whose grids are installed; a
+ballpark operation, which leaves the datum as it is, is never one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from textwrap import shorten
+from typing import Final
+
+import numpy as np
+from pyproj import CRS, Transformer
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.track.crs import (
+    LARGEST_SCALE,
+    MARGIN_DEG,
+    REGIONAL,
+    TRANSIT,
+    WORST_M,
+    Box,
+    Operations,
+    contains,
+    find_crs,
+    find_operations,
+    get_geodetic_frame,
+    is_in_area,
+    kind_of_frame,
+    known_accuracy_m,
+    name_operation,
+    rank_operation,
+)
+
+#: Projections of web maps and of the world, whose scale is none of a survey.
+_UNEVEN: Final = (
+    "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
+)  # fmt: skip
+_CELL_DEG: Final = 0.25  #: Maps within one cell of this size have one operation [deg].
+#: Accuracies better than this are within the accuracy of a map [m].
+NEGLIGIBLE_M: Final = 0.1
+_BETTER: Final = 0.9  #: An operation that lacks its grid is named where its accuracy is less than this of the one used.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Georeference:
+    """Coordinates of n points of a map in a modern frame, and how they came there."""
+
+    latitude_deg: Floats  #: Shape (n,).
+    longitude_deg: Floats  #: Shape (n,).
+    frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates.
+    operation: str = ""  #: PROJ's operation between the datums; empty where the CRS is in a modern frame itself.
+    accuracy_m: float = 0.0  #: Standard deviation in plan of the operation [m]; NaN where it is unknown.
+    notes: tuple[str, ...] = ()
+
+    @property
+    def box(self) -> Box:
+        """South, north, west and east of the points."""
+        return _box(self.latitude_deg, self.longitude_deg)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EllipsoidalHeights:
+    """Ellipsoidal heights of n points of a map, and how they came there."""
+
+    height_m: Floats  #: Shape (n,).
+    datum: str  #: That of the file: ``"ellipsoidal"`` or ``"orthometric"``.
+    geoid: str = ""  #: Geoid model or operation used; empty where none was needed.
+    accuracy_m: float = 0.0  #: Standard deviation of the model [m]; NaN where it is unknown.
+    notes: tuple[str, ...] = ()
+
+
+def _box(latitude_deg: Floats, longitude_deg: Floats) -> Box:
+    """Return the box about points, across the date line with an east of more than 180."""
+    west = float(longitude_deg.min())
+    if float(longitude_deg.max()) - west > 180.0:
+        longitude_deg = longitude_deg % 360.0
+    return (
+        float(latitude_deg.min()), float(latitude_deg.max()),
+        float(longitude_deg.min()), float(longitude_deg.max()),
+    )  # fmt: skip
+
+
+def _cells(box: Box) -> Box:
+    """Return a box widened to whole cells, so that the parts of one map have one operation."""
+    south, north, west, east = box
+    low = [float(np.floor(v / _CELL_DEG) * _CELL_DEG) for v in (south, west)]
+    high = [float(np.ceil(v / _CELL_DEG) * _CELL_DEG) for v in (north, east)]
+    return max(low[0], -90.0), min(high[0], 90.0), low[1], high[1]
+
+
+def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
+    """Return map coordinates in degrees of a modern frame, with the operation used and its accuracy.
+
+    Parameters
+    ----------
+    crs : str
+        Coordinate reference system of the map.
+    x, y : ndarray, shape (n,)
+        Easting and northing in its unit, or longitude and latitude in its unit; finite.
+    path : str
+        File that is named in errors.
+
+    Raises
+    ------
+    InputFileError
+        The coordinates are not of the CRS.
+    SettingsError
+        PROJ has no operation from the datum of the CRS there, or its grid is not installed.
+    """
+    latitude, longitude = _in_degrees(crs, x, y)
+    _check_area(crs, latitude, longitude, path=path)
+    system = find_crs(crs)
+    if system.is_projected:
+        _check_scale(crs, np.stack([x, y], axis=-1), latitude, longitude, path=path)
+    if not system.is_bound and kind_of_frame(crs) != "older datum":
+        return Georeference(latitude_deg=latitude, longitude_deg=longitude, frame=_find_frame(crs))
+    chosen = _find_chosen(crs, _box(latitude, longitude), path=path)
+    moved = [np.asarray(v, np.float64) for v in chosen.transformer.transform(x, y)]
+    if not np.isfinite(moved).all():
+        raise SettingsError(
+            f"{path}: the grid of {chosen.name!r} does not cover all points; give a map in ETRS89 or WGS 84"
+        )
+    return Georeference(
+        latitude_deg=moved[1],
+        longitude_deg=moved[0],
+        frame=chosen.frame,
+        operation=chosen.name,
+        accuracy_m=chosen.accuracy_m,
+        notes=(chosen.note,),
+    )
+
+
+def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
+    """Return the coordinates of places in a CRS, such as that of a raster: `georeference` reversed. Modern frames count
+    as one here: they are within 2 m of each other.
+    """
+    if not find_crs(crs).is_bound and kind_of_frame(crs) != "older datum":
+        conversion, unit, origin = _to_datum(crs)
+        degrees = (place.longitude_deg - origin) / unit, place.latitude_deg / unit
+        x, y = conversion.transform(*degrees, direction="INVERSE")
+    else:
+        operation = _find_chosen(crs, place.box, path=path).transformer
+        x, y = operation.transform(place.longitude_deg, place.latitude_deg, direction="INVERSE")
+    return np.asarray(x, np.float64), np.asarray(y, np.float64)
+
+
+def _find_chosen(crs: str, box: Box, *, path: str) -> _Chosen:
+    """Return the operation of a map over a box; SettingsError where there is none."""
+    chosen = _choose_operation(crs, _cells(box))
+    if isinstance(chosen, str):
+        chosen = _choose_operation(crs, box)
+    if isinstance(chosen, str):
+        raise SettingsError(f"{path}: {chosen}")
+    return chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Chosen:
+    transformer: Transformer
+    frame: str
+    name: str
+    accuracy_m: float
+    note: str
+
+
+@lru_cache(maxsize=256)
+def _choose_operation(crs: str, box: Box) -> _Chosen | str:
+    """Return the best operation of a CRS of an older datum to a modern frame over a box; a sentence where none is."""
+    source = find_crs(crs).to_2d()
+    known = {code: find_operations(source, CRS.from_user_input(code).to_2d(), box) for code in _targets(crs, box)}
+    datum = "its own datum" if source.is_bound else get_geodetic_frame(crs).name
+    datum = "a CRS without a datum" if datum == "unknown" else datum
+    missing = next((m for operations in known.values() if (m := operations.describe_lacking(crs))), "")
+    found = [(code, operations.usable[0]) for code, operations in known.items() if operations.usable]
+    code, best = min(found, key=lambda item: rank_operation(item[1]), default=("", None))
+    accuracy = _accuracy(crs, known[code].usable, box) if best is not None else np.nan
+    if best is None or accuracy > WORST_M:
+        where = f"latitude {(box[0] + box[1]) / 2.0:.2f}, longitude {(box[2] + box[3]) / 2.0:.2f}"
+        why = f"; {missing}" if missing else ""
+        return (
+            f"PROJ has no installed operation from {datum} to a modern frame at {where}{why}"
+            f"{'; or ' if missing else '; '}give a map in WGS 84 or a modern frame of the region"
+        )
+    lacking = [
+        o for operations in known.values() for o in operations.lacking
+        if not known_accuracy_m(o.accuracy) >= _BETTER * accuracy
+    ]  # fmt: skip
+    better = Operations(usable=(), lacking=tuple(lacking)).describe_lacking(crs)
+    to, name = CRS.from_user_input(code).name, name_operation(best.description, crs)
+    size = f"accuracy {accuracy:g} m" if np.isfinite(accuracy) else "accuracy unknown"
+    area = "" if best.area_of_use is None else f", of {shorten(best.area_of_use.name, 60)}"
+    note = f"map: {datum} is transformed to {to} by PROJ's {name!r} ({size}{area})"
+    return _Chosen(
+        transformer=best,
+        frame=code,
+        name=name,
+        accuracy_m=accuracy,
+        note=note + (f"; better: {better}" if better else ""),
+    )
+
+
+def _targets(crs: str, box: Box) -> Iterable[str]:
+    """Return the modern frames that a map may be transformed to: those of its region, then WGS 84."""
+    if get_geodetic_frame(crs).name == TRANSIT:  # of which the way to a realisation of the ITRF is known
+        return ("EPSG:7902",)
+    if find_crs(crs).is_bound:  # +towgs84
+        return ("EPSG:4326",)
+    areas = {code: CRS.from_user_input(code).area_of_use for code in REGIONAL.values()}
+    return (*(code for code, area in areas.items() if contains(area, box)), "EPSG:4326")
+
+
+def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
+    """Return the accuracy of the first of some operations [m]: as PROJ states it, or what the others leave of it.
+
+    Where an operation lies further from the first than its own accuracy, the first may be off by the rest.
+    """
+    stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
+    conversion, unit, origin = _to_datum(crs)
+    middle = ((box[2] + box[3]) / 2.0 - origin) / unit, (box[0] + box[1]) / 2.0 / unit
+    x, y = conversion.transform(*middle, direction="INVERSE")
+    places = np.array([operation.transform(x, y)[:2] for operation in usable])
+    points = ecef_from_geodetic(places[:, 1], places[:, 0], np.zeros(len(places)))
+    apart = np.linalg.norm(points - points[0], axis=1)
+    own = np.array([known_accuracy_m(operation.accuracy) for operation in usable])
+    worst = float(np.max(np.where(np.isfinite(apart), apart - own, 0.0), initial=0.0))
+    return stated if not worst > stated else float(np.ceil(10.0 * worst) / 10.0)
+
+
+def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
+    """Reject points outside the area of use of a CRS's frame, of which a projection may be used beyond its own."""
+    south, north, west, east = _bounds(crs)
+    of_latitude = south <= latitude_deg.min() and latitude_deg.max() <= north
+    if of_latitude and west <= longitude_deg.min() and longitude_deg.max() <= east:
+        return
+    finite = np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90.0)
+    if not finite.all():
+        raise InputFileError(
+            path, f"some coordinates lie outside the CRS {crs}; give the right one (--crs), in the unit of the file"
+        )
+    geodetic = get_geodetic_frame(crs)
+    outside, area = ~is_in_area(geodetic, latitude_deg, longitude_deg, margin_deg=MARGIN_DEG), geodetic.area_of_use
+    if area is None or not outside.any():
+        return
+    lat, lon = latitude_deg[outside][:1], longitude_deg[outside][:1]
+    swapped = find_crs(crs).is_geographic and is_in_area(geodetic, lon, lat, margin_deg=MARGIN_DEG).all()
+    raise InputFileError(
+        path,
+        f"latitude {lat[0]:.4f}, longitude {lon[0]:.4f} is outside the area of use of {geodetic.name} (latitude "
+        f"{area.south:g} to {area.north:g}, longitude {area.west:g} to {area.east:g}); "
+        + ("latitude and longitude are swapped" if swapped else f"is {crs} the right CRS?"),
+    )
+
+
+@lru_cache(maxsize=64)
+def _bounds(crs: str) -> Box:
+    """South, north, west and east of the area of use of a CRS's frame, with the margin; nothing lies in it without."""
+    area = get_geodetic_frame(crs).area_of_use
+    if area is None:
+        return (np.inf, -np.inf, np.inf, -np.inf)
+    return (area.south - MARGIN_DEG, area.north + MARGIN_DEG, area.west - MARGIN_DEG, area.east + MARGIN_DEG)
+
+
+def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
+    """Reject points of a grid whose unit of length there is not that of the ground: they are of another grid."""
+    system = find_crs(crs)
+    method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
+    if len(xy) < 2 or method in _UNEVEN:
+        return
+    unit = system.axis_info[0].unit_conversion_factor
+    grid = float(np.hypot(*np.diff(xy, axis=0).T).sum()) * unit
+    ellipsoid = get_geodetic_frame(crs).get_geod()
+    ground = float(ellipsoid.line_length(longitude, latitude)) if ellipsoid is not None else grid
+    if ground > 0.0 and abs(grid / ground - 1.0) > LARGEST_SCALE:
+        raise InputFileError(
+            path,
+            f"the line is {grid:.0f} m long in {system.name}, on the ground there {ground:.0f} m; the "
+            "coordinates are of another grid (--crs)",
+        )
+
+
+@lru_cache(maxsize=32)
+def _to_datum(crs: str) -> tuple[Transformer, float, float]:
+    """Return the conversion of a CRS to its own datum, and the unit [deg] and origin [deg] of its longitudes there."""
+    system, datum = find_crs(crs), CRS.from_user_input(_find_frame(crs)).to_2d()
+    plan = system.source_crs if system.is_bound and system.source_crs is not None else system
+    meridian = datum.prime_meridian
+    origin = 0.0 if meridian is None else meridian.longitude * np.degrees(meridian.unit_conversion_factor)
+    conversion = Transformer.from_crs(plan.to_2d(), datum, always_xy=True)
+    return conversion, float(np.degrees(datum.axis_info[0].unit_conversion_factor)), float(origin)
+
+
+def _in_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Return latitude and longitude [deg] of coordinates on the datum of their own CRS."""
+    conversion, unit, origin = _to_datum(crs)
+    longitude, latitude = (np.asarray(v, np.float64) for v in conversion.transform(x, y))
+    return (latitude, longitude) if (unit, origin) == (1.0, 0.0) else (latitude * unit, longitude * unit + origin)
+
+
+@lru_cache(maxsize=32)
+def _find_frame(crs: str) -> str:
+    geodetic = get_geodetic_frame(crs)
+    authority = geodetic.to_authority()
+    return geodetic.to_wkt() if authority is None else ":".join(authority)

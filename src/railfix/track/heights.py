@@ -1,0 +1,236 @@
+"""Ellipsoidal heights of a map, the geoid model or operation that led there, and its accuracy (P1 3.1(1))."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+
+import japan_geoid
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.crs import CompoundCRS
+from pyproj.exceptions import CRSError, ProjError
+from scipy.ndimage import map_coordinates, spline_filter
+
+from railfix.core.arrays import Floats, read_only
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.track.crs import find_operations, get_vertical_datum, known_accuracy_m
+from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference
+from railfix.track.route import MapReading
+
+#: Geoid models of the GSI of Japan: GSIGEO2011 for heights levelled before April 2025, JPGEO2024 since.
+JAPAN_MODELS: Final = {
+    "japan": "JPGEO2024",
+    "jpgeo2024": "JPGEO2024",
+    "jpgeo2024+hrefconv2024": "JPGEO2024+Hrefconv2024",
+    "gsigeo2011": "GSIGEO2011",
+}
+_LOADERS: Final = {
+    "JPGEO2024": japan_geoid.load_embedded_jpgeo2024,
+    "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
+    "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
+}
+#: Their standard deviation [m] (GSI: 2 cm against GNSS and levelling).
+_JAPAN_M: Final = 0.02
+GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Geoids by name.
+#: Advice for orthometric heights without a geoid.
+GEOID_HELP: Final = f"give one (--geoid): {GEOIDS}; or a column geoid_m"
+_EGM96_NAMES: Final = ("egm96", "epsg:5773")
+#: Standard deviation of EGM96 against heights above the sea [m], as EPSG states it (operation 10084).
+_EGM96_M: Final = 1.0
+HEIGHT_DATUMS: Final = ("ellipsoidal", "orthometric")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeoidModel:
+    """Heights of a geoid above the ellipsoid at n points, the name of the model, and its standard deviation [m]."""
+
+    height_m: Floats
+    name: str
+    accuracy_m: float
+
+
+def check_height_datum(height_datum: str | None) -> None:
+    """Raise `SettingsError` for a height datum other than ellipsoidal and orthometric."""
+    if height_datum is not None and height_datum not in HEIGHT_DATUMS:
+        raise SettingsError(f"height_datum {height_datum!r} is unknown; expected 'ellipsoidal' or 'orthometric'")
+
+
+def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidModel:
+    """Return heights of a geoid (`JAPAN_MODELS`, ``egm96``, a pyproj grid, a vertical or compound CRS) above the
+    ellipsoid of the frame of some points. SettingsError: not known or not installed.
+    """
+    key = geoid.strip().lower() if isinstance(geoid, str) else ""
+    if isinstance(geoid, CRS) and geoid.to_authority() == ("EPSG", "5773"):
+        key = _EGM96_NAMES[0]
+    if key in JAPAN_MODELS:
+        name = JAPAN_MODELS[key]
+        degrees = np.array(place.longitude_deg), np.array(place.latitude_deg)
+        heights = np.asarray(_LOADERS[name]().get_heights(*degrees), np.float64)
+        model = GeoidModel(height_m=heights, name=name, accuracy_m=_JAPAN_M)
+    elif key in _EGM96_NAMES:
+        heights = egm96_heights(place.latitude_deg, place.longitude_deg)
+        model = GeoidModel(height_m=heights, name="EGM96, grid of 15'", accuracy_m=_EGM96_M)
+    else:
+        model = _model_of_proj(geoid, place)
+    outside = ~np.isfinite(model.height_m)
+    if outside.any():
+        i = int(np.argmax(outside))
+        raise InputFileError(
+            path,
+            f"{int(outside.sum())} of {len(outside)} points lie outside the geoid {model.name}, the first at latitude "
+            f"{place.latitude_deg[i]:.6f}, longitude {place.longitude_deg[i]:.6f}; are latitude and longitude swapped, "
+            "or is it another country's geoid?",
+        )
+    return model
+
+
+def egm96_heights(latitude_deg: Floats, longitude_deg: Floats) -> Floats:
+    """Compute heights of the geoid EGM96 above the WGS 84 ellipsoid, shape (n,) [m]: a cubic spline through its grid
+    of 15' (NGA, WW15MGH), within 5 mm of the published test values.
+    """
+    place = (90.0 - latitude_deg) * 4.0, (longitude_deg % 360.0) * 4.0 + _WRAP
+    return np.asarray(map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
+
+
+_WRAP: Final = 16  #: Columns of the grid that are repeated at both sides, so that the spline goes round the Earth.
+
+
+@lru_cache(maxsize=1)
+def _egm96_spline() -> Floats:
+    """Return the spline coefficients of the grid, which is kept as differences of centimetres along both axes."""
+    with (files("railfix.track") / "egm96_15.npz").open("rb") as file, np.load(file) as data:
+        heights = data["second_differences_cm"].astype(np.int64).cumsum(axis=0).cumsum(axis=1) / 100.0
+    return read_only(spline_filter(np.pad(heights, ((0, 0), (_WRAP, _WRAP)), mode="wrap"), order=3))
+
+
+def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
+    """Return a geoid by PROJ: a grid file, or the operation from a height datum to the ellipsoid of the frame."""
+    try:
+        if isinstance(geoid, str) and (geoid.lower().endswith((".tif", ".tiff", ".gtx")) or _is_file(geoid)):
+            steps = f"+proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=vgridshift +grids={geoid} +multiplier=1"
+            back = "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+            transformer = Transformer.from_pipeline(f"+proj=pipeline +step {steps} {back}")
+            return GeoidModel(height_m=_undulation(transformer, place), name=geoid, accuracy_m=0.0)
+        crs = geoid if isinstance(geoid, CRS) else CRS.from_user_input(geoid)
+    except CRSError:
+        raise SettingsError(f"geoid {geoid!r} is unknown; {GEOID_HELP}") from None
+    except ProjError:
+        raise SettingsError(
+            f"geoid {geoid!r}: the grid is not installed in PROJ; install it (projsync --file "
+            f"{Path(str(geoid)).name}), or give its path"
+        ) from None
+    if not (crs.is_vertical or crs.is_compound):
+        raise SettingsError(f"geoid {geoid!r} is {crs.name}, which has no height datum; {GEOID_HELP}")
+    vertical = crs.sub_crs_list[1] if crs.is_compound else crs
+    frame = CRS.from_user_input(place.frame)
+    source = CompoundCRS(vertical.name, [frame.to_2d(), vertical])
+    operations = find_operations(source, frame.to_3d(), place.box)
+    if not operations.usable:
+        why = operations.describe_lacking() or "there is no operation of PROJ"
+        raise SettingsError(
+            f"the heights are {vertical.name}, for which PROJ has no installed operation there: {why}; "
+            "or give the grid file itself (--geoid)"
+        )
+    best = operations.usable[0]
+    accuracy = known_accuracy_m(best.accuracy)
+    return GeoidModel(
+        height_m=_undulation(best, place),
+        name=vertical.name,
+        accuracy_m=accuracy if np.isfinite(accuracy) else np.nan,
+    )
+
+
+def _is_file(geoid: str) -> bool:
+    """Return whether a text is the path of a file; False for texts that are too long for one."""
+    try:
+        return Path(geoid).is_file()
+    except OSError:
+        return False
+
+
+def _undulation(transformer: Transformer, place: Georeference) -> Floats:
+    """Return the height above the ellipsoid of points of height 0."""
+    zeros = np.zeros(len(place.latitude_deg))
+    return np.asarray(transformer.transform(place.longitude_deg, place.latitude_deg, zeros)[2], np.float64)
+
+
+def heights_of_file(heights_m: Floats, place: Georeference, reading: MapReading, *, path: str) -> EllipsoidalHeights:
+    """Return ellipsoidal heights of a file without a datum of its own, which must be given."""
+    check_height_datum(reading.height_datum)
+    datum, geoid = own_height_datum(reading.crs, reading.height_datum, reading.geoid, path=path)
+    if datum is None:
+        raise SettingsError(f"{path}: the height datum is missing; give --height-datum ellipsoidal or orthometric")
+    return ellipsoidal_heights(heights_m, place, datum=datum, geoid=geoid, path=path)
+
+
+def own_height_datum(
+    crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
+) -> tuple[str | None, str | CRS | None]:
+    """Height datum and geoid asked for, or those of a compound CRS; SettingsError when they contradict each other."""
+    vertical = get_vertical_datum(crs)
+    if vertical is None:
+        return height_datum, geoid
+    if height_datum == "ellipsoidal":
+        raise SettingsError(
+            f"{path}: height_datum 'ellipsoidal' contradicts the file's own CRS, whose heights are {vertical.name}"
+        )
+    if geoid is not None and not _is_geoid_of(geoid, vertical):
+        raise SettingsError(
+            f"{path}: geoid {geoid!r} contradicts the file's own CRS, whose heights are {vertical.name}; leave it out, "
+            "or give the grid file of that height datum"
+        )
+    return "orthometric", geoid or vertical
+
+
+def _is_geoid_of(geoid: str, vertical: CRS) -> bool:
+    """Return whether a geoid given by name is that of a height datum; a grid file may always be."""
+    key = geoid.strip().lower()
+    if key in JAPAN_MODELS:
+        return vertical.name.startswith(("JGD", "JSLD"))
+    if key in _EGM96_NAMES:
+        return vertical.name.startswith("EGM96")
+    try:
+        given = CRS.from_user_input(geoid)
+    except CRSError:
+        return True
+    own = given.sub_crs_list[1] if given.is_compound else given
+    return own.name == vertical.name
+
+
+def ellipsoidal_heights(
+    heights_m: Floats,
+    place: Georeference,
+    *,
+    datum: str,
+    geoid: str | CRS | None,
+    path: str,
+    geoid_m: Floats | None = None,
+) -> EllipsoidalHeights:
+    """Convert heights of a datum to ellipsoidal ones, by a model or the map's `geoid_m`."""
+    if datum == "ellipsoidal":
+        if geoid is not None:
+            raise SettingsError(f"{path}: geoid {geoid!r} was given, but the heights are ellipsoidal already")
+        return EllipsoidalHeights(
+            height_m=heights_m,
+            datum=datum,
+            notes=("map: its heights are taken as those above the ellipsoid of WGS 84",) if place.operation else (),
+        )
+    if geoid_m is not None:
+        if geoid is not None:
+            raise SettingsError(f"{path}: geoid {geoid!r} was given, but the map has geoid_m itself; use one")
+        return EllipsoidalHeights(height_m=heights_m + geoid_m, datum=datum, geoid="geoid_m of the map")
+    if geoid is None:
+        raise InputFileError(path, f"the heights are orthometric, which needs a geoid; {GEOID_HELP}")
+    model = geoid_heights(geoid, place, path=path)
+    accuracy = f"{model.accuracy_m:g} m" if np.isfinite(model.accuracy_m) else "unknown (--height-sigma)"
+    return EllipsoidalHeights(
+        height_m=heights_m + model.height_m,
+        datum=datum,
+        geoid=model.name,
+        accuracy_m=model.accuracy_m,
+        notes=() if model.accuracy_m < NEGLIGIBLE_M else (f"map: heights by {model.name}, accuracy {accuracy}",),
+    )

@@ -1,0 +1,325 @@
+"""Alignments of LandXML 1.2: elements in plan, profile, cant and stations, evaluated as `railfix.track.elements`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError
+from railfix.track.crs import choose_crs
+from railfix.track.elements import (
+    CantElement,
+    Design,
+    Plan,
+    PlanElement,
+    ProfileElement,
+    Stations,
+    is_within,
+    segment_of_design,
+)
+from railfix.track.route import MapReading, Segment
+from railfix.track.transitions import OrdinateElement, Shape
+
+_METRIC: Final = (1.0, 1e-3, 1e-2, 1e3)
+_UNITS: Final = {
+    **dict(zip(("meter", "millimeter", "centimeter", "kilometer"), _METRIC, strict=True)),
+    "foot": 0.3048,
+    "USSurveyFoot": 1200.0 / 3937.0,
+    "inch": 0.0254,
+    "mile": 1609.344,
+}
+#: Transitions given by ordinates over the tangent (`railfix.track.transitions`): with End, which every spiral has, the
+#: cubics are one curve, with Japan's correction and without.
+_ORDINATES: Final[dict[str, Shape]] = {
+    "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
+}  # fmt: skip
+#: The biquadratic parabola (of InfraModel, Finland) is Helmert's law: the curvature runs by two parabolas.
+_SPIRALS: Final = {
+    "clothoid": "linear",
+    "bloss": "bloss",
+    "cosine": "cosine",
+    "sinusoid": "sine",
+    "biquadraticParabola": "helmert",
+}
+_CANT_LAWS: Final = {**_SPIRALS, **dict.fromkeys(_ORDINATES, "linear"), "sineHalfWave": "cosine"}
+_SAME_M: Final = 1e-6  #: Elements shorter than this have no direction and are left out [m].
+#: Half the length of the line over which the kilometrage jumps at a station equation [m].
+_JUMP_M: Final = 0.05
+#: Least share of the ordinate of a cubic parabola at the end of a spiral, and the largest.
+_ORDINATE_SHARE: Final = (0.9, 1.25)
+_BROKEN_RAD: Final = 0.1  #: Directions of elements that differ by more at a joint are of another order of coordinates.
+
+
+def finite_number(text: Any) -> float:
+    """Return a finite number of a text; ValueError where it is none."""
+    value = float(text)
+    if not np.isfinite(value):
+        raise ValueError(f"{text} is not finite")
+    return value
+
+
+def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Segment]:
+    """Read the alignments below the root of a LandXML file as segments."""
+    unit = root.find(".//{*}Metric")
+    unit = root.find(".//{*}Imperial") if unit is None else unit
+    of_length = "meter" if unit is None else unit.get("linearUnit", "meter")
+    if of_length not in _UNITS:
+        raise InputFileError(path, f"linearUnit is {of_length!r}; one of {', '.join(_UNITS)} was expected")
+    scale = _UNITS[of_length]
+    system = root.find(".//{*}CoordinateSystem")
+    named = f"EPSG:{system.get('epsgCode')}" if system is not None and system.get("epsgCode") else None
+    segments = []
+    for number, alignment in enumerate(root.iterfind(".//{*}Alignment"), start=1):
+        name = alignment.get("name") or f"alignment {number}"
+        start = finite_number(alignment.get("staStart") or 0.0) * scale
+        geometry = alignment.find("{*}CoordGeom")
+        if geometry is None:
+            continue
+        try:
+            crs = choose_crs(path, reading.crs, named)
+            plan, order_notes = _read_plans(path, _elements(geometry), scale, crs)
+            profile = _read_profile(path, alignment.find(".//{*}ProfAlign"), scale, start)
+            cant, notes = _read_cant(alignment.find(".//{*}Cant"), scale, start)
+            notes += (*_notes(alignment, name), *order_notes)
+            stations = _read_stations(path, alignment, scale, start)
+        except KeyError as error:
+            raise InputFileError(
+                path, f"alignment {name!r}: cant of transition type {error} is not read; {', '.join(_CANT_LAWS)} are"
+            ) from None
+        except (TypeError, ValueError, AttributeError):
+            raise InputFileError(
+                path, f"alignment {name!r}: an element lacks a number that LandXML 1.2 has, or it is none"
+            ) from None
+        segments.append(
+            segment_of_design(
+                path=path,
+                name=name,
+                design=Design(plan=plan, profile=profile, cant=cant, stations=stations),
+                reading=replace(reading, crs=crs),
+                notes=notes,
+            )
+        )
+    if not segments:
+        raise InputFileError(path, "there is no Alignment with CoordGeom in this LandXML file")
+    return segments
+
+
+def _notes(alignment: Any, name: str) -> tuple[str, ...]:
+    """Return the notes on what of an alignment is not used."""
+    notes = []
+    if (count := len(alignment.findall(".//{*}ProfAlign"))) > 1:
+        notes.append(f"{name}: the first of {count} profiles is used")
+    return tuple(notes)
+
+
+def _elements(parent: Any) -> list[Any]:
+    """Return the children that are neither comments nor extensions of a country or program (`Feature`)."""
+    return [e for e in parent if isinstance(e.tag, str) and e.tag.rsplit("}", 1)[-1] != "Feature"]
+
+
+def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Stations:
+    """Return places in plan and the stations just before and after them: of the start, and of station equations."""
+    rows, before, sign = [(0.0, start, start)], (0.0, start), 1.0
+    for equation in alignment.iterfind("{*}StaEquation"):
+        ahead = finite_number(equation.get("staAhead")) * scale
+        if equation.get("staInternal") is not None:
+            place = finite_number(equation.get("staInternal")) * scale - start
+        else:
+            place = before[0] + sign * (finite_number(equation.get("staBack")) * scale - before[1])
+        back = before[1] + sign * (place - before[0])
+        if place < before[0] + 2.0 * _JUMP_M:
+            raise InputFileError(path, "its station equations do not rise from the start along the line; mend them")
+        rows.append((place, back, ahead))
+        sign = -1.0 if equation.get("staIncrement") == "decreasing" else 1.0
+        before = (place, ahead)
+    return Stations(rows=tuple(rows), last_sign=sign, jump_m=_JUMP_M)
+
+
+def _point(element: Any, name: str, scale: float, easting_first: bool) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the easting and northing of a child."""
+    first, second = (finite_number(v) for v in element.find(f"{{*}}{name}").text.split()[:2])
+    return np.array([first, second] if easting_first else [second, first]) * scale
+
+
+def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -> tuple[list[Plan], tuple[str, ...]]:
+    """Return the elements in plan, and a note where the file has easting before northing, against LandXML.
+
+    The order is the one in which the coordinates lie in the area of the CRS; where both do, the one in which elements
+    go on in the direction of those before.
+    """
+    plans, broken, inside = [], [], []
+    for easting_first in (False, True):
+        plan = [p for e in elements if (p := _read_plan(path, e, scale, easting_first)) is not None]
+        plans.append(plan)
+        broken.append(sum(_turn_at(a, b) > _BROKEN_RAD for a, b in pairwise(plan)))
+        inside.append(crs is None or not plan or is_within(crs, np.array([[p.x_m, p.y_m] for p in plan])))
+    if inside[0] != inside[1]:
+        chosen = int(inside[1])
+        if broken[chosen] > broken[1 - chosen]:
+            orders = ("northing first", "easting first")
+            raise InputFileError(
+                path,
+                f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the other side "
+                f"than they say (rot), with {orders[1 - chosen]} the reverse; mend the order of the coordinates",
+            )
+    else:
+        chosen = int(broken[1] < broken[0])
+    notes = (f"{path}: the file has easting before northing, against LandXML 1.2",) if chosen else ()
+    return plans[chosen], notes
+
+
+def _turn_at(before: Plan, after: Plan) -> float:
+    """Return the change of direction from the end of one element to the start of the next [rad]."""
+    ends = before.place_at(before.length_m - np.array([0.0, min(0.01, before.length_m / 2.0)]))
+    direction = np.arctan2(*(ends[0] - ends[1])[::-1])
+    return float(abs((after.direction_rad - direction + np.pi) % (2.0 * np.pi) - np.pi))
+
+
+def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Plan | None:
+    """Return an element in plan; None where it has no length."""
+    kind = element.tag.rsplit("}", 1)[-1]
+    start, end = (_point(element, name, scale, easting_first) for name in ("Start", "End"))
+    if kind in ("Line", "Curve", "Spiral") and np.hypot(*(end - start)) < _SAME_M:
+        return None
+    side = 1.0 if element.get("rot") == "ccw" else -1.0
+    if kind == "Line":
+        step = end - start
+        first = last = 0.0
+        direction, length, law = np.arctan2(step[1], step[0]), float(np.hypot(*step)), "linear"
+    elif kind == "Curve":
+        centre = _point(element, "Center", scale, easting_first)
+        radius = float(np.hypot(*(start - centre)))
+        first = last = side / radius
+        arm, other = start - centre, end - centre
+        direction = np.arctan2(arm[1], arm[0]) + side * np.pi / 2.0
+        turn = side * (np.arctan2(other[1], other[0]) - np.arctan2(arm[1], arm[0]))
+        length, law = radius * float(turn % (2.0 * np.pi)), "linear"
+    elif kind == "Spiral" and element.get("spiType") in (*_SPIRALS, *_ORDINATES):
+        middle = _point(element, "PI", scale, easting_first)
+        texts = [element.get(k) for k in ("radiusStart", "radiusEnd")]
+        radii = [0.0 if text == "INF" else finite_number(text) * scale for text in texts]
+        first, last = (side / radius if radius else 0.0 for radius in radii)  # programs write 0 for a straight end, too
+        if element.get("spiType") in _ORDINATES:
+            return _read_ordinates(path, _ORDINATES[element.get("spiType")], (start, middle, end), (first, last))
+        length, law = finite_number(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
+        if last == 0.0:  # parabolas are laid out from the tangent at the straight; half the bend is turned by each law
+            direction = np.arctan2(*(end - middle)[::-1]) - first * length / 2.0
+        else:
+            direction = np.arctan2(*(middle - start)[::-1])
+    else:
+        kind = f"{kind} {element.get('spiType') or ''}".strip()
+        raise InputFileError(path, f"element {kind} is not read; Line, Curve and Spiral ({', '.join(_CANT_LAWS)}) are")
+    return PlanElement(
+        x_m=float(start[0]),
+        y_m=float(start[1]),
+        direction_rad=float(direction),
+        first=first,
+        last=last,
+        length_m=length,
+        law=law,
+    )
+
+
+def _read_ordinates(
+    path: str, shape: Shape, points: tuple[Floats, Floats, Floats], curvature: tuple[float, float]
+) -> OrdinateElement:
+    """Return a transition of ordinates through its ends, the tangent of its straight end being that to its PI."""
+    start, middle, end = points
+    into = curvature[0] == 0.0
+    if (curvature[0] == 0.0) == (curvature[1] == 0.0):
+        raise InputFileError(path, f"a {shape} transition between two curves is not read; one end has to be straight")
+    straight, other = (start, end) if into else (end, start)
+    along = (middle - straight) / np.hypot(*(middle - straight))
+    tangent, ordinate = along @ (other - straight), along[0] * (other - straight)[1] - along[1] * (other - straight)[0]
+    element = OrdinateElement(
+        x_m=float(start[0]),
+        y_m=float(start[1]),
+        direction_rad=float(np.arctan2(*((middle - start) if into else (end - middle))[::-1])),
+        tangent_m=float(tangent),
+        ordinate_m=float(ordinate),
+        shape=shape,
+        into=into,
+    )
+    share = abs((element.last if into else element.first) / (curvature[1] if into else curvature[0]))
+    if not _ORDINATE_SHARE[0] < share < _ORDINATE_SHARE[1]:
+        raise InputFileError(path, f"the end of a {shape} transition is not that of its radius ({share:.2f} times)")
+    if not into:  # the direction at the curve is that of the tangent less the turn
+        element = replace(element, direction_rad=element.direction_rad + element.turn_rad)
+    return element
+
+
+def _read_profile(path: str, profile: Any, scale: float, start: float) -> list[ProfileElement]:
+    """Return the elements of points of vertical intersection and the curves at them."""
+    if profile is None:
+        return []
+    points = []
+    for element in _elements(profile):
+        kind = element.tag.rsplit("}", 1)[-1]
+        if kind not in ("PVI", "ParaCurve", "CircCurve"):
+            raise InputFileError(path, f"profile element {kind} is not read; PVI, ParaCurve and CircCurve are")
+        place, height = (finite_number(v) * scale for v in element.text.split()[:2])
+        points.append((kind, place - start, height, finite_number(element.get("length") or 0.0) * scale))
+    if any(b[1] <= a[1] for a, b in pairwise(points)):
+        raise InputFileError(path, "the stations of a profile do not rise from one PVI to the next; put them in order")
+    elements: list[ProfileElement] = []
+    grades = [(b[2] - a[2]) / (b[1] - a[1]) for a, b in pairwise(points)]
+    at = points[0][1]
+    for k, grade in enumerate(grades):
+        _, place, height, half = points[k][0], points[k][1], points[k][2], points[k][3] / 2.0
+        if half and k:
+            begin = place - half
+            elements.append(
+                ProfileElement(
+                    start_m=begin,
+                    length_m=2.0 * half,
+                    height_m=height - grades[k - 1] * half,
+                    first=grades[k - 1],
+                    last=grade,
+                    arc="circle" if points[k][0] == "CircCurve" else "parabola",
+                )
+            )
+            at = place + half
+        end = points[k + 1][1] - (points[k + 1][3] / 2.0 if k + 1 < len(grades) else 0.0)
+        if end - at > 1e-6:
+            elements.append(
+                ProfileElement(
+                    start_m=at, length_m=end - at, height_m=height + grade * (at - place), first=grade, last=grade
+                )
+            )
+        at = end
+    return elements
+
+
+def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement], tuple[str, ...]]:
+    """Return elements between cant stations and notes; the outer rail is raised unless named; units are mm, inches
+    where lengths are imperial (LandXML 1.2), metres in InfraModel.
+    """
+    if cant is None:
+        return [], ()
+    lowered = {"center": 0.5, "outsideRail": 1.0}.get(cant.get("rotationPoint", "insideRail"), 0.0)
+    found = list(cant.iterfind("{*}CantStation"))
+    applied = np.array([finite_number(element.get("appliedCant")) for element in found])
+    unit = 1e-3 if scale in _METRIC else 25.4e-3
+    notes: tuple[str, ...] = ()
+    if 0.0 < np.abs(applied).max(initial=0.0) < 1.0:
+        unit = scale
+        notes = (
+            f"cant: at most {np.abs(applied).max():g} in the file; taken in its unit of length, not in millimetres",
+        )
+    stations, laws = [], []
+    for element, value in zip(found, applied * unit, strict=True):
+        # clockwise is a curve to the right: the left rail is the outer one
+        outer, inner = value * (1.0 - lowered), -value * lowered
+        rails = (outer, inner) if element.get("curvature") == "cw" else (inner, outer)
+        stations.append((finite_number(element.get("station")) * scale - start, rails))
+        laws.append(_CANT_LAWS[element.get("transitionType", "clothoid")])
+    elements = [
+        CantElement(start_m=a[0], length_m=b[0] - a[0], left_m=(a[1][0], b[1][0]), right_m=(a[1][1], b[1][1]), law=law)
+        for (a, b), law in zip(pairwise(stations), laws, strict=False)
+        if b[0] > a[0]
+    ]
+    return elements, notes

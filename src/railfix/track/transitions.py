@@ -1,0 +1,132 @@
+"""Transition curves in plan that are given by ordinates over the tangent: cubic parabolas and the half-sine.
+
+With x along the tangent from the straight end, X the length on the tangent and R the radius at the other end:
+
+- cubic parabola ``y = x^3 / (6 R X)``, of many railways; IFC has ``y = x^3 / (6 R L)`` with the length L of the curve
+- with the correction of Japan's railways ``y = x^3 (1 + (X / 2R)^2)^1.5 / (6 R X)``, whose curvature at the
+  end is 1/R within half a percent
+- half-sine, of the Shinkansen, ``y = X^2 / R ((x/X)^2 / 4 - (1 - cos(pi x/X)) / (2 pi^2))``
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+
+Shape = Literal["cubic", "half-sine"]
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+_PIECES: Final = 16  #: Pieces of the quadrature of the length; 12 nodes each are exact to rounding.
+_ROUNDS: Final = 30  #: Steps of the fixed points below, which converge within ten.
+_HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: y R / X^2 at the end of a half-sine.
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrdinateElement:
+    """One transition between straight and curve, with ordinates over the tangent at its straight end."""
+
+    #: First point, easting and northing.
+    x_m: float
+    y_m: float
+    direction_rad: float  #: At the first point, counter-clockwise from the x axis.
+    tangent_m: float  #: Length on the tangent, X.
+    ordinate_m: float  #: Ordinate at X, positive to the left of the tangent seen from the straight.
+    shape: Shape = "cubic"
+    into: bool = True  #: Whether the first point is the straight end.
+
+    def _ordinates(self, x: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return y and its first and second derivative at places on the tangent."""
+        share, end, size = x / self.tangent_m, self.ordinate_m, self.tangent_m
+        if self.shape == "cubic":
+            return end * share**3, 3.0 * end / size * share**2, 6.0 * end / size**2 * share
+        scale, turn = end / _HALF_SINE_END, np.pi * share
+        return (
+            scale * (share**2 / 4.0 - (1.0 - np.cos(turn)) / (2.0 * np.pi**2)),
+            scale / size * (share / 2.0 - np.sin(turn) / (2.0 * np.pi)),
+            scale / size**2 * (1.0 - np.cos(turn)) / 2.0,
+        )
+
+    @cached_property
+    def _knots(self) -> tuple[Floats, Floats]:
+        """Places on the tangent and the lengths of the curve to them."""
+        x = np.linspace(0.0, self.tangent_m, _PIECES + 1)
+        return x, np.concatenate([[0.0], np.cumsum(self._length_between(x[:-1], x[1:]))])
+
+    def _length_between(self, start: Floats, end: Floats) -> Floats:
+        half = (end - start)[:, None] / 2.0
+        slope = self._ordinates(start[:, None] + half * (1.0 + _NODES))[1]
+        return np.asarray((half * _WEIGHTS * np.hypot(1.0, slope)).sum(axis=1))
+
+    @property
+    def length_m(self) -> float:
+        """Length of the curve."""
+        return float(self._knots[1][-1])
+
+    def _place_on_tangent(self, way_m: Floats) -> Floats:
+        """Return the places on the tangent of lengths of the curve from the first point."""
+        x, length = self._knots
+        target = way_m if self.into else length[-1] - way_m
+        piece = np.clip(np.searchsorted(length, target, side="right") - 1, 0, _PIECES - 1)
+        place = np.interp(target, length, x)
+        for _ in range(4):  # Newton: the slope is known
+            rest = length[piece] + self._length_between(x[piece], place) - target
+            place = place - rest / np.hypot(1.0, self._ordinates(place)[1])
+        return np.asarray(place)
+
+    @property
+    def turn_rad(self) -> float:
+        """Direction at the curved end, seen from the straight one, positive to the left [rad]."""
+        return float(np.arctan(self._ordinates(np.array([self.tangent_m]))[1][0]))
+
+    @property
+    def first(self) -> float:
+        """Curvature at the first point, positive to the left [1/m]."""
+        return float(self.curvature_at(np.zeros(1))[0])
+
+    @property
+    def last(self) -> float:
+        """Curvature at the last point."""
+        return float(self.curvature_at(np.array([self.length_m]))[0])
+
+    def curvature_at(self, way_m: Floats) -> Floats:
+        """Return the curvature [1/m] at distances from the first point."""
+        _, slope, second = self._ordinates(self._place_on_tangent(way_m))
+        curvature = second / np.hypot(1.0, slope) ** 3
+        return np.asarray(curvature if self.into else -curvature)
+
+    def place_at(self, way_m: Floats) -> Floats:
+        """Return the easting and northing at distances from the first point, shape (n, 2) [m]."""
+        x = self._place_on_tangent(way_m)
+        own = np.stack([x, self._ordinates(x)[0]], axis=-1)
+        if not self.into:  # from the curve to the straight: the same curve from its other end
+            cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
+            own = (np.array([self.tangent_m, self.ordinate_m]) - own) @ np.array([[cosine, -sine], [sine, cosine]])
+        cosine, sine = np.cos(self.direction_rad), np.sin(self.direction_rad)
+        return np.asarray(np.array([self.x_m, self.y_m]) + own @ np.array([[cosine, sine], [-sine, cosine]]))
+
+
+def cubic_of_length(
+    *, x_m: float, y_m: float, direction_rad: float, first: float, last: float, length_m: float, variant: str
+) -> OrdinateElement:
+    """Return a cubic parabola of a length of the curve: ``"length"`` (IFC), ``"tangent"`` or ``"corrected"``."""
+    into = first == 0.0
+    curvature = last if into else -first
+    tangent = length_m
+    for _ in range(_ROUNDS):
+        coefficient = curvature / (6.0 * (length_m if variant == "length" else tangent))
+        if variant == "corrected":
+            coefficient *= (1.0 + (curvature * tangent / 2.0) ** 2) ** 1.5
+        element = OrdinateElement(
+            x_m=x_m,
+            y_m=y_m,
+            direction_rad=direction_rad,
+            tangent_m=tangent,
+            ordinate_m=coefficient * tangent**3,
+            into=into,
+        )
+        tangent *= length_m / element.length_m
+    return element

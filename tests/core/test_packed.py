@@ -1,0 +1,65 @@
+"""Packed files are read as the plain one by every reader: gz, Z, bz2, xz, zip, zip of gz, KMZ."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import ncompress
+import pytest
+
+from railfix.core.errors import InputFileError
+from railfix.core.files import ending, read_bytes, unpacked_file
+
+pytestmark = pytest.mark.requirement("G5")
+
+TEXT = b"a line of text\n" * 400
+
+
+def zipped(content: bytes, name: str = "run.csv") -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("__MACOSX/._run.csv", b"x")
+        archive.writestr(name, content)
+    return file.getvalue()
+
+
+FORMS: dict[str, Callable[[bytes], bytes]] = {
+    "run.csv": bytes,
+    "run.csv.gz": gzip.compress,
+    "run.csv.Z": ncompress.compress,
+    "run.csv.bz2": bz2.compress,
+    "run.csv.xz": lzma.compress,
+    "run.zip": zipped,
+    "packed.zip": lambda content: zipped(gzip.compress(content), "run.csv.gz"),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_the_content_and_the_ending_are_those_of_the_plain_file(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(FORMS[name](TEXT))
+    assert read_bytes(path) == TEXT
+    assert ending(path) == ".csv"
+    with unpacked_file(path) as file:
+        content = file.read_bytes()
+        assert (gzip.decompress(content) if name == "packed.zip" else content) == TEXT
+    if name != "run.csv":
+        path.write_bytes(path.read_bytes()[:-40])
+        if not name.endswith(".Z"):  # which does not say how long it is
+            with pytest.raises(InputFileError, match=r"damaged|end early|cannot be read"):
+                read_bytes(path)
+
+
+def test_an_archive_of_several_files_names_them(tmp_path: Path) -> None:
+    path = tmp_path / "two.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.obs", TEXT)
+        archive.writestr("b.obs", TEXT)
+    with pytest.raises(InputFileError, match=r"zip archive of 2 files \(a.obs, b.obs\); unpack it"):
+        read_bytes(path)
