@@ -253,8 +253,8 @@ def check_ranges(
 
 #: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.
 _LARGEST_VARIANCE: Final = 1e4
-#: Probability that the residuals of consistent ranges fail the test below.
-_CONSISTENT: Final = 1e-3
+#: Variance of an epoch's ranges in space over that of the receiver from which on they contradict each other.
+_CONTRADICT: Final = 25.0
 
 
 def _consistent(
@@ -266,7 +266,7 @@ def _consistent(
 
     def contradict(point: SinglePoint, ranges: Ranges) -> Masks:
         freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
-        return np.asarray(point.wsse > chdtri(freedom, _CONSISTENT) * np.maximum(scale, 1.0) ** 2)
+        return np.asarray(point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2)
 
     wrong = excluded & (agreeing.weight > 0) & contradict(free, agreeing)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
