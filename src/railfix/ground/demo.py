@@ -33,7 +33,7 @@ from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops
 from railfix.ground.triangle import MonitorState, TriangleLimits, TriangleVerdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io.train_message import TrainMessage, encode
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
 
 
 class RelaySettings(Settings):
