@@ -45,7 +45,7 @@ class LargeSigmaScreen(ObservationScreen[LargeSigmaLimits]):
         self, antenna: AntennaRanges, limits: LargeSigmaLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
         """Return the verdict on a chunk; the screen has no memory."""
-        screened = Screened(metric=antenna.sigma_m, reject=antenna.sigma_m > limits.limit_m)
+        screened = Screened(metric=antenna.sigma_m, reject=antenna.sigma_m > limits.limit_m, limit=limits.limit_m)
         return (Verdict(name=self.name, reason=REASON, screened=screened),), None
 
     def pictures(self, tables: RunTables, limits: LargeSigmaLimits) -> Iterator[tuple[str, ScreenPicture]]:

@@ -25,9 +25,9 @@ read                         `read_observations`, `read_navigation`, `read_track
 position in Python           `EpochProcessor` with a `Config` and `Trajectory` objects
                              (`antenna_trajectory`); the answer is a `Result`
 position files               `run_files` with `RunInputs`
-stages by hand               `ranges.corrected_ranges`, `positioning.find_section`,
-                             `positioning.position_on_line`, `integrity.exclude_faults`,
-                             `integrity.protection_level`, the screens of `screens`
+stages by hand               `ranges.find_satellites`, `ranges.corrected_ranges`, the screens of `screens`,
+                             `positioning.find_section`, `positioning.position_on_line`,
+                             `integrity.exclude_faults`, `integrity.protection_level`
 tables                       `train_table` (the filter), `positions_table`, `observations_table`, `to_xarray`
 evaluate and report          `evaluate_runs`, `write_report`
 from and to georinex         `observations_from_xarray`, `observations_to_xarray`,

@@ -33,8 +33,8 @@ from typing import Any
 import numpy as np
 
 from railfix.ground.demo import LinkDisturbance, RelaySettings
+from railfix.ground.keys import write_keys
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks, create_bearers
-from railfix.ground.quic import write_keys
 
 #: Namespaces, and addresses of both bearers in each.
 TRAIN, CENTRE = f"rf{os.getpid()}t", f"rf{os.getpid()}c"

@@ -21,8 +21,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 
 import synthetic
-from railfix.positioning.normal_equations import Ranges, SinglePoint, single_point
-from railfix.positioning.section_search import SearchIndex, search
+from railfix.positioning.normal_equations import SinglePoint, point_position
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.search_index import SearchIndex
+from railfix.positioning.section_search import find_section
 from railfix.track.trajectory import Trajectory
 
 LENGTHS_M = (1_000.0, 200_000.0)
@@ -43,13 +45,13 @@ def case(line: Trajectory, epochs: int, satellites: int, layout: str) -> tuple[R
     ranges = synthetic.ranges(line, places(line, epochs, layout))
     if satellites < ranges.weight.shape[1]:
         ranges = replace(ranges, weight=np.where(np.arange(ranges.weight.shape[1]) < satellites, ranges.weight, 0.0))
-    return ranges, single_point(ranges, np.broadcast_to(line.ecef_m.mean(axis=0), (epochs, 3)))
+    return ranges, point_position(ranges, np.broadcast_to(line.ecef_m.mean(axis=0), (epochs, 3)))
 
 
 def microseconds(ranges: Ranges, index: SearchIndex, point: SinglePoint) -> float:
     """Time an epoch of one call over all epochs [us]."""
     begin = time.perf_counter()
-    search(ranges, index, point)
+    find_section(ranges, index, point)
     return 1e6 * (time.perf_counter() - begin) / len(ranges)
 
 
@@ -69,7 +71,7 @@ def main() -> None:
     ):
         cases = [case(line, epochs, satellites, layout) for line in lines]
         looked = [
-            float(search(ranges, index, point).evaluations.mean())
+            float(find_section(ranges, index, point).evaluations.mean())
             for index, (ranges, point) in zip(indices, cases, strict=True)
         ]
         times = np.array(

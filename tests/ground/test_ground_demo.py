@@ -14,7 +14,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from starlette.routing import Route
 
 from railfix.ground import web
 from railfix.ground.demo import FAULT_S, run_demo
-from railfix.ground.quic import write_keys
+from railfix.ground.keys import write_keys
 from railfix.ground.web import MOST_WRONG, SESSION_S, PageServer, Sessions, page_app
 from report_page import _OPTIONS, Page, browser, fetched
 
@@ -272,6 +272,43 @@ def test_a_request_that_does_not_end_is_ended(
                 assert time.monotonic() - begin < 2.0, text
                 assert answer.startswith(b"HTTP/1.1 ") or text in (b"", b"GET / HT")
                 assert text != begun or answer.startswith(b"HTTP/1.1 403")
+
+
+def test_many_half_open_connections_lock_nobody_out() -> None:
+    """550 connections that say nothing, of the operator's own address: each of 20 orders is answered."""
+    given: list[Any] = []
+    app = page_app(lambda: {"done": False}, {"stop": lambda values, by: given.append((values, by))}, sessions=Sessions(
+        password="secret", others={"anna": "word"}))  # fmt: skip
+    with served(app) as url:
+        host, port = url.split("/")[2].split(":")
+        browser = Browser(url)
+        open_ = [socket.create_connection((host, int(port))) for _ in range(300)]
+        assert browser.post("login", {"name": "anna", "password": "word"}) == (200, None)
+        for k in range(20):
+            open_ += [socket.create_connection((host, int(port))) for _ in range(12)]
+            assert browser.post("orders/stop", {"train": k}) == (200, None)
+        for connection in open_:
+            connection.close()
+    assert given == [({"train": k}, "anna") for k in range(20)]
+
+
+@needs_browser
+def test_a_page_without_news_says_within_two_seconds_that_it_is_old(
+    demo: tuple[dict[str, Any], dict[str, Any]],
+) -> None:
+    """The events stop after the first; the centre's loop may hang, or the network."""
+    state = {**demo[1], "done": False}
+
+    async def silent() -> AsyncIterator[str]:
+        yield f"data: {json.dumps(state)}\n\n"
+        await asyncio.sleep(30.0)
+
+    app = page_app(lambda: state, {}, sessions=Sessions(password="secret"))
+    app.router.routes[:] = [route for route in app.router.routes if getattr(route, "path", "") != "/events"]
+    app.router.routes.append(Route("/events", lambda _: StreamingResponse(silent(), media_type="text/event-stream")))
+    with served(app) as url:
+        page = Page(browse(url, "--timeout=3500", "--dump-dom"))
+    assert "OLD: no word from the centre for" in page.text["stale"]
 
 
 def test_beyond_loopback_addresses_the_page_is_served_by_tls(

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from explored_line import World, explore, small_world
-from test_ground_attacks import RULES
-from test_ground_interlocking import take_out
+from ground_rules import RULES, take_out
 
 pytestmark = [pytest.mark.requirement("F4"), pytest.mark.requirement("F6")]
 

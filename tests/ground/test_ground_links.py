@@ -5,20 +5,26 @@ from __future__ import annotations
 import asyncio
 import gc
 import random
+import shutil
 import time
 from collections import Counter
 from collections.abc import Coroutine
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from cryptography.x509 import load_pem_x509_certificate
 
 from attacked_link import AttackedLink, AttackSettings
 from railfix.core.errors import OutputError
+from railfix.ground import keys as keys_module
 from railfix.ground.demo import Relay, RelaySettings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
+from railfix.ground.keys import list_ending, renew_keys, write_keys
 from railfix.ground.links import (
     BEARERS,
     CentreLinks,
@@ -30,7 +36,7 @@ from railfix.ground.links import (
     create_bearers,
     round_trips,
 )
-from railfix.ground.quic import LinkProtocol, configuration, connection, write_keys
+from railfix.ground.quic import LinkProtocol, configuration, connection
 
 pytestmark = pytest.mark.requirement("F3")
 
@@ -38,7 +44,8 @@ SECOND = 1_000_000_000
 
 
 def frame(sequence: int, *, sender: int = 7, at_s: float = 0.0, kind: FrameKind = FrameKind.DATA) -> Frame:
-    return Frame(kind=kind, sender=sender, sequence=sequence, time_ns=round(at_s * SECOND), payload=b"place")
+    time_ns = round(at_s * SECOND)
+    return Frame(kind=kind, sender=sender, session=1, sequence=sequence, time_ns=time_ns, payload=b"place")
 
 
 def test_every_flipped_bit_is_rejected_and_counted() -> None:
@@ -63,7 +70,7 @@ def test_each_threat_has_its_counter() -> None:
     assert used("A", frame(3, at_s=0.9), 1.1) is None  # overtaken
     assert used("A", frame(5, at_s=2.0), 4.1) is None  # 2.1 s late
     assert used("A", frame(6, sender=8, at_s=5.0), 5.0) is None
-    assert used("A", frame(100, at_s=6.0), 6.0) is None
+    assert used("A", frame(1_000, at_s=6.0), 6.0) is None
     assert receiver.threats == {
         Threat.REPETITION: 1, Threat.DELETION: 2, Threat.RESEQUENCING: 1, Threat.DELAY: 1, Threat.MASQUERADE: 1,
         Threat.INSERTION: 1,
@@ -72,14 +79,30 @@ def test_each_threat_has_its_counter() -> None:
 
 
 def test_one_number_far_ahead_locks_nobody_out() -> None:
-    """It counts once the next goes on from there, as after a start of the sender; right ones go on before that."""
-    receiver = FrameReceiver(sender=7, limits=ReceiverLimits(jump=50))
-    used = [
-        receiver.receive("A", frame(k).encode(), 0)[1] is not None for k in (1, 2, 1 << 60, 3, 9_000, 4, 9_000, 9_001)
-    ]
-    assert used == [True, True, False, True, False, True, False, True]
-    assert receiver.threats[Threat.INSERTION] == 3
-    assert receiver.receive("A", frame(5).encode(), 0)[1] is None
+    """However often it comes; after an outage a number may be as far ahead as a sender counts meanwhile."""
+    receiver = FrameReceiver(sender=7, limits=ReceiverLimits(jump=50, rate=100.0, delay_s=1e9))
+    numbers = (1, 2, 1 << 60, 3, 9_000, 4, 9_000, 9_001)
+    used = [receiver.receive("A", frame(k).encode(), 0)[1] is not None for k in numbers]
+    assert used == [True, True, False, True, False, True, False, False]
+    assert receiver.threats[Threat.INSERTION] == 4
+    assert receiver.receive("A", frame(9_000).encode(), 90 * SECOND)[1] is not None
+
+
+def test_a_start_of_the_sender_begins_anew_and_what_is_late_of_the_one_before_is_rejected() -> None:
+    """Numbers and the clock's origin begin again, by no clock that could be set back."""
+    receiver = FrameReceiver(sender=7, limits=ReceiverLimits(delay_s=2.0))
+
+    def is_used(session: int, number: int, at_s: float) -> bool:
+        sent = replace(frame(number, at_s=at_s), session=session)
+        return receiver.receive("A", sent.encode(), 50 * SECOND)[1] is not None
+
+    assert is_used(1, 700, 40.0)
+    assert is_used(2, 1, 1e6)
+    assert not is_used(1, 701, 40.0)
+    assert receiver.threats == {Threat.RESEQUENCING: 1}
+    assert is_used(2, 2, 1e6)
+    assert is_used(3, 1, 0.0)
+    assert not is_used(2, 3, 1e6)
 
 
 def test_the_origin_of_the_senders_clock_does_not_matter() -> None:
@@ -97,7 +120,7 @@ def test_no_message_is_used_twice_and_none_older_after_a_newer(count: int) -> No
     rng, receiver, used, newest = random.Random(3), FrameReceiver(sender=7), set(), -1
     held: list[tuple[str, bytes]] = []
     for sequence in range(count):
-        data = Frame(kind=FrameKind.DATA, sender=7, sequence=sequence, time_ns=sequence * 1000).encode()
+        data = Frame(kind=FrameKind.DATA, sender=7, session=1, sequence=sequence, time_ns=sequence * 1000).encode()
         arriving = [(link, data) for link in ("A", "B") if rng.random() > 0.2]
         if held and rng.random() < 0.3:
             arriving.append(held.pop(rng.randrange(len(held))))
@@ -224,11 +247,15 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_keys_are_readable_by_their_owner_and_never_replaced(keys: Path) -> None:
     assert {path.name for path in keys.iterdir()} == {
-        "authority.pem", "centre.pem", "centre.key", "train-7.pem", "train-7.key", "train-8.pem", "train-8.key",
+        "authority.pem", "authority.key", "centre.pem", "centre.key", "train-7.pem", "train-7.key", "train-8.pem",
+        "train-8.key",
     }  # fmt: skip
-    assert (keys / "train-7.key").stat().st_mode & 0o077 == 0
-    with pytest.raises(OutputError, match="is there already"):
-        write_keys(keys, [9])
+    assert all((keys / name).stat().st_mode & 0o077 == 0 for name in ("train-7.key", "authority.key"))
+    before = {path.name: path.read_bytes() for path in keys.iterdir()}
+    with pytest.raises(OutputError, match="every certificate is there already"):
+        write_keys(keys, [7])
+    assert [path.name for path in write_keys(keys, [7, 9])] == ["train-9.pem", "train-9.key"]
+    assert {path.name: path.read_bytes() for path in keys.iterdir()}.items() > before.items()
 
 
 HOSTS = {"A": "127.0.1.1", "B": "127.0.2.1"}
@@ -391,7 +418,9 @@ def test_a_centre_that_does_not_answer_is_one_time_out(keys: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["other authority", "no certificate", "other train"])
-def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) -> None:
+def test_a_wrong_certificate_is_rejected(
+    keys: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def work() -> None:
         got: list[bytes] = []
         centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload))
@@ -411,15 +440,13 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
 
             def without(path: Path, name: str, **rest: Any) -> Any:
                 settings = plain(path, name, **rest)
+                if name == "centre":
+                    return settings
                 settings.certificate = settings.private_key = None
                 return settings
 
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(links, "configuration", without)
-                await train.start()
-                await asyncio.sleep(0.1)
-        else:
-            await train.start()
+            monkeypatch.setattr(links, "configuration", without)
+        await train.start()
         for _ in range(40):
             train.send(b"from 7")
             await asyncio.sleep(0.02)
@@ -431,7 +458,7 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
     run(work())
 
 
-@pytest.mark.parametrize("how", ["revoked", "expired"])
+@pytest.mark.parametrize("how", ["revoked", "serial number", "expired"])
 @pytest.mark.every(2)
 def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
     write_keys(tmp_path / "keys", [7, 8])
@@ -454,12 +481,17 @@ def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
 
         assert await _until(lambda: all(len(t.protocols) == 2 for t in trains.values()), 5.0) < 5.0
         assert await carried({7, 8})
-        if how == "revoked":
-            (keys / "revoked.txt").write_text("train-7\n")
+        serial = load_pem_x509_certificate((keys / "train-7.pem").read_bytes()).serial_number
+        if how != "expired":
+            (keys / "revoked.txt").write_text("train-7\n" if how == "revoked" else f"{serial:#x}\n")
         else:
             for (number, _), protocol in centre._peers.items():
                 if number == 7:
-                    protocol.ends = datetime(2020, 1, 1, tzinfo=UTC)
+                    ended: Any = SimpleNamespace(
+                        not_valid_after_utc=datetime(2020, 1, 1, tzinfo=UTC), serial_number=1,
+                        subject=protocol.certificate.subject,  # type: ignore[union-attr]
+                    )  # fmt: skip
+                    protocol.certificate = ended
         rejected = centre.masquerades
         assert await _until(lambda: centre.masquerades >= rejected + 2, 5.0) < 5.0
         if how == "revoked":
@@ -469,9 +501,57 @@ def test_a_certificate_ends_while_connected(tmp_path: Path, how: str) -> None:
             (keys / "revoked.txt").write_bytes(b"\xff\xfe")
             assert await _until(lambda: centre.alarm is not None, 5.0) < 5.0
             assert await carried({8})
+        if how == "serial number":  # a new certificate counts, taken over by the next connection
+            renew_keys(keys, [7])
+            assert load_pem_x509_certificate((keys / "train-7.pem").read_bytes()).serial_number != serial
+            await _until(lambda: len(trains[7].protocols) == 2, 5.0)
+            assert await carried({7, 8})
         for train in trains.values():
             await train.stop()
         await centre.stop()
+
+    run(work())
+
+
+def test_an_authority_that_ends_is_renewed_with_overlap(tmp_path: Path) -> None:
+    """Both certificates of the authority are valid: old and new ends of the links trust each other."""
+    old, new = tmp_path / "old", tmp_path / "new"
+    write_keys(old, [7, 8], valid_days=20)
+    assert [text.partition(" ends")[0] for text in list_ending(old, "centre")] == ["the certificate centre.pem"]
+    shutil.copytree(old, new)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(keys_module, "AUTHORITY_DAYS", 25)
+        short = tmp_path / "short"
+        write_keys(short, [7, 8], valid_days=20)
+        assert len(list_ending(short, "centre")) == 2
+    shutil.copytree(short, tmp_path / "renewed")
+    renew_keys(tmp_path / "renewed", [7])
+    assert list_ending(tmp_path / "renewed", "centre") == []
+    both = (tmp_path / "renewed" / "authority.pem").read_bytes()
+    assert both.endswith((short / "authority.pem").read_bytes())
+    (short / "authority.pem").write_bytes(both)  # handed to every end before the new certificates
+
+    async def work() -> None:
+        got: list[int] = []
+        for folder, numbers in ((short, (7, 8)), (tmp_path / "renewed", (7, 8))):
+            centre = CentreLinks(folder, HOSTS, received=lambda train, _: got.append(train))
+            await centre.start()
+            for number in numbers:
+                of = tmp_path / "renewed" if number == 7 else short
+                train = TrainLinks(number, of, create_bearers(centre.addresses, LOCAL))
+                await train.start()
+                await _until(lambda train=train: len(train.protocols) == 2, 5.0)  # type: ignore[misc]
+                train.send(b"place")
+                await _until(lambda number=number: number in got, 2.0)  # type: ignore[misc]
+                if number == 8:  # looked at once a second
+                    await _until(lambda centre=centre: any("train-8" in a for a in centre.alarms()), 4.0)  # type: ignore[misc]
+                alarms = centre.alarms()
+                await train.stop()
+            assert sorted(set(got)) == [7, 8]
+            assert any("the certificate of train-8 ends" in text for text in alarms)
+            assert not any("train-7" in text for text in alarms)
+            got.clear()
+            await centre.stop()
 
     run(work())
 

@@ -23,16 +23,19 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli.ground import app
+from railfix.ground.authority import Authority
 from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
-from railfix.ground.interlocking import HEAD, Interlocking, TrainInterval, from_documents
-from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, create_bearers, first_sequence
-from railfix.ground.quic import write_keys
-from railfix.ground.serve import STEP_S, SimulatedPoints, _work, run_centre
+from railfix.ground.field import SimulatedPoints
+from railfix.ground.keys import write_keys
+from railfix.ground.links import BEARERS, LinkLimits, TrainLinks, create_bearers
+from railfix.ground.on_board import OnBoard, OnBoardLimits
+from railfix.ground.serve import STEP_S, _work, run_centre
+from railfix.ground.state import HEAD, Interlocking, TrainInterval, from_documents
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
-from railfix.ground.train import Authority, OnBoard, OnBoardLimits, run_train
+from railfix.ground.train import run_train
 from railfix.ground.triangle import MonitorLimits, TriangleVerdict
 from railfix.io.train_message import MessageStatus, SuspectedInterference, encode, to_json
 
@@ -98,7 +101,7 @@ def test_a_killed_centre_keeps_what_its_trains_know(folder: Path, tmp_path: Path
     async def work() -> None:
         train = SimulatedTrain(
             number=1, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0), length_m=80.0,
-            sequence=first_sequence(),
+
         )  # fmt: skip
         newest: list[Authority] = []
         sent: set[int] = set()
@@ -236,7 +239,7 @@ def test_a_train_whose_positions_end_waits_for_its_last_answer(folder: Path, tmp
     reports, authorities = asyncio.run(asyncio.wait_for(work(), 60.0))
     assert reports == 1
     assert authorities > 0
-    assert any(line.get("report", 0) > 1 for line in lines)
+    assert any(line.get("report") == 1 for line in lines)
 
 
 @pytest.mark.parametrize("taken", ["page", "bearer B"])
@@ -337,13 +340,15 @@ def layout_state() -> Interlocking:
 
 def restored(store: Store, state: Interlocking, sent: list[Authority], now: list[float]) -> ControlCentre:
     moved: list[Any] = []
+    asked: list[Any] = []
     supervision = Supervision(
         layout=line_with_loops(3), state=state, command=lambda point, _: moved.append(point), routes="by hand"
     )
     control = ControlCentre.restore(
         supervision, store, judged=True, curves={}, send=lambda _, data: sent.append(Authority.decode(data)),
-        clock=lambda: now[0], wall_ns=lambda: 0, times=MonitorLimits(healthy_s=5.0),
+        clock=lambda: now[0], wall_ns=lambda: 0, times=MonitorLimits(healthy_s=5.0), ask=asked.append,
     )  # fmt: skip
+    control.asked = asked  # type: ignore[attr-defined]
     control.moved = moved  # type: ignore[attr-defined]
     return control
 
@@ -377,7 +382,11 @@ def test_routes_and_the_release_by_hand(
     seconds(1, TriangleVerdict.HEALTHY)
     assert sent[-2].end_cm == 192_000
     assert "A" in control.point_name((0, 1))
-    for line in ("stop released by hand", "train 1: route asked for by hand", "train 1: route to B, track 1"):
+    for line in (
+        "stop released by hand",
+        'order of the page: route {"train": 1}: done',
+        "train 1: route to B, track 1",
+    ):
         assert any(line in text for text in control.lines)
 
     seconds(4, None)  # nothing judges any more
@@ -395,11 +404,19 @@ def test_routes_and_the_release_by_hand(
     assert again.monitor is not None
     assert (again.monitor.stopped, again.monitor.cause) == (True, TriangleVerdict.MONITOR_LOST)
     assert again.supervision.state.trains[1].end_m == 1920.0
-    assert again.moved == [(1, -1)]  # type: ignore[attr-defined]
     numbers = [a.number for a in sent]
     again.step()
     assert sent[-1].number > max(numbers)
     assert sent[-1].stopped
+    # what was detected before is not believed: the field is asked; nothing is commanded under an interval
+    assert set(again.asked) == set(again.supervision.layout.points())  # type: ignore[attr-defined]
+    assert {point.detected for point in again.supervision.state.points.values()} == {None}
+    for name in again.asked:  # type: ignore[attr-defined]
+        again.supervision.set_detected(name, 2 if name == (1, -1) else 1)
+    again.step()
+    assert again.moved == []  # type: ignore[attr-defined]
+    assert again.supervision.state.trains[1].stop == "points of its route lie otherwise"
+    assert again.supervision.state.trains[2].stop is None
 
 
 def test_an_order_to_stop_is_acknowledged_and_timed(
@@ -440,7 +457,7 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
     assert (lost["state"], lost["shown"]) == ("simulated", shown["shown"])
     assert shown["place"] == ""  # without a reference run
     assert lost["place"] == "A to B, 10 %"  # P5 3.1: 400 m, the stations stop at 250 and 1750 m
-    assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed"
+    assert orders["release-train"]({"train": 1}) == "the section where train 1 is or may run is closed: A"
     assert orders["open-section"]({"section": "A"}) is None
     assert (orders["release-train"]({"train": 1}) or "").startswith("train 1 is silent")
     second(delivered=True)

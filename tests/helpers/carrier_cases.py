@@ -10,7 +10,8 @@ import synthetic
 from railfix.core.geodesy import range_with_rotation
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import Phases
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.range_arrays import Ranges
+from railfix.ranges.channels import clock_groups
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

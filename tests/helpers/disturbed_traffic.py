@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from railfix.ground.interlocking import Interlocking, from_documents, to_documents
 from railfix.ground.layout import Layout
+from railfix.ground.on_board import OnBoard
+from railfix.ground.state import Interlocking, from_documents, to_documents
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops
-from railfix.ground.train import OnBoard
 from railfix.io.train_message import TrainMessage
 
 

@@ -11,10 +11,11 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, field, replace
 
-from railfix.ground.interlocking import InterlockingLimits, from_documents, to_documents
+from railfix.ground.authority import Authority
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
+from railfix.ground.on_board import OnBoard
+from railfix.ground.state import InterlockingLimits, from_documents, to_documents
 from railfix.ground.supervision import Supervision, at_start, standing_train
-from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 STEP_S, LENGTH_M, BOUND_M, WAY_M = 10.0, 80.0, 5.0, 500.0

@@ -210,7 +210,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("heights_missing.csv", csv(LINE * [1, 1, 0] - [0, 0, 9999]), "found", "-9,999 m, where no railway is"),
     Odd("height_of_zero.csv", csv(np.where(np.arange(N)[:, None] == 9, [1, 1, 0], 1) * LINE), "found", "the height"),
     Odd("heights_in_millimetres.csv", csv(LINE * [1, 1, 1000]), "found", "is it in millimetres"),
-    Odd("column_in_feet.csv", csv(LINE / [1, 1, _FOOT]).replace("t_m", "t_ft"), "refused", "is 'height_m' meant?"),
+    Odd("column_in_feet.csv", csv(LINE / [1, 1, _FOOT]).replace("t_m", "t_ft"), "refused", "is in feet"),
     Odd("two_datums.csv", csv(np.vstack([LINE[:20], LINE[20:] - [0, 0, 47]])), "found", "the height deviates from"),
     Odd("repeated.csv", csv(np.repeat(LINE, 2, axis=0)), "refused", "the same point as line 3"),
     Odd("out_of_order.csv", csv(LINE[np.random.default_rng(0).permutation(N)]), "found", "the direction turns by"),

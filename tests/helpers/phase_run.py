@@ -24,7 +24,7 @@ from railfix.positioning.carrier.observation_model import (
     reduce,
     shift_phases,
 )
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
 #: Last step along the line [m], and linearisations at most.

@@ -132,7 +132,7 @@ def flat(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
     else:
         items = [(item.name, getattr(value, item.name)) for item in fields(value)]
     for name, inner in items:
-        if name in NO_EPOCHS or inner is None:
+        if name in NO_EPOCHS or inner is None or isinstance(inner, float):
             continue
         if isinstance(inner, np.ndarray):
             found[prefix + name] = inner

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from types import ModuleType
@@ -12,16 +13,16 @@ import numpy as np
 import pytest
 
 from railfix import kernels
-from railfix.kernels.tracking import layout, references
+from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
-from railfix.tracking.bank import OTHERS, SENSORS, SourceKind, budget, classify_source
-from railfix.tracking.filter import _parameters
-from railfix.tracking.handover import _work_space
+from railfix.tracking.bank import OTHERS, SourceKind, classify_source
+from railfix.tracking.packing import _pack_sources, pack_parameters
+from railfix.tracking.state import CLOCKS, HYPOTHESIS, MONITORS, SATELLITES
 
 
 def _compiled_modules() -> list[str]:
     """Modules with compiled functions: compiled or not, they are imported together."""
-    kept = (".layout", ".constants", ".compiling", ".references")
+    kept = (".layout", ".constants", ".compiling")
     return [name for name in sys.modules if name.startswith("railfix.kernels.") and not name.endswith(kept)]
 
 
@@ -30,7 +31,6 @@ def plain(name: str) -> ModuleType:
     """A module of `railfix.kernels` that the compiler has left alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("NUMBA_DISABLE_JIT", "1")
-        patch.setattr(references, "by_reference", references._as_it_is)
         for attribute, value in list(vars(kernels).items()):
             if isinstance(value, ModuleType):
                 patch.setattr(kernels, attribute, value)  # an import sets it
@@ -48,50 +48,33 @@ def named_tuple(kind: type, **values: Any) -> Any:
     return kind(**{name: values.get(name) for name in fields})
 
 
-def parameters(limits: TrackingLimits) -> layout.Parameters:
-    return _parameters(limits, limits.map_branch_m)
+def given(limits: TrackingLimits) -> layout.Given:
+    """What the recursion reads, settings alone."""
+    made = named_tuple(layout.Given, parameters=pack_parameters(limits, 0.0), line=np.zeros(1, dtype=layout.LINE))
+    return cast(layout.Given, made)
 
 
-def work_space(hypotheses: int, sources: int = 0) -> layout.Work:
-    return _work_space(4, len(SENSORS), 12, hypotheses, sources)[1]
+def kernel_state(
+    place_m: Any,
+    sigma_m: Any,
+    log_probability: Any,
+    limits: TrackingLimits,
+    names: Sequence[str] = (),
+    **monitors: float,
+) -> layout.State:
+    """Hypotheses at places, and sub-filters by the names of their sources, those of satellites first.
 
-
-def memory(
-    place_m: np.ndarray, sigma_m: np.ndarray, log_probability: np.ndarray, **scalars: float
-) -> layout.KernelState:
-    """Hypotheses at places; scalars by their names in the layout."""
-    count = len(place_m)
-    mean, covariance = np.zeros((count, 12)), np.zeros((count, 12, 12))
-    mean[:, layout.ARC], covariance[:, layout.ARC, layout.ARC] = place_m, sigma_m**2
-    values = np.zeros(layout.MOTION_MISFIT + 1)
-    values[layout.HYPOTHESES] = count
-    for name, value in scalars.items():
-        values[getattr(layout, name)] = value
-    made = named_tuple(
-        layout.KernelState,
-        mean=mean,
-        covariance=covariance,
-        log_probability=log_probability.copy(),
-        log_code=np.zeros(count),
-        log_recent=np.zeros(count),
-        scalars=values,
-    )
-    return cast(layout.KernelState, made)
-
-
-def subfilters(names: list[str], place_m: Any, sigma_m: Any, limits: TrackingLimits, weak_s: Any = 0.0) -> Any:
-    """Running sub-filters at places, those of satellites first; the last ones, `OTHERS`, not running."""
-    given, kinds = budget(limits), [classify_source(name) for name in (*names, *OTHERS)]
-    size = len(kinds)
-    mean, covariance = np.zeros((size, 12)), np.zeros((size, 12, 12))
-    mean[: len(names), layout.ARC], covariance[: len(names), layout.ARC, layout.ARC] = place_m, np.square(sigma_m)
-    return named_tuple(
-        layout.Subfilters,
-        running=np.arange(size) < len(names),
-        mean=mean,
-        covariance=covariance,
-        weak_s=np.where(np.arange(size) < len(names), np.resize(weak_s, size), 0.0),
-        prior=np.array(given.prior)[kinds],
-        k=np.array(given.k_fault)[kinds],
-        clock=np.zeros(kinds.count(SourceKind.SATELLITE), dtype=np.intp),
-    )
+    `OTHERS` come after these; places and sigmas are those of the hypotheses and then of the sub-filters named, which
+    run.
+    """
+    listed = [*names, *OTHERS] if names else []
+    count, satellites = len(log_probability), sum(classify_source(name) == SourceKind.SATELLITE for name in names)
+    x, P = np.zeros((count + len(listed), SATELLITES)), np.zeros((count + len(listed), SATELLITES, SATELLITES))
+    x[: len(place_m), layout.ARC], P[: len(place_m), layout.ARC, layout.ARC] = place_m, np.square(sigma_m)
+    hypothesis, values = np.zeros(count, dtype=HYPOTHESIS), np.zeros(1, dtype=MONITORS)
+    hypothesis["log_probability"], values["hypotheses"] = log_probability, count
+    for name, value in monitors.items():
+        values[name] = value
+    source = _pack_sources(listed, limits)
+    source["running"][: len(place_m) - count] = True
+    return layout.State(x, P, hypothesis, values, np.zeros(satellites), np.zeros(len(CLOCKS), dtype=bool), source)

@@ -7,7 +7,8 @@ import numpy as np
 
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.range_arrays import Ranges
+from railfix.ranges.channels import clock_groups
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

@@ -25,9 +25,9 @@ from railfix.integrity.protection.araim import (
 )
 from railfix.pipeline import level_stage
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.corrected_ranges import Models
 from railfix.pipeline.level_stage import with_map
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.range_stage import Models
 
 MESSAGE = """
 format = "railfix integrity support 1"

@@ -19,11 +19,11 @@ from railfix.core.geodesy import elevation_azimuth, range_with_rotation
 from railfix.core.reasons import Status
 from railfix.integrity.protection import SATELLITE_PRIOR, RiskBudget, open_places
 from railfix.integrity.protection.open_places import places_beyond_the_level
-from railfix.integrity.raim import constrained_model
+from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.search_index import SearchIndex
 from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
@@ -106,13 +106,13 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
     ranges, level, arc = ranges.take(rows), level[rows], result.constrained.arc_m[rows]
     section = result.constrained.section[rows]
     systems = [name[0] for name in result.satellite[result.columns].tolist()]
-    model = constrained_model(ranges, line, arc, section=section)
+    model = linear_model(ranges, line, arc, section=section)
     scale = np.maximum(result.noise_scale[rows], 1.0)
     index = SearchIndex(line)
     elevation, azimuth = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(arc))
     right = np.sin(np.radians(azimuth - line.heading_deg[section][:, None])) > 0
     sides = np.stack([(elevation < 45.0) & ~right, (elevation < 45.0) & right], axis=1)
-    found = places_beyond_the_level(AntennaRows.of(index), arc, model, level, scale, systems, risk, sides)
+    found = places_beyond_the_level(AntennaRows.on(index), arc, model, level, scale, systems, risk, sides)
     points = line.at_arc(np.arange(0.0, line.arc_m[-1], 0.5))
     open_ones = 0
     for t in range(len(rows)):
@@ -150,7 +150,7 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
     )
     assert result.protection is not None
     level, arc = share * result.protection.level.level_m, result.constrained.arc_m
-    model = constrained_model(ranges_of(result), path, arc, section=np.maximum(result.constrained.section, 0))
+    model = linear_model(ranges_of(result), path, arc, section=np.maximum(result.constrained.section, 0))
     systems = [name[0] for name in result.satellite[result.columns].tolist()]
     scale, rows = np.maximum(result.noise_scale, 1.0), np.flatnonzero(np.isfinite(level))
     columns = result.columns
@@ -168,12 +168,12 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(open_places, "_risk_of_block", counted)
     bounded = places_beyond_the_level(
-        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides
+        AntennaRows.on(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides
     )
     assert 0 < sum(looked_at) < 0.3 * len(rows)
     monkeypatch.setattr(kernels.off_tangent, "risk_off_tangent", lambda _, scale, *__: np.full(len(scale), 1.0))
     every = places_beyond_the_level(
-        AntennaRows.of(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides
+        AntennaRows.on(SearchIndex(path)), arc, model, level, scale, systems, RiskBudget(), sides
     )
     np.testing.assert_array_equal(bounded, every)
     assert every.any() == (share < 1.0)
@@ -211,7 +211,7 @@ def test_forms_are_those_of_least_squares_without_the_channels(systems: str) -> 
     """None, each channel, each pair and each side left out: generalised least squares with the map error as noise."""
     arc, scale, sigma_m, n = np.array([731.0, 1420.0]), np.array([1.0, 2.5]), (0.7, 4.0), len(systems)
     ranges = oracle.made(arc, systems, seed=6, noise=2.0)
-    model = constrained_model(ranges, oracle.LINE, arc)
+    model = linear_model(ranges, oracle.LINE, arc)
     likely, of_side = np.linspace(1e-5, 7e-5, n), 3e-6
     sides = np.zeros((2, 3, n), dtype=bool)
     sides[:, 0, [0, 2, 3]] = sides[:, 1, [1, 4]] = sides[:, 2, 5] = True

@@ -19,12 +19,12 @@ from railfix.integrity.protection import (
     LevelStatus,
     ProtectionLevel,
     RiskBudget,
-    along_track_level,
     availability,
+    protection_level,
 )
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
-from railfix.integrity.raim import LinearModel, constrained_model
-from railfix.positioning.normal_equations import UNTIED_M
+from railfix.integrity.raim import LinearModel, linear_model
+from railfix.positioning.range_arrays import UNTIED_M
 from raim_oracle import point_model
 
 pytestmark = pytest.mark.requirement("C2")
@@ -34,7 +34,7 @@ ARC = np.array([731.0])
 
 def test_case_worked_by_hand():
     """docs/protection-level.md follows these figures."""
-    got = along_track_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
+    got = protection_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
     assert got.sigma_m[0] == pytest.approx(np.sqrt(0.625), abs=1e-12)
     assert got.unchecked_risk[0] == pytest.approx(1e-5, rel=1e-9)  # 10 triples of 0.01^3
     # 9e-5 left, 3e-5 for each part.
@@ -71,7 +71,7 @@ def test_case_worked_by_hand():
     # 3 m on satellite 1 move the position by 0.8 * 3/1.6 = 1.5 m; without it 0: 1.5 m against 3.403 * 0.791 m.
     assert got.consistent[0]
     assert got.separation[0] == pytest.approx(1.5 / (norm.isf(0.01 / 30) * np.sqrt(0.625)), abs=1e-9)
-    off = along_track_level(hand_model((6.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
+    off = protection_level(hand_model((6.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
     assert not off.consistent[0]
     assert off.separation[0] == pytest.approx(2.0 * got.separation[0], abs=1e-9)
     assert availability(off.level_m, 20.0, consistent=off.consistent)[0] == LevelStatus.ALARM
@@ -94,7 +94,7 @@ def test_case_worked_by_hand_against_rows_and_columns():
     expected = protection_oracle.level(
         case, dict.fromkeys(range(5), 0.01), risk_per_sample=1e-4, share=1 / 3, false_alarm=0.01
     )
-    got = along_track_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
+    got = protection_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
     assert expected.level_m <= got.level_m[0] <= 1.002 * expected.level_m
     assert got.fault_free_m[0] == pytest.approx(expected.fault_free_m, abs=1e-9)
     assert got.one_fault_m[0] == pytest.approx(expected.one_fault_m, abs=1e-9)
@@ -128,7 +128,7 @@ def test_case_worked_by_hand_against_rows_and_columns():
 def test_level_equals_solving_every_subset_again(seed, system, scale, biased, shared, risk, fault):
     systems, ties = system
     ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault})
-    model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
     budget = HAND.replaced(risk_per_hour=risk, constellation_prior={"E": 1e-5, "C": 1e-4} if shared else {})
     bias = np.random.default_rng(seed).uniform(0.0, 1.0, len(systems)) if biased else None
     events = [
@@ -148,7 +148,7 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
     )
     if expected.sigma_m > 100.0:
         return  # at the edge of what the ranges determine
-    got = along_track_level(model, list(systems), risk=budget, scale=scale, overbound=RangeBounds(bias_m=bias))
+    got = protection_level(model, list(systems), risk=budget, scale=scale, overbound=RangeBounds(bias_m=bias))
     assert got.sigma_m[0] == pytest.approx(expected.sigma_m, rel=1e-7)
     for mine, theirs in (
         (got.fault_free_m, expected.fault_free_m),
@@ -170,8 +170,8 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
 def test_noise_scale_multiplies_the_ranges_not_the_map():
     """The level grows with the noise, but by less: the map error stays what it is."""
     ranges = oracle.made(ARC, "GGGGGEEE", seed=3)
-    model = constrained_model(ranges, oracle.LINE, ARC)
-    one, two = (along_track_level(model, list("GGGGGEEE"), scale=s) for s in (1.0, 2.0))
+    model = linear_model(ranges, oracle.LINE, ARC)
+    one, two = (protection_level(model, list("GGGGGEEE"), scale=s) for s in (1.0, 2.0))
     assert one.level_m[0] < two.level_m[0] < 2.0 * one.level_m[0]
     assert two.sigma_m[0] == pytest.approx(np.sqrt(model.position_covariance_m2(np.array([2.0]))[0, 0, 0]), rel=1e-12)
 
@@ -181,12 +181,12 @@ def test_batch_equals_epoch_by_epoch_and_gaps_stay_empty():
     ranges = oracle.made(arc, "GGGGGGEEEECC", seed=8)
     weight = ranges.weight * (np.random.default_rng(1).random(ranges.weight.shape) > 0.25)
     arc = np.where(np.arange(40) % 7 == 3, np.nan, arc)
-    model = constrained_model(replace(ranges, weight=weight), oracle.LINE, arc)
+    model = linear_model(replace(ranges, weight=weight), oracle.LINE, arc)
     scale = np.linspace(0.5, 2.0, 40)
     out = np.arange(40) % 4
-    whole = along_track_level(model, list("GGGGGGEEEECC"), scale=scale, n_excluded=out)
+    whole = protection_level(model, list("GGGGGGEEEECC"), scale=scale, n_excluded=out)
     for t in range(40):
-        each = along_track_level(model.take(np.array([t])), list("GGGGGGEEEECC"), scale=scale[t], n_excluded=out[t])
+        each = protection_level(model.take(np.array([t])), list("GGGGGGEEEECC"), scale=scale[t], n_excluded=out[t])
         for name in ProtectionLevel.__dataclass_fields__:
             mine, alone = getattr(whole, name)[t : t + 1], getattr(each, name)
             if mine.dtype == float:
@@ -200,7 +200,7 @@ def test_batch_equals_epoch_by_epoch_and_gaps_stay_empty():
     assert np.isfinite(whole.level_m[~empty & (out == 0)]).any()
     assert np.isinf(whole.level_m[~empty & (out == 3)]).all()
     assert (whole.cause[~empty & (out == 3)] == Cause.BUDGET).all()
-    assert len(along_track_level(model.take(np.zeros(0, dtype=int)), list("GGGGGGEEEECC")).level_m) == 0
+    assert len(protection_level(model.take(np.zeros(0, dtype=int)), list("GGGGGGEEEECC")).level_m) == 0
 
 
 def kinds_of_faults(systems: str) -> tuple[LinearModel, dict[str, Any]]:
@@ -208,7 +208,7 @@ def kinds_of_faults(systems: str) -> tuple[LinearModel, dict[str, Any]]:
     arc, n, rng = np.linspace(200.0, 1800.0, 12), len(systems), np.random.default_rng(4)
     ranges = oracle.made(arc, systems, seed=8, faults_m={1: 9.0})
     weight = ranges.weight * (rng.random(ranges.weight.shape) > 0.15)
-    model = constrained_model(replace(ranges, weight=weight), oracle.LINE, arc)
+    model = linear_model(replace(ranges, weight=weight), oracle.LINE, arc)
     sides = rng.random((12, 2, n)) > 0.7
     sides[::3] = False
     options: dict[str, Any] = {
@@ -247,9 +247,9 @@ def at(options: dict[str, Any], t: int) -> dict[str, Any]:
 def test_epochs_have_the_same_levels_together_and_alone(systems):
     """Hypotheses that only some epochs of a block ask for have no effect on the others."""
     model, options = kinds_of_faults(systems)
-    whole, finite = along_track_level(model, list(systems), **options), 0
+    whole, finite = protection_level(model, list(systems), **options), 0
     for t in range(12):
-        alone = along_track_level(model.take(np.array([t])), list(systems), **at(options, t))
+        alone = protection_level(model.take(np.array([t])), list(systems), **at(options, t))
         for name in ProtectionLevel.__dataclass_fields__:
             mine, own = getattr(whole, name)[t : t + 1], getattr(alone, name)
             if mine.dtype == float:
@@ -279,8 +279,8 @@ def test_levels_have_the_unit_of_the_sigmas(systems, factor):
         "overbound": RangeBounds(*(factor * values for values in options["overbound"])),
         "map_error": MapDeviation(factor * error.bias_m, (factor * error.seen[0], error.seen[1] / factor**2)),
     }
-    one = along_track_level(model, list(systems), **options)
-    two = along_track_level(other, list(systems), **{**options, **metres})
+    one = protection_level(model, list(systems), **options)
+    two = protection_level(other, list(systems), **{**options, **metres})
     for name in ("level_m", "fault_free_m", "one_fault_m", "two_fault_m", "sigma_m"):
         np.testing.assert_allclose(getattr(two, name), factor * getattr(one, name), rtol=1e-6, err_msg=name)
     np.testing.assert_allclose(two.separation, one.separation, rtol=1e-6)
@@ -288,31 +288,31 @@ def test_levels_have_the_unit_of_the_sigmas(systems, factor):
 
 
 def test_the_worst_hypothesis_is_named_by_its_channels_or_its_constellation():
-    few = constrained_model(oracle.made(ARC, "GGGGGCCEE", seed=5), oracle.LINE, ARC)
-    of_one = along_track_level(few, list("GGGGGCCEE"), risk=RiskBudget(constellation_prior={"C": 1e-12, "E": 1e-12}))
+    few = linear_model(oracle.made(ARC, "GGGGGCCEE", seed=5), oracle.LINE, ARC)
+    of_one = protection_level(few, list("GGGGGCCEE"), risk=RiskBudget(constellation_prior={"C": 1e-12, "E": 1e-12}))
     assert of_one.worst_one[0] >= 0
     assert of_one.worst_constellation[0] == ""
-    model = constrained_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
-    many = constrained_model(oracle.made(ARC, "GGGGGGGEEE", seed=5), oracle.LINE, ARC)
-    of_all = along_track_level(many, list("GGGGGGGEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
+    model = linear_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    many = linear_model(oracle.made(ARC, "GGGGGGGEEE", seed=5), oracle.LINE, ARC)
+    of_all = protection_level(many, list("GGGGGGGEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
     assert (of_all.worst_one[0], of_all.worst_constellation[0]) == (-1, "G")
     rare = RiskBudget(satellite_prior=dict.fromkeys("GE", 1e-8), local_prior=0.0)
-    assert along_track_level(model, list("GGGGGEEEEE"), risk=rare).worst_two[0].tolist() == [-1, -1]
+    assert protection_level(model, list("GGGGGEEEEE"), risk=rare).worst_two[0].tolist() == [-1, -1]
 
 
 def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligible():
     # Two satellites of one clock fix the position: either fault is invisible.
     ranges = oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 3])
-    model = constrained_model(oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 1]), oracle.LINE, ARC)
-    got = along_track_level(model, list("GGGEEE"))
+    model = linear_model(oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 1]), oracle.LINE, ARC)
+    got = protection_level(model, list("GGGEEE"))
     assert np.isinf(got.level_m[0])
     assert got.cause[0] == Cause.UNCHECKED
     rare = HAND.replaced(satellite_prior={"G": 1e-7, "E": 1e-7}, local_prior=0.0)
-    small = along_track_level(model, list("GGGEEE"), risk=rare)
+    small = protection_level(model, list("GGGEEE"), risk=rare)
     assert small.level_m[0] <= small.fault_free_m[0] < np.inf
     assert small.level_m[0] > small.sigma_m[0] * norm.isf(1e-4 / 2.0)  # the whole risk spent on noise
     assert small.k_one_fault[0] == -np.inf
-    nothing = along_track_level(constrained_model(ranges, oracle.LINE, ARC), list("GGGEEE"))
+    nothing = protection_level(linear_model(ranges, oracle.LINE, ARC), list("GGGEEE"))
     assert np.isnan(nothing.level_m[0])
 
 
@@ -325,7 +325,7 @@ def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligibl
 )
 def test_what_nothing_checks_is_taken_off_the_risk(systems, common):
     ranges = oracle.made(ARC, systems, seed=4)
-    model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
     budget = HAND.replaced(satellite_prior={"G": common, "E": 0.3}, local_prior=0.0)
     expected = protection_oracle.level(
         case,
@@ -334,61 +334,61 @@ def test_what_nothing_checks_is_taken_off_the_risk(systems, common):
         share=1 / 3,
         false_alarm=0.01,
     )
-    got = along_track_level(model, list(systems), risk=budget)
+    got = protection_level(model, list(systems), risk=budget)
     assert expected.level_m * (1.0 - 1e-7) <= got.level_m[0] <= 1.003 * expected.level_m < np.inf
 
 
 def test_excluded_satellites_raise_the_level():
     ranges = oracle.made(ARC, "GGGGGEEEE", seed=5)
-    model = constrained_model(ranges, oracle.LINE, ARC)
-    levels = [along_track_level(model, list("GGGGGEEEE"), n_excluded=e) for e in range(4)]
+    model = linear_model(ranges, oracle.LINE, ARC)
+    levels = [protection_level(model, list("GGGGGEEEE"), n_excluded=e) for e in range(4)]
     assert levels[0].level_m[0] < levels[1].level_m[0] < levels[2].level_m[0] < np.inf
     assert np.isinf(levels[3].level_m[0])
-    never = along_track_level(model, list("GGGGGEEEE"), risk=RiskBudget(exclusion_share=0.0), n_excluded=1)
+    never = protection_level(model, list("GGGGGEEEE"), risk=RiskBudget(exclusion_share=0.0), n_excluded=1)
     assert never.cause[0] == Cause.BUDGET
 
 
 def test_constellation_fault_that_nothing_checks():
     """All satellites of one constellation: without it there is no position."""
-    model = constrained_model(oracle.made(ARC, "GGGGGG", seed=5), oracle.LINE, ARC)
-    got = along_track_level(model, list("GGGGGG"), risk=RiskBudget(constellation_prior={"G": 1e-4}))
+    model = linear_model(oracle.made(ARC, "GGGGGG", seed=5), oracle.LINE, ARC)
+    got = protection_level(model, list("GGGGGG"), risk=RiskBudget(constellation_prior={"G": 1e-4}))
     assert got.cause[0] == Cause.UNCHECKED_CONSTELLATION
     assert got.worst_constellation[0] == "G"
     # Without the map six satellites of one constellation are enough, five less one are not: a map and a satellite.
     known = (np.zeros((1, 2)), np.zeros((1, 2, 2)))
-    few = constrained_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
-    free = along_track_level(
+    few = linear_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
+    free = protection_level(
         few, list("GGGGG"), risk=RiskBudget(map_prior=1e-2, local_prior=1e-4), map_error=MapDeviation(seen=known)
     )
     assert free.cause[0] == Cause.UNCHECKED_MAP
-    wide = constrained_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    wide = linear_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
     priors = RiskBudget(map_prior=1e-2, constellation_prior={"G": 1e-5}, unchecked_share=1e-3)
     four = oracle.only(oracle.made(ARC, "GGGGGEEEEE", seed=5), [0, 1, 2, 3, 4, 5, 6, 7])
-    both = along_track_level(
-        constrained_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)
+    both = protection_level(
+        linear_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)
     )
     assert both.cause[0] == Cause.UNCHECKED_TOGETHER
     assert np.isfinite(
-        along_track_level(wide, list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)).level_m[0]
+        protection_level(wide, list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)).level_m[0]
     )
-    both = constrained_model(oracle.made(ARC, "GGGGGGEEEEE", seed=5), oracle.LINE, ARC)
-    ok = along_track_level(both, list("GGGGGGEEEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
+    both = linear_model(oracle.made(ARC, "GGGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    ok = protection_level(both, list("GGGGGGEEEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
     assert np.isfinite(ok.level_m[0])
 
 
 def test_refusals():
-    model = constrained_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
+    model = linear_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
     with pytest.raises(ValueError, match="5 channels, got 4"):
-        along_track_level(model, list("GGGG"))
+        protection_level(model, list("GGGG"))
     with pytest.raises(ValueError, match="constellation 'X'"):
-        along_track_level(model, list("GGGGX"))
+        protection_level(model, list("GGGGX"))
     with pytest.raises(ValueError, match="scale must be positive"):
-        along_track_level(model, list("GGGGG"), scale=0.0)
+        protection_level(model, list("GGGGG"), scale=0.0)
     with pytest.raises(ValueError, match="got a negative one"):
-        along_track_level(model, list("GGGGG"), n_excluded=-1)
+        protection_level(model, list("GGGGG"), n_excluded=-1)
     space = point_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE.at_arc(ARC))
     with pytest.raises(ValueError, match="a model on the line"):
-        along_track_level(space, list("GGGGG"))
+        protection_level(space, list("GGGGG"))
 
 
 def test_status():

@@ -9,8 +9,9 @@ import raim_oracle as oracle
 import synthetic
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, RiskBudget
-from railfix.integrity.raim import constrained_model
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.integrity.raim import linear_model
+from railfix.positioning.range_arrays import Ranges
+from railfix.ranges.channels import clock_groups
 from sbas_levels import levels_in_space, sbas_level
 
 pytestmark = pytest.mark.requirement("C2")
@@ -90,7 +91,7 @@ def test_level_along_the_track_is_the_textbooks(scale):
     arc = np.linspace(100.0, 1900.0, 20)
     ranges = oracle.made(arc, "GGGGGEE", seed=9)
     k = RiskBudget().sample_k
-    got = sbas_level(constrained_model(ranges, oracle.LINE, arc), k=k, scale=scale)
+    got = sbas_level(linear_model(ranges, oracle.LINE, arc), k=k, scale=scale)
     for t in range(20):
         rows = oracle.problem_on_line(ranges, t, arc[t])
         along = np.linalg.pinv(rows.design)[0]
@@ -101,7 +102,7 @@ def test_level_along_the_track_is_the_textbooks(scale):
 
 def test_no_position_no_level():
     arc = np.array([500.0, np.nan])
-    got = sbas_level(constrained_model(oracle.made(np.full(2, 500.0), "GGGGG", seed=1), oracle.LINE, arc), k=5.33)
+    got = sbas_level(linear_model(oracle.made(np.full(2, 500.0), "GGGGG", seed=1), oracle.LINE, arc), k=5.33)
     assert np.isfinite(got[0])
     assert np.isnan(got[1])
     ranges, place, _ = case("GGG", seed=2)

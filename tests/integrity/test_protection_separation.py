@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import protection_oracle
 import raim_oracle as oracle
-from railfix.integrity.protection import RiskBudget, along_track_level
-from railfix.integrity.raim import constrained_model
-from railfix.positioning.normal_equations import UNTIED_M
+from railfix.integrity.protection import RiskBudget, protection_level
+from railfix.integrity.raim import linear_model
+from railfix.positioning.range_arrays import UNTIED_M
 from separation_oracle import (
     AllInView,
     Separations,
@@ -80,7 +80,7 @@ def compare(
 def test_every_subset_equals_solving_without_it(seed, system, scale, fault, least):
     systems, ties = system
     ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault, len(systems) - 1: 2.0})
-    model = constrained_model(ranges, oracle.LINE, ARC)
+    model = linear_model(ranges, oracle.LINE, ARC)
     n, bias = len(systems), np.random.default_rng(seed).uniform(0.0, 1.0, len(systems))
     bound = None if least is None else np.random.default_rng(seed + 1).uniform(0.0, least, n)
     solved = protection_oracle.Resolved(oracle.problem_on_line(ranges, 0, ARC[0]), scale, bound)
@@ -118,7 +118,7 @@ def test_a_map_left_out_equals_solving_with_what_takes_its_place(seed, system, s
     """The offset of the last minutes in place of the map, or nothing; alone and without each satellite."""
     systems, ties = system
     ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: 12.0})
-    model = constrained_model(ranges, oracle.LINE, ARC)
+    model = linear_model(ranges, oracle.LINE, ARC)
     case = oracle.problem_on_line(ranges, 0, ARC[0])
     before = protection_oracle.Resolved(case, scale)
     n, sigma = len(systems), np.array([2.0, 5.0])
@@ -163,7 +163,7 @@ def test_two_clocks_without_one_of_a_pair_leave_a_direction_free(scale):
     10 km across and up gives 10 km times 0.0016, some 16 m, which no observation supports.
     """
     ranges = oracle.made(ARC, "GGGEEC", seed=193, faults_m={1: 12.0})
-    model = constrained_model(ranges, oracle.LINE, ARC)
+    model = linear_model(ranges, oracle.LINE, ARC)
     whitened = oracle.problem_on_line(ranges, 0, ARC[0])
     rows = whitened.design[:6, :3] / whitened.scale_of[:3] * whitened.sigma_m[:, None]
     free = np.cross(rows[1] - rows[0], rows[2] - rows[0])
@@ -184,7 +184,7 @@ def test_subsets_that_leave_no_position_are_found():
     """Three of one clock: without two of them one is left."""
     bias = np.zeros(3)
     ranges = oracle.made(ARC, "GGG", seed=4)
-    model = constrained_model(ranges, oracle.LINE, ARC)
+    model = linear_model(ranges, oracle.LINE, ARC)
     solved = protection_oracle.Resolved(oracle.problem_on_line(ranges, 0, ARC[0]), 1.0)
     pairs = list(combinations(range(3), 2))
     twos = without(all_in_view(model, np.ones(1), *EXACT), *pairs)
@@ -194,19 +194,19 @@ def test_subsets_that_leave_no_position_are_found():
 def test_pair_of_a_clock_of_its_own_is_left_out_whole():
     """Each of the two is useless without the other: both gone is the same as one gone."""
     ranges = oracle.made(ARC, "GGGGGGEE", seed=6, faults_m={7: 25.0})
-    model = constrained_model(ranges, oracle.LINE, ARC)
+    model = linear_model(ranges, oracle.LINE, ARC)
     all_of = all_in_view(model, np.ones(1), *EXACT)
     pair, one = without(all_of, (6, 7)), without(all_of, *((c,) for c in range(8)))
     assert pair.moved_m[0, 0] == pytest.approx(one.moved_m[0, 6], rel=1e-9)
     assert pair.sigma_m[0, 0] == pytest.approx(one.sigma_m[0, 7], rel=1e-9)
     assert abs(pair.moved_m[0, 0]) > 0.1
-    assert np.isfinite(along_track_level(model, list("GGGGGGEE")).level_m[0])
+    assert np.isfinite(protection_level(model, list("GGGGGGEE")).level_m[0])
 
 
 def test_excluded_satellites_count_among_those_that_may_be_faulty():
-    model = constrained_model(oracle.made(ARC, "GGGGGEEEE", seed=5), oracle.LINE, ARC)
+    model = linear_model(oracle.made(ARC, "GGGGGEEEE", seed=5), oracle.LINE, ARC)
     risk = RiskBudget()
-    spent = [along_track_level(model, list("GGGGGEEEE"), risk=risk, n_excluded=e).unchecked_risk[0] for e in (0, 1, 2)]
+    spent = [protection_level(model, list("GGGGGEEEE"), risk=risk, n_excluded=e).unchecked_risk[0] for e in (0, 1, 2)]
     prior = risk.prior(list("GGGGGEEEE"))
     for e, value in enumerate(spent):
         everyone = [*prior, *[prior.max()] * e]

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 import protection_oracle
 import raim_oracle as oracle
-from railfix.integrity.protection import Cause, RiskBudget, along_track_level
+from railfix.integrity.protection import Cause, RiskBudget, protection_level
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
-from railfix.integrity.raim import constrained_model
+from railfix.integrity.raim import linear_model
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -55,7 +55,7 @@ def without_the_map(case: oracle.Problem, seen_m: tuple[float, float] | None, sc
 def test_tails_of_all_hypotheses_use_up_the_risk(seed, side_prior, of_constellation, common, scale, biased, seen):
     """Satellites, sides, constellations, a wrong map, and as many of them together as their priors ask for."""
     ranges = oracle.made(ARC, SYSTEMS, seed=seed, faults_m={1: 9.0})
-    model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
     members = np.zeros((1, len(SIDES), len(SYSTEMS)), dtype=bool)
     for number, side in enumerate(SIDES):
         members[0, number, list(side)] = True
@@ -63,7 +63,7 @@ def test_tails_of_all_hypotheses_use_up_the_risk(seed, side_prior, of_constellat
     risk = RISK.replaced(
         side_prior=side_prior, local_prior=common, constellation_prior=dict.fromkeys("EC", of_constellation)
     )
-    got = along_track_level(
+    got = protection_level(
         model,
         list(SYSTEMS),
         risk=risk,

@@ -9,10 +9,10 @@ import pytest
 
 import raim_oracle as oracle
 from railfix.core.geodesy import range_with_rotation
-from railfix.integrity.protection import RiskBudget, along_track_level, risk
+from railfix.integrity.protection import RiskBudget, protection_level, risk
 from railfix.integrity.protection.level import MapDeviation
-from railfix.integrity.raim import constrained_model
-from railfix.positioning.normal_equations import Ranges
+from railfix.integrity.raim import linear_model
+from railfix.positioning.range_arrays import Ranges
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -76,9 +76,9 @@ def exceeded(systems: str, members: tuple[int, ...], *, wrong_map: bool) -> floa
         # A map that is wrong by some metres: the antenna is beside it by as much the other way.
         beside = -size * faults[:, -2:]
         code = ranges.code_m + size * faults[:, :-2] - np.einsum("tmi,tai,ta->tm", los, axes, beside)
-        moved = constrained_model(replace(ranges, code_m=code), oracle.LINE, arc)
+        moved = linear_model(replace(ranges, code_m=code), oracle.LINE, arc)
         known = (beside + sigma * drawn, np.tile(np.diag(sigma**-2.0), (EPOCHS, 1, 1)))
-        got = along_track_level(moved, list(systems), risk=RISK, map_error=MapDeviation(seen=known), sides=sides)
+        got = protection_level(moved, list(systems), risk=RISK, map_error=MapDeviation(seen=known), sides=sides)
         over = (np.abs(moved.step_m[:, 0]) > got.level_m) & got.consistent
         largest = max(largest, float(over.mean()))
     return largest

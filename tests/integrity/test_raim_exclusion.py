@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import raim_oracle as oracle
 import synthetic
-from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude, reliability
-from railfix.positioning.normal_equations import UNTIED_M, Ranges
+from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, exclude, linear_model, reliability
+from railfix.positioning.range_arrays import UNTIED_M, Ranges
 
 pytestmark = pytest.mark.requirement("B4")
 
@@ -70,7 +70,7 @@ def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
     systems, ties = system
     arc = np.array([731.0])
     ranges = oracle.made(arc, systems, seed=seed, tie_sigma_m=ties, faults_m=faults)
-    model = constrained_model(ranges, oracle.LINE, arc)
+    model = linear_model(ranges, oracle.LINE, arc)
     if np.isfinite(model.wsse[0]):
         check_against_trying(oracle.problem_on_line(ranges, 0, arc[0]), model, limits, scale)
 
@@ -100,7 +100,7 @@ def test_own_errors_about_the_limit_of_noise():
     for seed in range(75):
         faults = {1: 80.0, 5: 2.0 + 0.2 * seed}
         ranges = oracle.made(arc, "GGGGGEEE", seed=seed, faults_m=faults, sigma_m=np.linspace(0.5, 3.0, 8))
-        model = constrained_model(ranges, oracle.LINE, arc)
+        model = linear_model(ranges, oracle.LINE, arc)
         check_against_trying(oracle.problem_on_line(ranges, 0, arc[0]), model, limits, scale)
         outcomes.append(exclude(model, limits=limits).outcome[0])
     assert min(outcomes.count(Outcome.EXCLUDED_ONE), outcomes.count(Outcome.EXCLUDED_TWO)) > 5
@@ -113,9 +113,9 @@ def test_every_outcome_is_reached_by_the_cases():
     for systems, ties in SYSTEMS:
         for faults in ({}, {0: 60.0}, {0: 60.0, 2: -90.0}, {0: 60.0, 1: 80.0, 2: -90.0, 3: 150.0}):
             ranges = oracle.made(arc, systems, seed=6, tie_sigma_m=ties, faults_m=faults)
-            reached |= set(exclude(constrained_model(ranges, oracle.LINE, arc)).outcome.tolist())
+            reached |= set(exclude(linear_model(ranges, oracle.LINE, arc)).outcome.tolist())
     only_three = oracle.only(oracle.made(arc, "GGGEEE", seed=6), [0, 3])
-    reached |= set(exclude(constrained_model(only_three, oracle.LINE, arc)).outcome.tolist())
+    reached |= set(exclude(linear_model(only_three, oracle.LINE, arc)).outcome.tolist())
     assert reached == {o.value for o in Outcome}
 
 
@@ -164,14 +164,14 @@ def parallel_case(along: int) -> Ranges:
 
 
 def test_parallel_lines_of_sight_that_alone_tell_the_place_cannot_be_separated():
-    model = constrained_model(parallel_case(2), oracle.LINE, np.array([1000.0]))
+    model = linear_model(parallel_case(2), oracle.LINE, np.array([1000.0]))
     got = exclude(model)
     assert got.outcome[0] == Outcome.INSEPARABLE
     assert not got.excluded.any()
     assert {got.best[0, 0], got.alternative[0, 0]} == {0, 1}
     assert got.alternative_shift_m[0] == pytest.approx(100.0 / np.cos(np.radians(30.0)), rel=0.03)
     # A third satellite ahead tells which.
-    got = exclude(constrained_model(parallel_case(3), oracle.LINE, np.array([1000.0])))
+    got = exclude(linear_model(parallel_case(3), oracle.LINE, np.array([1000.0])))
     assert got.outcome[0] == Outcome.EXCLUDED_ONE
     assert got.best[0].tolist() == [0, -1]
     assert got.own_error_m[0, 0] == pytest.approx(100.0, abs=3.0)
@@ -181,7 +181,7 @@ def test_two_satellites_of_a_clock_of_their_own():
     """Which of them is wrong cannot be told, but the position without either is the same."""
     arc = np.array([731.0])
     ranges = oracle.made(arc, "GGGGGGEE", seed=11, faults_m={7: 50.0})
-    model = constrained_model(ranges, oracle.LINE, arc)
+    model = linear_model(ranges, oracle.LINE, arc)
     got = exclude(model)
     assert got.outcome[0] == Outcome.INSEPARABLE
     assert {got.best[0, 0], got.alternative[0, 0]} == {6, 7}
@@ -259,7 +259,7 @@ def mixed_case() -> tuple[Ranges, np.ndarray]:
 
 def test_all_epochs_at_once_is_epoch_by_epoch():
     ranges, arc = mixed_case()
-    model = constrained_model(ranges, oracle.LINE, arc)
+    model = linear_model(ranges, oracle.LINE, arc)
     scale = np.linspace(0.7, 2.0, len(arc))
     whole = exclude(model, scale=scale)
     assert len(set(whole.outcome.tolist())) >= 5
@@ -273,7 +273,7 @@ def test_all_epochs_at_once_is_epoch_by_epoch():
 
 def test_unused_channels_are_never_named():
     ranges, arc = mixed_case()
-    got = exclude(constrained_model(ranges, oracle.LINE, arc), limits=RaimLimits(separation_risk=1.0))
+    got = exclude(linear_model(ranges, oracle.LINE, arc), limits=RaimLimits(separation_risk=1.0))
     unused = ranges.weight == 0
     assert not (got.excluded & unused).any()
     assert np.isnan(got.own_error_m[unused]).all()
@@ -292,7 +292,7 @@ def test_order_of_satellites_changes_nothing():
         code_m=ranges.code_m[:, order],
         weight=ranges.weight[:, order],
     )
-    one, two = (exclude(constrained_model(r, oracle.LINE, arc)) for r in (ranges, shuffled))
+    one, two = (exclude(linear_model(r, oracle.LINE, arc)) for r in (ranges, shuffled))
     assert np.array_equal(one.outcome, two.outcome)
     assert np.array_equal(one.excluded[:, order], two.excluded)
     clear = one.outcome != Outcome.INSEPARABLE  # of equals, the first channel
@@ -305,10 +305,10 @@ def test_epochs_that_cannot_be_tested():
     weight = ranges.weight.copy()
     weight[2, 2:] = 0.0
     weight[3] = 0.0
-    got = exclude(constrained_model(replace(ranges, weight=weight), oracle.LINE, arc))
+    got = exclude(linear_model(replace(ranges, weight=weight), oracle.LINE, arc))
     assert got.outcome.tolist() == [Outcome.EXCLUDED_ONE] + [Outcome.UNTESTABLE] * 3
     assert got.position_change_m[1:].tolist() == [[0.0]] * 3
-    nothing = exclude(constrained_model(ranges, oracle.LINE, arc).take(np.zeros(4, dtype=bool)))
+    nothing = exclude(linear_model(ranges, oracle.LINE, arc).take(np.zeros(4, dtype=bool)))
     assert nothing.excluded.shape == (0, 6)
 
 
@@ -316,13 +316,13 @@ def test_two_faults_of_forty_satellites_are_excluded():
     """Failing epochs, all pairs."""
     arc = np.linspace(50.0, 1950.0, 3000)
     ranges = oracle.made(arc, "G" * 12 + "E" * 10 + "C" * 10 + "R" * 8, seed=1, faults_m={3: 100.0, 20: -60.0})
-    got = exclude(constrained_model(ranges, oracle.LINE, arc))
+    got = exclude(linear_model(ranges, oracle.LINE, arc))
     assert (got.outcome == Outcome.EXCLUDED_TWO).mean() > 0.95
 
 
 def test_arrays_of_the_caller_are_left_alone():
     ranges, arc = mixed_case()
-    model = constrained_model(ranges, oracle.LINE, arc)
+    model = linear_model(ranges, oracle.LINE, arc)
     frozen = {f.name: getattr(model, f.name) for f in fields(model)}
     before = {name: np.copy(value) for name, value in frozen.items()}
     for value in frozen.values():

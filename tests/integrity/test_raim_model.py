@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 import raim_oracle as oracle
 import synthetic
 from railfix import kernels
-from railfix.integrity.raim import constrained_model
-from railfix.integrity.raim.model import compact, model_on_line
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, constrained_position, single_point
+from railfix.integrity.raim import linear_model
+from railfix.integrity.raim.model import _model, compact
+from railfix.positioning.normal_equations import point_position, position_on_line
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies
 from raim_oracle import point_model
 
 pytestmark = pytest.mark.requirement("B6")
@@ -43,7 +44,7 @@ def test_model_is_the_solvers_own(systems, ties):
     assert np.sqrt(model.position_covariance_m2(np.ones(30))[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-6)
     assert (model.freedom == ranges.n_used - ranges.n_clocks - 1).all()
 
-    point = single_point(ranges, np.broadcast_to(oracle.LINE.ecef_m[0], (30, 3)))
+    point = point_position(ranges, np.broadcast_to(oracle.LINE.ecef_m[0], (30, 3)))
     model = point_model(ranges, point.ecef_m)
     solved = np.isfinite(point.wsse)
     assert solved.all() == (len(systems) > 3 + ranges.n_clocks[0] - 1)
@@ -64,7 +65,7 @@ def test_model_is_least_squares_with_all_columns(seed, case, space):
         if full.freedom < 0:
             return
     else:
-        model, full = constrained_model(ranges, oracle.LINE, arc), oracle.problem_on_line(ranges, 0, arc[0])
+        model, full = linear_model(ranges, oracle.LINE, arc), oracle.problem_on_line(ranges, 0, arc[0])
     step, cofactors, residual = full.solve()
     covariance = cofactors[:3, :3] * np.outer(full.scale_of[:3], full.scale_of[:3])
     size = float(np.sqrt(np.trace(covariance)))
@@ -80,7 +81,7 @@ def test_projector_gives_residuals_and_redundancy(systems, ties):
     """nu = S y, its diagonal the redundancy; the redundancies add up to the degrees of freedom, priors apart."""
     arc = np.linspace(100.0, 1900.0, 20)
     ranges = oracle.made(arc, systems, seed=8, tie_sigma_m=ties)
-    for model in (constrained_model(ranges, oracle.LINE, arc), point_model(ranges, oracle.LINE.at_arc(arc))):
+    for model in (linear_model(ranges, oracle.LINE, arc), point_model(ranges, oracle.LINE.at_arc(arc))):
         if model.freedom[0] < 0:
             continue
         parts = compact(model)
@@ -109,7 +110,7 @@ def test_unused_channels_leave_no_trace():
     part = oracle.only(whole, [0, 1, 3, 4, 6, 8])
     code = part.code_m.copy()
     code[:, [2, 5, 7]] = 0.0
-    model, other = (constrained_model(r, oracle.LINE, arc) for r in (part, replace(part, code_m=code)))
+    model, other = (linear_model(r, oracle.LINE, arc) for r in (part, replace(part, code_m=code)))
     assert np.array_equal(model.residual, other.residual)
     assert (model.residual[:, [2, 5, 7]] == 0).all()
     assert (model.redundancy[:, [2, 5, 7]] == 0).all()
@@ -125,7 +126,7 @@ def test_epochs_without_a_position_are_nan():
     arc = np.array([500.0, np.nan, 700.0])
     ranges = oracle.made(np.full(3, 500.0), "GGGGGG", seed=5)
     for model in (
-        constrained_model(ranges, oracle.LINE, arc, section=np.array([25, -1, 35])),
+        linear_model(ranges, oracle.LINE, arc, section=np.array([25, -1, 35])),
         point_model(ranges, oracle.LINE.at_arc(arc)),
     ):
         assert np.isnan(model.wsse).tolist() == [False, True, False]
@@ -137,8 +138,8 @@ def test_section_of_a_shared_point():
     line = synthetic.line(spacing_m=20.0)
     vertex = np.array([10])
     ranges = synthetic.ranges(line, line.arc_m[vertex])
-    before, after = (constrained_model(ranges, line, line.arc_m[vertex], section=vertex + k) for k in (-1, 0))
-    default = constrained_model(ranges, line, line.arc_m[vertex])
+    before, after = (linear_model(ranges, line, line.arc_m[vertex], section=vertex + k) for k in (-1, 0))
+    default = linear_model(ranges, line, line.arc_m[vertex])
     assert np.array_equal(default.design, after.design)
     assert not np.array_equal(default.design, before.design)
 
@@ -149,13 +150,13 @@ def test_ties_of_some_epochs_go_with_them():
     sigma = np.tile([0.0, 1.0], (6, 1))
     sigma[3:, 1] = UNTIED_M
     tied = replace(ranges, ties=ClockTies(offset_m=np.zeros((6, 2)), sigma_m=sigma))
-    got = constrained_position(tied, oracle.LINE, np.argmin(np.abs(oracle.LINE.arc_m - arc[:, None]), axis=1))
-    model = constrained_model(tied, oracle.LINE, got.arc_m)
+    got = position_on_line(tied, oracle.LINE, np.argmin(np.abs(oracle.LINE.arc_m - arc[:, None]), axis=1))
+    model = linear_model(tied, oracle.LINE, got.arc_m)
     assert model.freedom.tolist() == [4, 4, 4, 3, 3, 3]
     assert np.array_equal(model.take(np.array([4, 1])).wsse, model.wsse[[4, 1]])
     for t in range(6):
         own = tied.take(np.array([t]))
-        alone = constrained_model(own, oracle.LINE, got.arc_m[t : t + 1])
+        alone = linear_model(own, oracle.LINE, got.arc_m[t : t + 1])
         for name in ("clock_covariance_m2", "covariance_m2", "misfit", "residual", "redundancy"):
             np.testing.assert_allclose(getattr(model, name)[t], getattr(alone, name)[0], atol=1e-12, err_msg=name)
 
@@ -165,12 +166,12 @@ def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
     arc = np.array([731.0])
     ranges = oracle.made(arc, "GGGGGG", seed=3, sigma_m=np.full(6, 1e4))
     place, axes = oracle.LINE.at_arc(arc), oracle.LINE.get_axes(oracle.LINE.segment_at(arc)[0])
-    exact = model_on_line(ranges, place, axes, 1e-4, 1e-4)
+    exact = _model(ranges, place, axes, np.diag([0.0, 1e8, 1e8]), unknowns=1)
     assert exact.covariance_m2[0, 1, 1] == pytest.approx(1e-8, rel=1e-6)
     information = (exact.design[0, :, 0] ** 2).sum()
     assert exact.covariance_m2[0, 0, 0] == pytest.approx(1.0 / information, rel=1e-9)
     alike = np.repeat(axes[:, :1], 3, axis=1)
-    assert np.isnan(model_on_line(ranges, place, alike, 1e12, 1e12).covariance_m2).all()
+    assert np.isnan(_model(ranges, place, alike, np.diag([0.0, 1e-24, 1e-24]), unknowns=1).covariance_m2).all()
 
 
 def test_epochs_of_another_model_are_put_in_whole():
@@ -180,9 +181,9 @@ def test_epochs_of_another_model_are_put_in_whole():
     weight = ranges.weight.copy()
     weight[[2, 5], 1] = weight[[2, 5], 6] = 0.0
     fewer, rows = replace(ranges, weight=weight), np.array([2, 5])
-    whole = constrained_model(fewer, oracle.LINE, arc)
-    before = constrained_model(ranges, oracle.LINE, arc)
-    patched = before.patch(rows, constrained_model(fewer.take(rows), oracle.LINE, arc[rows]))
+    whole = linear_model(fewer, oracle.LINE, arc)
+    before = linear_model(ranges, oracle.LINE, arc)
+    patched = before.patch(rows, linear_model(fewer.take(rows), oracle.LINE, arc[rows]))
     for item in fields(whole):
         found, expected = getattr(patched, item.name), getattr(whole, item.name)
         if isinstance(expected, np.ndarray):

@@ -15,15 +15,17 @@ from railfix.integrity.raim import (
     LinearModel,
     Outcome,
     RaimLimits,
-    constrained_model,
     detect,
     exclude,
+    linear_model,
     noncentrality,
     reliability,
 )
 from railfix.integrity.raim.model import compact
 from railfix.io import read_observations
-from railfix.positioning.normal_equations import Constrained, Ranges, clock_groups, constrained_position
+from railfix.positioning.normal_equations import Constrained, position_on_line
+from railfix.positioning.range_arrays import Ranges
+from railfix.ranges.channels import clock_groups
 from railfix.track.trajectory import Trajectory
 from raim_oracle import point_model
 from recordings_score import geonet
@@ -43,14 +45,14 @@ class Station:
     scale: np.ndarray
 
     def model(self) -> LinearModel:
-        return constrained_model(self.ranges, self.trajectory, self.position.arc_m, section=self.position.section)
+        return linear_model(self.ranges, self.trajectory, self.position.arc_m, section=self.position.section)
 
     def with_errors(self, error_m: np.ndarray) -> LinearModel:
         """Solved again with errors added to the ranges."""
         ranges = replace(self.ranges, code_m=self.ranges.code_m + error_m)
         vertex = np.argmin(np.abs(self.trajectory.arc_m - self.position.arc_m[:, None]), axis=1)
-        got = constrained_position(ranges, self.trajectory, vertex)
-        return constrained_model(ranges, self.trajectory, got.arc_m, section=got.section)
+        got = position_on_line(ranges, self.trajectory, vertex)
+        return linear_model(ranges, self.trajectory, got.arc_m, section=got.section)
 
 
 @pytest.fixture(scope="module", params=[("0759", 0.0), ("3040", 90.0)], ids=["0759-north", "3040-east"])

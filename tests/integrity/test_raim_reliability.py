@@ -13,8 +13,8 @@ from scipy.stats import binom, chi2, ncx2, norm
 
 import raim_oracle as oracle
 import synthetic
-from railfix.integrity.raim import RaimLimits, constrained_model, detect, noncentrality, reliability
-from railfix.positioning.normal_equations import UNTIED_M
+from railfix.integrity.raim import RaimLimits, detect, linear_model, noncentrality, reliability
+from railfix.positioning.range_arrays import UNTIED_M
 from raim_oracle import point_model
 
 pytestmark = pytest.mark.requirement("B6")
@@ -64,7 +64,7 @@ def test_minimal_detectable_bias_is_missed_as_stated(systems, ties, channel):
     sigma = np.linspace(0.8, 2.0, len(systems))
     for scale in (1.0, 2.0):
         probe = oracle.made(ARC, systems, seed=1, tie_sigma_m=ties, sat_ecef_m=sat, sigma_m=sigma)
-        model = constrained_model(probe, oracle.LINE, ARC)
+        model = linear_model(probe, oracle.LINE, ARC)
         bias = reliability(model, limits=limits, scale=scale).minimal_detectable_bias_m[0, channel]
         assert 1.0 < bias < 100.0
         ranges = oracle.made(
@@ -129,7 +129,7 @@ def test_protection_level_is_the_worst_fault_found_by_search(seed, system, space
     if space:
         model, case = point_model(ranges, place), oracle.problem_in_space(ranges, 0, place[0])
     else:
-        model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+        model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
     if case.freedom < 1 or not np.isfinite(model.wsse[0]):
         return
     value = float(noncentrality(case.freedom))
@@ -170,7 +170,7 @@ def test_error_beyond_the_level_and_undetected_is_rarer_than_missed_detection():
     sigma = np.array([1.0, 1.5, 0.7, 2.0, 1.0])
     arc = np.full(epochs, ARC[0])
     probe = oracle.made(ARC, "GGGGG", seed=1, sat_ecef_m=sat, sigma_m=sigma)
-    level = reliability(constrained_model(probe, oracle.LINE, ARC), limits=limits)
+    level = reliability(linear_model(probe, oracle.LINE, ARC), limits=limits)
     worst = int(level.worst[0])
     hazard = []
     for share in (0.6, 0.8, 1.0, 1.2, 1.5):
@@ -225,7 +225,7 @@ def test_noise_level():
 )
 def test_availability(channels, level, available):
     ranges = oracle.only(oracle.made(ARC, "GGGGEEC", seed=3), channels)
-    got = reliability(constrained_model(ranges, oracle.LINE, ARC), limits=RaimLimits(alarm_limit_m=1e5))
+    got = reliability(linear_model(ranges, oracle.LINE, ARC), limits=RaimLimits(alarm_limit_m=1e5))
     value = got.protection_level_m[0]
     assert {"finite": np.isfinite(value), "infinite": np.isposinf(value), "nan": np.isnan(value)}[level]
     assert bool(got.available[0]) is available
@@ -237,14 +237,12 @@ def test_availability(channels, level, available):
 
 
 def test_lone_satellite_of_a_clock():
-    got = reliability(
-        constrained_model(oracle.only(oracle.made(ARC, "GGGGEEC", seed=3), [0, 1, 2, 3, 6]), oracle.LINE, ARC)
-    )
+    got = reliability(linear_model(oracle.only(oracle.made(ARC, "GGGGEEC", seed=3), [0, 1, 2, 3, 6]), oracle.LINE, ARC))
     assert np.isposinf(got.minimal_detectable_bias_m[0, 6])
     assert got.slope_m[0, 6] == 0.0
     # Known clock: the satellite is checked, and counts.
     tied = oracle.only(oracle.made(ARC, "GGGGEEC", seed=3, tie_sigma_m=(0.0, 1.0, 1.0)), [0, 1, 2, 3, 6])
-    got = reliability(constrained_model(tied, oracle.LINE, ARC))
+    got = reliability(linear_model(tied, oracle.LINE, ARC))
     assert np.isfinite(got.minimal_detectable_bias_m[0, 6])
     assert got.slope_m[0, 6] > 0.0
 
@@ -253,7 +251,7 @@ def test_pair_that_hides_a_fault():
     """Two satellites in error in the proportion that another place or clock would show."""
     ranges = oracle.made(ARC, "GGG", seed=3)
     one, two = (
-        reliability(constrained_model(ranges, oracle.LINE, ARC), limits=RaimLimits(faults=k, alarm_limit_m=1e6))
+        reliability(linear_model(ranges, oracle.LINE, ARC), limits=RaimLimits(faults=k, alarm_limit_m=1e6))
         for k in (1, 2)
     )
     assert one.available[0]
@@ -261,19 +259,19 @@ def test_pair_that_hides_a_fault():
     assert two.alarm[0]
     # The two satellites of a clock of their own hide a common error, which moves nothing.
     ranges = oracle.made(ARC, "GGGGGGEE", seed=3)
-    two = reliability(constrained_model(ranges, oracle.LINE, ARC), limits=RaimLimits(faults=2))
+    two = reliability(linear_model(ranges, oracle.LINE, ARC), limits=RaimLimits(faults=2))
     assert two.available[0]
 
 
 def test_alarm_truth_table():
-    model = constrained_model(oracle.made(ARC, "GGGGGG", seed=3), oracle.LINE, ARC)
+    model = linear_model(oracle.made(ARC, "GGGGGG", seed=3), oracle.LINE, ARC)
     level = float(reliability(model).protection_level_m[0])
     for limit, alarm in ((level, False), (np.nextafter(level, 0.0), True), (level / 2, True), (2 * level, False)):
         assert bool(reliability(model, limits=RaimLimits(alarm_limit_m=limit)).alarm[0]) is alarm
 
 
 def test_scale_multiplies_what_the_noise_does():
-    model = constrained_model(oracle.made(ARC, "GGGGGEE", seed=3), oracle.LINE, ARC)
+    model = linear_model(oracle.made(ARC, "GGGGGEE", seed=3), oracle.LINE, ARC)
     one, three = reliability(model), reliability(model, scale=3.0)
     for name in ("minimal_detectable_bias_m", "slope_m", "fault_level_m"):
         assert getattr(three, name) == pytest.approx(3.0 * getattr(one, name), rel=1e-9)
@@ -293,7 +291,7 @@ def test_all_epochs_at_once_is_epoch_by_epoch_in_any_order_of_satellites():
         ranges, sat_ecef_m=ranges.sat_ecef_m[:, order], code_m=ranges.code_m[:, order], weight=weight[:, order]
     )
     limits = RaimLimits(faults=2)
-    models = [constrained_model(r, oracle.LINE, arc) for r in (ranges, shuffled)]
+    models = [linear_model(r, oracle.LINE, arc) for r in (ranges, shuffled)]
     whole, other = (reliability(m, limits=limits) for m in models)
     rows = [reliability(models[0].take(np.array([t])), limits=limits) for t in range(60)]
     for item in fields(whole):

@@ -124,8 +124,9 @@ def test_ephemeris_at_the_end_of_a_week(number: int, received_s: int, week: int,
 
 def test_satellites_without_a_date_are_named(tmp_path: Path) -> None:
     """GPS and GLONASS carry no full date; Galileo does."""
-    chosen = {"number": 7, "toc_s": 5400, "toe_sow_s": 5400}
-    gps, galileo = message(1019, 0, {**chosen, "week": WEEKS[1019]}), message(1046, 0, {**chosen, "week": WEEKS[1046]})
+    chosen = {"number": 7, "toc_s": 5400, "toe_sow_s": 5400, "eccentricity": 2**23}
+    gps = message(1019, 0, {**chosen, "week": WEEKS[1019], "sqrt_a": int(5153.7 * 2**19)})
+    galileo = message(1046, 0, {**chosen, "week": WEEKS[1046], "sqrt_a": int(5440.6 * 2**19)})
     path = tmp_path / "caster.rtcm3"
     path.write_bytes(gps + galileo)
     navigation = railfix.read_navigation(path)

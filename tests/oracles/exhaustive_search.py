@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
-from railfix.positioning.normal_equations import Ranges, fit
+from railfix.positioning.normal_equations import misfit
+from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
 
@@ -21,5 +22,5 @@ def exhaustive_search(ranges: Ranges, trajectory: Trajectory) -> tuple[Indices, 
     points = trajectory.ecef_m
     q = np.empty((len(ranges), len(points)))
     for t in range(len(ranges)):
-        q[t] = fit(ranges.take(np.full(len(points), t)), points)
+        q[t] = misfit(ranges.take(np.full(len(points), t)), points)
     return np.where(ranges.n_used > ranges.n_clocks, np.argmin(q, axis=1), -1), q

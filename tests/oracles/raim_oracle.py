@@ -11,17 +11,11 @@ from scipy.stats import chi2
 
 import synthetic
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model
+from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, linear_model
 from railfix.integrity.raim.model import _model
-from railfix.positioning.normal_equations import (
-    UNTIED_M,
-    ClockTies,
-    Constrained,
-    Ranges,
-    clock_groups,
-    constrained_position,
-    single_point,
-)
+from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.ranges.channels import clock_groups
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -98,13 +92,13 @@ def only(ranges: Ranges, channels: list[int]) -> Ranges:
 
 def solved(ranges: Ranges, arc_m: np.ndarray) -> tuple[Constrained, LinearModel]:
     """Position on the line, started near the truth, and its model."""
-    got = constrained_position(ranges, LINE, np.argmin(np.abs(LINE.arc_m - arc_m[:, None]), axis=1))
-    return got, constrained_model(ranges, LINE, got.arc_m, section=got.section)
+    got = position_on_line(ranges, LINE, np.argmin(np.abs(LINE.arc_m - arc_m[:, None]), axis=1))
+    return got, linear_model(ranges, LINE, got.arc_m, section=got.section)
 
 
 def in_space(ranges: Ranges) -> LinearModel:
     """Model of the 3-D position."""
-    point = single_point(ranges, np.broadcast_to(LINE.ecef_m[0], (len(ranges), 3)))
+    point = point_position(ranges, np.broadcast_to(LINE.ecef_m[0], (len(ranges), 3)))
     return point_model(ranges, point.ecef_m)
 
 

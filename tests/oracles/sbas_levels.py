@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats
 from railfix.integrity.protection.risk import K_H_PA, K_V
 from railfix.integrity.raim import LinearModel
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
 from raim_oracle import point_model
 
 

@@ -20,12 +20,12 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline import processor as processing
 from railfix.pipeline.antennas import filter_verdicts, position_verdicts
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import Models, correct_ranges
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.range_stage import Models, correct_ranges
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.error_model import ErrorModel
 from railfix.run.processor import make_processor
 from railfix.screens import FilteredMotion, PairedEpochs, Screened
@@ -227,7 +227,7 @@ def test_rows_are_split_by_antenna() -> None:
     split = [(index is front, rows.tolist()) for index, rows in both.split(np.array([1, 2, 4]))]
     assert split == [(True, [1]), (False, [2, 4])]
     assert [rows.tolist() for _, rows in both.split(np.array([3]))] == [[3]]
-    alone = AntennaRows.of(rear)
+    alone = AntennaRows.on(rear)
     assert [rows.tolist() for _, rows in alone.split(np.array([3]))] == [[3]]
     assert not list(alone.split(np.array([], dtype=np.intp)))
     arc = np.array([10.0, np.nan, 20.0, 30.0, 40.0])
@@ -239,9 +239,9 @@ def test_chunks_are_freed_as_soon_as_they_are_done(monkeypatch: pytest.MonkeyPat
     made: list[weakref.ref[Any]] = []
 
     def noted(*arguments: Any, **options: Any) -> Any:
-        ranges = correct_ranges(*arguments, **options)
+        ranges, near = correct_ranges(*arguments, **options)
         made.append(weakref.ref(ranges))
-        return ranges
+        return ranges, near
 
     monkeypatch.setattr(processing, "correct_ranges", noted)
     logs, navigation, paths = _inputs()

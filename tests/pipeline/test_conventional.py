@@ -8,8 +8,8 @@ from scipy.stats import binomtest
 
 import synthetic
 from pipeline_cases import channel, clean_observations, front_alone, with_code
-from railfix.pipeline.solve import PointStatus, position_dilution, validate_point
-from railfix.positioning.normal_equations import SinglePointLimits, single_point
+from railfix.integrity.point_validation import PointStatus, position_dilution, validate_point
+from railfix.positioning.normal_equations import SinglePointLimits, point_position
 
 pytestmark = pytest.mark.requirement("A6")
 LINE = synthetic.line()
@@ -37,7 +37,7 @@ def test_noise_alone_fails_as_often_as_set(scale: float) -> None:
     place = LINE.at_arc(arc)
     object.__setattr__(ranges, "code_m", synthetic.travelled_range(ranges.sat_ecef_m, place[:, None]) + noise)
     limits = SinglePointLimits(false_alarm=0.02, dilution_limit=1e3)
-    point = single_point(ranges, np.broadcast_to(LINE.ecef_m.mean(axis=0), place.shape))
+    point = point_position(ranges, np.broadcast_to(LINE.ecef_m.mean(axis=0), place.shape))
     status = validate_point(point, ranges, np.full(len(arc), scale), limits=limits)
     failed = int(np.count_nonzero(status == PointStatus.RESIDUALS))
     assert binomtest(failed, len(arc), 0.02).pvalue > 1e-3

@@ -14,8 +14,9 @@ from railfix.gnss.observations import Observations
 from railfix.pipeline.processor import Result
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.gross_errors import gross_alone, gross_errors, scan_line
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, single_point
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.normal_equations import point_position
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies
+from railfix.positioning.search_index import SearchIndex
 from railfix.tracking import TrackStatus
 
 pytestmark = pytest.mark.requirement("A6")
@@ -107,8 +108,8 @@ def test_epochs_without_a_clear_culprit_are_unsure() -> None:
     ranges = synthetic.ranges(line, true, systems="GGGG", sigma_m=1.0)
     ranges = replace(ranges, code_m=ranges.code_m + np.array([0.0, 600.0, 0.0, 0.0]))
     index = SearchIndex(line)
-    point = single_point(ranges, line.at_arc(true))
-    found = gross_errors(ranges, AntennaRows.of(index), point)
+    point = point_position(ranges, line.at_arc(true))
+    found = gross_errors(ranges, AntennaRows.on(index), point)
     accused = found.gross.any(axis=1)
     assert not found.gross[:, [0, 2, 3]].any()
     assert np.isfinite(found.unsure_arc_m[~accused]).any()
@@ -122,7 +123,7 @@ def test_range_alone_on_its_clock_is_checked_by_the_known_bias() -> None:
     code[1, 5] += 3e5
     code[2, 5] += 20.0
     ranges = replace(ranges, code_m=code)
-    clock = single_point(ranges, line.at_arc(np.array([300.0] * 3))).clock_m
+    clock = point_position(ranges, line.at_arc(np.array([300.0] * 3))).clock_m
     known = ClockTies(offset_m=np.zeros((3, 2)), sigma_m=np.full((3, 2), 2.0))
     assert np.array_equal(gross_alone(ranges, clock, known), np.eye(6, dtype=bool)[5] & np.array([[0], [1], [0]], bool))
     nothing = replace(known, sigma_m=np.array([[0.0, UNTIED_M]] * 3))

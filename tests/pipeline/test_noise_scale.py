@@ -15,8 +15,8 @@ from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.noise_scale import NoiseScaleLimits, epoch_variance, robust_fit
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, robust_fit
 from railfix.positioning.windows import Windows
 from railfix.simulate.demonstration import demo_files
 

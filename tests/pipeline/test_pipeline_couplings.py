@@ -15,16 +15,20 @@ from railfix.core.arrays import copy_with
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.gnss.observations import Observations, carrier_frequency_hz
+from railfix.integrity import fault_exclusion
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
-from railfix.pipeline import level_stage, solution, solve
+from railfix.pipeline import level_stage, range_stage
 from railfix.pipeline.along_track import gnss_epochs
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.corrected_ranges import CorrectedRanges, Models
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.range_stage import Models
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.noise_scale import RobustFit
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning import inter_system, line_fix, receiver_noise
+from railfix.positioning.approximate import ApproximatePosition
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.receiver_noise import RobustFit
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
 
 BASE = {"screens": ["elevation", "raim"]}
@@ -110,13 +114,13 @@ def test_the_bias_of_the_error_model_is_in_the_level() -> None:
 @pytest.mark.requirement("C2")
 def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """Left and right of the track by the directions to the satellites, up to the elevation of the setting."""
-    caught, original = [], level_stage.along_track_level
+    caught, original = [], level_stage.protection_level
 
     def spied(*arguments: Any, **options: Any) -> Any:
         caught.append(options["sides"])
         return original(*arguments, **options)
 
-    monkeypatch.setattr(level_stage, "along_track_level", spied)
+    monkeypatch.setattr(level_stage, "protection_level", spied)
     result = front_alone(front(), BASE)
     (sides,) = caught
     line, columns = clean_trajectories()["front"], result.columns
@@ -183,7 +187,7 @@ def test_sigmas_of_the_level_are_the_larger_of_model_and_receiver() -> None:
 @pytest.mark.requirement("B4")
 def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """An exclusion whose remaining ranges fit badly at their own section leaves the epoch unresolved."""
-    original, solved = solve.place_on_line, []
+    original, solved = line_fix.fix_on_line, []
 
     def worse(*arguments: Any, **options: Any) -> Any:
         place = original(*arguments, **options)
@@ -193,7 +197,7 @@ def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.Mo
             solved.append(len(wsse))
         return replace(place, constrained=replace(place.constrained, wsse=wsse))
 
-    monkeypatch.setattr(solve, "place_on_line", worse)
+    monkeypatch.setattr(line_fix, "fix_on_line", worse)
     found = front_alone(with_code(front(), with_fault(80.0)), BASE)
     assert solved
     assert (found.raim.outcome[::2] == Outcome.UNRESOLVED).all()
@@ -213,14 +217,15 @@ def faults(*sizes_m: float) -> np.ndarray:
 @pytest.mark.requirement("B4")
 def test_a_pair_that_the_robust_fit_keeps_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two that disagree with the rest the rest can be faulty: nothing is excluded, and a check has failed."""
-    observations, original = with_code(front(), faults(60.0, 90.0)), solution.robust_fit
+    observations, original = with_code(front(), faults(60.0, 90.0)), receiver_noise.robust_fit
     believed = front_alone(observations, BASE)
     assert (believed.raim.outcome == Outcome.EXCLUDED_TWO).all()
 
     def keeps_all(ranges: Ranges, *args: Any, **options: Any) -> RobustFit:
         return replace(original(ranges, *args, **options), kept=ranges.weight > 0)
 
-    monkeypatch.setattr(solution, "robust_fit", keeps_all)
+    for module in (inter_system, receiver_noise):
+        monkeypatch.setattr(module, "robust_fit", keeps_all)
     doubted = front_alone(observations, BASE)
     assert (doubted.raim.outcome == Outcome.UNRESOLVED).all()
     assert (doubted.status == Status.INCONSISTENT).all()
@@ -232,13 +237,14 @@ def test_a_pair_that_the_robust_fit_keeps_is_not_believed(monkeypatch: pytest.Mo
 @pytest.mark.requirement("B4")
 def test_an_unresolved_fault_leaves_the_ranges_of_the_robust_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three faults are more than RAIM excludes: the position is that of the rest, and its status a failed check."""
-    change, original = faults(60.0, 90.0, 130.0), solution.robust_fit
+    change, original = faults(60.0, 90.0, 80.0), receiver_noise.robust_fit
     faulty = (change != 0)[:, fault_free().columns]
 
     def rejects_them(ranges: Ranges, *args: Any, **options: Any) -> RobustFit:
         return replace(original(ranges, *args, **options), kept=(ranges.weight > 0) & ~faulty)
 
-    monkeypatch.setattr(solution, "robust_fit", rejects_them)
+    for module in (inter_system, receiver_noise):
+        monkeypatch.setattr(module, "robust_fit", rejects_them)
     found = front_alone(with_code(front(), change), BASE | {"noise_scale": {"prior": 1e6}})
     assert (found.raim.outcome == Outcome.UNRESOLVED).all()
     assert (found.status == Status.INCONSISTENT).all()
@@ -295,7 +301,7 @@ def test_the_noise_of_a_3d_fit_is_that_of_its_redundant_ranges() -> None:
     log = clean_observations()["front"][300:500]
     order = np.argsort(-fault_free().elevation_deg[0])
     gps = [s for s in fault_free().satellite[order].tolist() if s[0] == "G"][:6]
-    noisy = with_code(only(log, gps), rng.normal(0.0, 40.0, (len(log), only(log, gps).code_m.shape[1])))
+    noisy = with_code(only(log, gps), rng.normal(0.0, 15.0, (len(log), only(log, gps).code_m.shape[1])))
     found = front_alone(noisy, {"screens": ["elevation"], "interference": {"use": "off"}})
     shown = np.maximum(1.0, found.single_point.wsse / (found.n_used - 4))
     lost = (found.constrained.wsse - found.single_point.wsse) / shown > chi2.isf(1e-6, 2)
@@ -308,7 +314,7 @@ def ranges_of_the_filter() -> CorrectedRanges:
     """Corrected ranges of ten epochs before any screen."""
     config = parse_config({"filter": "off", "screens": []})
     processor = EpochProcessor(config, {"front": clean_trajectories()["front"]}, navigation=clean_navigation())
-    return processor.screen({"front": front()[:10]})[0].ranges["front"]
+    return processor.screen({"front": front()[:10]})[0].corrected
 
 
 #: Reasons that the filter weighs itself; any other keeps code, phase and Doppler out of it.
@@ -327,8 +333,9 @@ def test_the_filter_has_what_a_screen_doubts_and_nothing_that_is_known_to_be_wro
     flagged[5, column] = reason
     epochs, _ = gnss_epochs(copy_with(ranges, reason=flagged), np.ones(10), parse_config({}), None)
     for values in (epochs.code_m, epochs.phase_m, epochs.rate_mps):
+        kept = (*DOUBTED, Reason.GROSS_ERROR) if values is not epochs.code_m else DOUBTED
         assert np.isfinite(values[[4, 6], column]).all()
-        assert np.isfinite(values[5, column]) == (reason in DOUBTED)
+        assert np.isfinite(values[5, column]) == (reason in kept)
 
 
 @pytest.mark.requirement("E5")
@@ -347,14 +354,14 @@ def test_phases_of_the_filter_are_without_troposphere_and_satellite_clocks() -> 
 @pytest.mark.requirement("B4")
 def test_exclusions_in_the_middle_of_a_chunk_are_those_of_their_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Noise scale, place and level of the epochs with a fault, as in a chunk that begins with them."""
-    change, original, scales = with_fault(80.0), solve.exclude, []
+    change, original, scales = with_fault(80.0), fault_exclusion.exclude, []
     change[:20] = 0.0
 
     def spied(model: Any, *, limits: Any, scale: np.ndarray) -> Any:
         scales.append(scale)
         return original(model, limits=limits, scale=scale)
 
-    monkeypatch.setattr(solve, "exclude", spied)
+    monkeypatch.setattr(fault_exclusion, "exclude", spied)
     observations, config = with_code(front(), change), parse_config({"filter": "off", **BASE})
     processor = EpochProcessor(config, {"front": clean_trajectories()["front"]}, navigation=clean_navigation())
     whole = processor.process({"front": observations})[0].antennas["front"]
@@ -374,15 +381,22 @@ def test_exclusions_in_the_middle_of_a_chunk_are_those_of_their_epochs(monkeypat
 
 
 @pytest.mark.requirement("A4")
-def test_far_from_the_line_the_anchor_is_the_position_and_its_place_the_nearest() -> None:
+def test_far_from_the_line_the_approximate_position_is_the_point_and_its_arc_the_nearest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A map of another region, 300 km away: the arc length is that of the nearest point of the line."""
     trajectory = clean_trajectories()["front"]
     middle = trajectory.ecef_m[len(trajectory.ecef_m) // 2]
     along = trajectory.ecef_m - middle
     far = replace(trajectory, ecef_m=middle + 3e5 * np.array([0.0, 0.6, 0.8]) + along)
     processor = EpochProcessor(parse_config(BASE), {"front": far}, navigation=clean_navigation())
+    notes: list[ApproximatePosition] = []
+    original = range_stage.approximate_position
+    monkeypatch.setattr(
+        range_stage, "approximate_position", lambda *a, **b: notes.append(original(*a, **b)) or notes[-1]
+    )
     ranges = processor.screen({"front": front()})[0].corrected
-    nearest, _ = far.nearest(ranges.anchor_ecef_m)
-    assert (np.linalg.norm(ranges.anchor_ecef_m - far.at_arc(nearest), axis=1) > 2e5).all()
-    np.testing.assert_allclose(ranges.anchor_arc_m, nearest, atol=1e-6)
+    nearest, _ = far.nearest(ranges.near_ecef_m)
+    assert (np.linalg.norm(ranges.near_ecef_m - far.at_arc(nearest), axis=1) > 2e5).all()
+    np.testing.assert_allclose(notes[0].arc_m, nearest, atol=1e-6)
     assert (nearest > 100.0).all()

@@ -194,9 +194,8 @@ def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: 
     stages = (
         "correct_ranges",
         "pair_antennas",
-        "with_slips",
-        "smooth_ranges",
-        "solve",
+        "screen_antennas",
+        "position_stage",
         "antenna_results",
         "along_track",
     )

@@ -20,20 +20,22 @@ from railfix.core.reasons import Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
+from railfix.integrity.fault_exclusion import compute_statistic
+from railfix.integrity.protection.level import RangeBounds
+from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
+from railfix.pipeline.range_stage import fit_ranges
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.solve import fault_free, line_model, place_on_line
 from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.line_fix import fix_on_line
 from railfix.positioning.map_offset import MapOffset
-from railfix.positioning.normal_equations import single_point
+from railfix.positioning.normal_equations import point_position
 from railfix.ranges.atmosphere import saastamoinen_delay_m
-from railfix.ranges.corrected import REASONS
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
+from railfix.ranges.sources import REASONS
 from railfix.run.processor import make_processor
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv
@@ -162,24 +164,25 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     assert level_facts(parse_config({"filter": "off"}))["kind"] == "separation"
     processor = make_processor(config, recording.navigation, {"front": recording.line})
     obs = recording.observations[180:200]
-    index = processor.indices["front"]
-    antennas, received = AntennaRows.of(index), processor.received
-    corrected = correct_ranges(obs, ChannelBook(config).of(obs, received.navigation), config, received, antennas)
-    one = processor._screen_antennas(("front",), antennas, corrected, received, State())[0]["front"]
-    ranges = one.ranges()
-    point = single_point(ranges, one.anchor_ecef_m)
-    place = place_on_line(ranges, index, point, config)
-    scale, model_on_line = np.ones(len(ranges)), line_model(ranges, antennas, place.constrained)
-    ranges, place, raim = fault_free(
-        ranges, antennas, place, model_on_line, scale, ranges.weight > 0, config.model_copy(update={"screens": ()})
+    one = processor.screen({"front": obs})[0].corrected
+    antennas, ranges = AntennaRows.on(processor.indices["front"]), fit_ranges(one)
+    fix = fix_on_line(ranges, antennas, point_position(ranges, one.near_ecef_m), config.fix_limits)
+    position = fix.constrained
+    scale, model_on_line = (
+        np.ones(len(ranges)),
+        linear_model(ranges, antennas, position.arc_m, section=position.section),
     )
+    raim = compute_statistic(ranges, fix, scale, limits=config.raim)
+    systems = [name[0] for name in one.satellite.tolist()]
     nothing = (np.zeros(len(ranges)), np.zeros(len(ranges)))
     offset = cast("MapOffset", SimpleNamespace(beyond_m=nothing, seen=None))
 
-    sides = low_sides(one, np.zeros(len(scale)), config.risk.side_elevation_deg)
+    sides = low_sides(one.azimuth_deg, one.elevation_deg, np.zeros(len(scale)), config.risk.side_elevation_deg)
 
     def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
-        return protection_levels(one, model_on_line, offset, raim, scale, sides, settings).level.level_m
+        bounds = None if settings.error_model is None else RangeBounds(one.bound_sigma_m, one.bias_m)
+        found = protection_levels(model_on_line, systems, offset, raim, scale, sides, settings, overbound=bounds)
+        return found.level.level_m
 
     has = np.isfinite(levels(scale, config))
     assert has.any()

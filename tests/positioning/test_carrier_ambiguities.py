@@ -16,7 +16,8 @@ from phase_run import phase_run
 from railfix.core.geodesy import range_with_rotation
 from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases, PhaseState, phase_positions
 from railfix.positioning.carrier.ambiguities import FREE_AMBIGUITY_M, number_hops
-from railfix.positioning.normal_equations import ClockTies, Ranges, constrained_position
+from railfix.positioning.normal_equations import position_on_line
+from railfix.positioning.range_arrays import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
 LINE = carrier_cases.straight()
@@ -190,7 +191,7 @@ def test_without_phases_it_is_the_position_of_the_codes(tied):
         ties = ClockTies(offset_m=np.tile([0.0, 5.5], (40, 1)), sigma_m=np.tile([0.0, 1.0], (40, 1)))
         ranges = replace(ranges, ties=ties)
     none = replace(phases, weight=np.zeros_like(phases.weight), arc_id=np.full(phases.arc_id.shape, -1))
-    code = constrained_position(ranges, LINE, np.clip(np.rint(arc / 50).astype(int), 0, 19))
+    code = position_on_line(ranges, LINE, np.clip(np.rint(arc / 50).astype(int), 0, 19))
     live, state = phase_positions(time, ranges, none, LINE, arc + 6.0)
     run = phase_run(time, ranges, none, LINE, arc + 6.0)
     for found in (live, run):
@@ -300,7 +301,7 @@ def test_noise_falls_and_the_sigma_tells_it():
         found, _ = phase_positions(time, ranges, phases, LINE, arc, limits=CONSTANT)
         errors.append(found.arc_m - arc)
         sigmas.append(found.noise_sigma_m)
-        codes.append(constrained_position(ranges, LINE, np.rint(arc / 50).astype(int)).arc_m - arc)
+        codes.append(position_on_line(ranges, LINE, np.rint(arc / 50).astype(int)).arc_m - arc)
     error, sigma, code = np.array(errors), np.array(sigmas), np.array(codes)
     assert np.std(error[:, -1]) < 0.25 * np.std(code[:, -1])
     assert 0.85 < np.sqrt(np.mean((error[:, 5:] / sigma[:, 5:]) ** 2)) < 1.15

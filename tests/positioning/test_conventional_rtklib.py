@@ -31,8 +31,10 @@ from railfix.io import read_navigation, read_observations
 from railfix.io.positions import read_positions
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
+from railfix.positioning.normal_equations import point_position
+from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.atmosphere import klobuchar_delay_m
+from railfix.ranges.channels import clock_groups
 from railfix.run.processor import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
@@ -158,7 +160,7 @@ def solved_again(found: AntennaResult, weight: np.ndarray) -> np.ndarray:
         groups=clock_groups(found.satellite[found.columns].astype("<U1")),
     )
     start = np.where(np.isfinite(found.conventional_ecef_m), found.conventional_ecef_m, 6.4e6)
-    return single_point(ranges, start).ecef_m
+    return point_position(ranges, start).ecef_m
 
 
 def positions(log: Log, choose: Callable[[Navigation], Navigation]) -> tuple[AntennaResult, Trajectory, Navigation]:

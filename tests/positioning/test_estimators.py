@@ -11,15 +11,11 @@ from scipy.optimize import least_squares
 import synthetic
 from exhaustive_search import exhaustive_search
 from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.normal_equations import (
-    Ranges,
-    clock_groups,
-    constrained_position,
-    fit,
-    normal_equations,
-    single_point,
-)
-from railfix.positioning.section_search import SearchIndex, SectionLimits, search
+from railfix.positioning.normal_equations import misfit, normal_equations, point_position, position_on_line
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.search_index import SearchIndex
+from railfix.positioning.section_search import SectionLimits, find_section
+from railfix.ranges.channels import clock_groups
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -46,8 +42,8 @@ def keep(ranges: Ranges, channels: list[int]) -> Ranges:
 
 
 def found_places(ranges: Ranges, line: Trajectory = LINE) -> tuple[np.ndarray, np.ndarray]:
-    point = single_point(ranges, np.broadcast_to(line.ecef_m.mean(axis=0), (len(ranges), 3)))
-    return search(ranges, SearchIndex(line), point).vertex, point.ecef_m
+    point = point_position(ranges, np.broadcast_to(line.ecef_m.mean(axis=0), (len(ranges), 3)))
+    return find_section(ranges, SearchIndex(line), point).vertex, point.ecef_m
 
 
 def test_range_agrees_with_the_rotated_satellite():
@@ -76,7 +72,7 @@ def test_clocks_eliminated_is_clocks_solved_for():
         assert step == pytest.approx(x[:3], abs=1e-5)
         covariance = np.linalg.inv(design.T @ (design * ranges.weight[t][:, None]))
         assert np.linalg.inv(equations.matrix[t]) == pytest.approx(covariance[:3, :3], rel=1e-6)
-    assert equations.wsse == pytest.approx(fit(ranges, place), rel=1e-9)
+    assert equations.wsse == pytest.approx(misfit(ranges, place), rel=1e-9)
 
 
 def test_channels_of_one_clock_stand_side_by_side():
@@ -88,7 +84,7 @@ def test_channels_of_one_clock_stand_side_by_side():
 @pytest.mark.requirement("A6")
 def test_single_point_of_exact_ranges_is_the_place():
     ranges = synthetic.ranges(LINE, arcs(40), sigma_m=0.0)
-    point = single_point(ranges, start(ranges))
+    point = point_position(ranges, start(ranges))
     assert np.linalg.norm(point.ecef_m - LINE.at_arc(arcs(40)), axis=1).max() < 2e-3
     assert point.clock_m[:, 0] == pytest.approx(3.0e5, abs=2e-3)
 
@@ -96,9 +92,9 @@ def test_single_point_of_exact_ranges_is_the_place():
 @pytest.mark.requirement("A6")
 def test_single_point_needs_three_ranges_beyond_the_clocks():
     ranges = keep(synthetic.ranges(LINE, arcs(3)), [0, 1, 2, 5, 6])
-    assert np.isfinite(single_point(ranges, start(ranges)).ecef_m).all()
+    assert np.isfinite(point_position(ranges, start(ranges)).ecef_m).all()
     ranges = keep(ranges, [0, 1, 2, 5])
-    assert np.isnan(single_point(ranges, start(ranges)).ecef_m).all()
+    assert np.isnan(point_position(ranges, start(ranges)).ecef_m).all()
 
 
 @pytest.mark.requirement("A3")
@@ -108,8 +104,8 @@ def test_single_point_needs_three_ranges_beyond_the_clocks():
 def test_search_equals_exhaustive_search(used, sigma_m):
     ranges = keep(synthetic.ranges(LINE, arcs(60), sigma_m=sigma_m), used)
     vertex, q = exhaustive_search(ranges, LINE)
-    point = single_point(ranges, start(ranges))
-    section = search(ranges, SearchIndex(LINE), point)
+    point = point_position(ranges, start(ranges))
+    section = find_section(ranges, SearchIndex(LINE), point)
     assert section.vertex.tolist() == vertex.tolist()
     assert section.q == pytest.approx(q.min(axis=1), rel=1e-3, abs=1e-3)
 
@@ -133,8 +129,8 @@ def test_search_looks_at_no_more_of_a_longer_line():
         looked = []
         for line in (LINE, long_line):
             ranges = keep(synthetic.ranges(line, arcs(40), sigma_m=1.0), used)
-            point = single_point(ranges, start(ranges))
-            section = search(ranges, SearchIndex(line), point)
+            point = point_position(ranges, start(ranges))
+            section = find_section(ranges, SearchIndex(line), point)
             looked.append(section.evaluations.mean())
         assert looked[1] < looked[0] * (1.5 if len(used) > 3 else 4.0) + 1
 
@@ -150,8 +146,8 @@ def test_two_branches_side_by_side_are_ambiguous():
     threshold = SectionLimits().threshold
     for sigma_m, ambiguous in ((12.0, True), (0.05, False)):
         ranges = synthetic.ranges(hairpin, where, sigma_m=sigma_m)
-        point = single_point(ranges, np.broadcast_to(hairpin.ecef_m[0], (30, 3)))
-        section = search(ranges, SearchIndex(hairpin), point)
+        point = point_position(ranges, np.broadcast_to(hairpin.ecef_m[0], (30, 3)))
+        section = find_section(ranges, SearchIndex(hairpin), point)
         assert np.all((section.excess <= threshold) == ambiguous)
 
 
@@ -195,7 +191,7 @@ def test_constrained_position_equals_a_general_optimiser(used):
     where = np.linspace(150.0, 850.0, 12)
     ranges = keep(synthetic.ranges(straight, where, sigma_m=1.0), used)
     vertex, _ = found_places(ranges, straight)
-    got = constrained_position(ranges, straight, vertex)
+    got = position_on_line(ranges, straight, vertex)
     good = np.flatnonzero((got.dilution < 20) & (got.overshoot_m == 0))
     assert len(good) >= 8
     expected = np.array([oracle(ranges, t, straight, got.arc_m[t]) for t in good])
@@ -207,7 +203,7 @@ def test_exact_ranges_of_two_satellites_give_the_place():
     where = arcs(40)
     ranges = keep(synthetic.ranges(LINE, where, sigma_m=0.0), [0, 1])
     truth = np.argmin(np.abs(LINE.arc_m - where[:, None]), axis=1)
-    got = constrained_position(ranges, LINE, truth)
+    got = position_on_line(ranges, LINE, truth)
     fine = got.dilution < 10
     assert fine.sum() > 20
     assert np.abs(got.arc_m - where)[fine].max() < 5e-3
@@ -223,7 +219,7 @@ def test_error_over_its_own_sigma_is_one():
     code = synthetic.travelled_range(ranges.sat_ecef_m, LINE.at_arc(where)[:, None, :])
     code = code + rng.normal(size=code.shape) / np.sqrt(ranges.weight)
     ranges = Ranges(sat_ecef_m=ranges.sat_ecef_m, code_m=code, weight=ranges.weight, groups=ranges.groups)
-    got = constrained_position(ranges, LINE, found_places(ranges)[0])
+    got = position_on_line(ranges, LINE, found_places(ranges)[0])
     inside = got.overshoot_m == 0
     ratio = ((got.arc_m - where) / got.exact_map_sigma_m)[inside]
     assert 0.9 < np.sqrt(np.mean(ratio**2)) < 1.1
@@ -244,7 +240,7 @@ def test_convex_vertex_ends_the_walk():
     made = synthetic.ranges(line, np.array([10.0]))
     code = synthetic.travelled_range(made.sat_ecef_m, outside[:, None, :])
     ranges = Ranges(sat_ecef_m=made.sat_ecef_m, code_m=code, weight=np.ones_like(code), groups=made.groups)
-    got = constrained_position(ranges, line, np.array([9]))
+    got = position_on_line(ranges, line, np.array([9]))
     assert got.arc_m == pytest.approx(200.0, abs=1e-9)
 
 
@@ -254,7 +250,7 @@ def test_beyond_the_end_is_clamped_and_told():
     place = LINE.ecef_m[0] - 80.0 * LINE.tangent[0]
     code = synthetic.travelled_range(made.sat_ecef_m, place)
     ranges = Ranges(sat_ecef_m=made.sat_ecef_m, code_m=code, weight=made.weight, groups=made.groups)
-    got = constrained_position(ranges, LINE, np.array([3]))
+    got = position_on_line(ranges, LINE, np.array([3]))
     assert got.arc_m[0] == 0.0
     assert got.overshoot_m[0] == pytest.approx(80.0, rel=0.05)
 
@@ -266,7 +262,7 @@ def test_clock_shift_and_order_of_satellites_change_nothing(seed, shift):
     where = arcs(5, seed)
     ranges = synthetic.ranges(LINE, where, systems="GGGGGGG", seed=seed)
     vertex, _ = found_places(ranges)
-    base = constrained_position(ranges, LINE, vertex)
+    base = position_on_line(ranges, LINE, vertex)
     order = np.random.default_rng(seed).permutation(7)
     other = Ranges(
         sat_ecef_m=ranges.sat_ecef_m[:, order],
@@ -274,7 +270,7 @@ def test_clock_shift_and_order_of_satellites_change_nothing(seed, shift):
         weight=ranges.weight[:, order],
         groups=ranges.groups,
     )
-    again = constrained_position(other, LINE, found_places(other)[0])
+    again = position_on_line(other, LINE, found_places(other)[0])
     assert again.arc_m == pytest.approx(base.arc_m, abs=1e-5)
     assert again.clock_m == pytest.approx(base.clock_m + shift, abs=1e-4)
 
@@ -287,5 +283,5 @@ def test_unused_satellites_do_not_matter():
     other = Ranges(sat_ecef_m=ranges.sat_ecef_m, code_m=code, weight=ranges.weight, groups=ranges.groups)
     vertex, place = found_places(ranges)
     assert np.array_equal(place, found_places(other)[1])
-    first, second = constrained_position(ranges, LINE, vertex), constrained_position(other, LINE, vertex)
+    first, second = position_on_line(ranges, LINE, vertex), position_on_line(other, LINE, vertex)
     assert np.array_equal(first.arc_m, second.arc_m)

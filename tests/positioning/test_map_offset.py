@@ -22,14 +22,15 @@ from railfix.positioning.map_offset import (
     beyond_threshold,
     map_offset,
 )
-from railfix.positioning.normal_equations import Ranges, SinglePoint, single_point
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.normal_equations import SinglePoint, point_position
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.search_index import SearchIndex
 
 pytestmark = pytest.mark.requirement("C4")
 
 EPOCHS = 40
 LINE = replace(oracle.LINE, sigma_plan_m=0.4, sigma_height_m=0.9)
-ALONE = AntennaRows.of(SearchIndex(LINE))
+ALONE = AntennaRows.on(SearchIndex(LINE))
 LIMITS = MapOffsetLimits(window_s=70.0, correlation_s=14.0, least_samples=2.5)
 SYSTEMS = "GGGGGEEE"
 #: Epochs at which the train is away from the line: they have a window of their own.
@@ -50,7 +51,7 @@ def case() -> tuple[np.ndarray, Ranges, SinglePoint, np.ndarray, np.ndarray, np.
     weight[9, [0, 1, 5]] = 0.0  # five of two clocks: no redundancy, not used
     weight[11, 3] = 0.0
     ranges = replace(ranges, weight=weight)
-    point = single_point(ranges, np.broadcast_to(LINE.ecef_m[0], (EPOCHS, 3)))
+    point = point_position(ranges, np.broadcast_to(LINE.ecef_m[0], (EPOCHS, 3)))
     arc[15] = np.nan
     return time, ranges, point, rng.uniform(0.3, 2.0, (EPOCHS, len(SYSTEMS))), rng.uniform(0.5, 4.0, EPOCHS), arc
 

@@ -1,12 +1,12 @@
 """Section search and constrained position on every epoch of the recordings and of the demonstration.
 
-The ranges are those that the pipeline itself hands to `search` and `constrained_position`. A sample of the
+The ranges are those that the pipeline itself hands to `search` and `position_on_line`. A sample of the
 epochs in the usual run; all with ``-m slow`` (``-s`` prints the counts).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,10 +19,11 @@ import synthetic
 from exhaustive_search import exhaustive_search
 from pipeline_cases import demo_observations, processor
 from railfix.core.epoch_rows import take_epochs
-from railfix.pipeline import corrected_ranges, solve
-from railfix.positioning import normal_equations, section_search
-from railfix.positioning.normal_equations import UNTIED_M, Constrained, ConstrainedLimits, Ranges, SinglePoint
-from railfix.positioning.section_search import SearchIndex, Section, SectionLimits
+from railfix.positioning import approximate, line_fix, normal_equations, section_search
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.normal_equations import Constrained, SinglePoint
+from railfix.positioning.range_arrays import UNTIED_M, Ranges
+from railfix.positioning.section_search import Section
 from railfix.track.trajectory import Trajectory
 
 #: Points times channels looked at together, to keep the exhaustive search in memory.
@@ -41,39 +42,22 @@ class Calls:
 def calls(monkeypatch) -> Calls:
     found = Calls()
 
-    def search(ranges: Ranges, index: SearchIndex, *args, **kwargs) -> Section:
-        result = section_search.search(ranges, index, *args, **kwargs)
-        found.searches.append((ranges, index.trajectory, result))
+    def find_section(ranges: Ranges, line: Line, point: SinglePoint, **limits) -> Section:
+        result = section_search.find_section(ranges, line, point, **limits)
+        for trajectory, rows in AntennaRows.on(line).lines:
+            found.searches.append((take_epochs(ranges, rows), trajectory, take_epochs(result, rows)))
         return result
 
-    def position(ranges: Ranges, trajectory: Trajectory, *args, **kwargs) -> Constrained:
-        result = normal_equations.constrained_position(ranges, trajectory, *args, **kwargs)
-        found.positions.append((ranges, trajectory, result))
+    def position_on_line(ranges: Ranges, line: Line, vertex: np.ndarray, **limits) -> Constrained:
+        result = normal_equations.position_on_line(ranges, line, vertex, **limits)
+        for trajectory, rows in AntennaRows.on(line).lines:
+            found.positions.append((take_epochs(ranges, rows), trajectory, take_epochs(result, rows)))
         return result
 
-    def search_lines(
-        ranges: Ranges, lines: Iterable[tuple[SearchIndex, slice]], point: SinglePoint, *, limits: SectionLimits
-    ) -> Section:
-        each = list(lines)
-        result = section_search.search_lines(ranges, each, point, limits=limits)
-        for index, rows in each:
-            found.searches.append((take_epochs(ranges, rows), index.trajectory, take_epochs(result, rows)))
-        return result
-
-    monkeypatch.setattr(solve, "search_lines", search_lines)
-    for module in (corrected_ranges, recordings_score):
-        monkeypatch.setattr(module, "search", search)
-
-    def positions(
-        ranges: Ranges, lines: Sequence[tuple[Trajectory, slice]], vertex: np.ndarray, *, limits: ConstrainedLimits
-    ) -> Constrained:
-        result = normal_equations.constrained_on_lines(ranges, lines, vertex, limits=limits)
-        for line, rows in lines:
-            found.positions.append((take_epochs(ranges, rows), line, take_epochs(result, rows)))
-        return result
-
-    monkeypatch.setattr(solve, "constrained_on_lines", positions)
-    monkeypatch.setattr(recordings_score, "constrained_position", position)
+    for module in (line_fix, approximate, recordings_score):
+        monkeypatch.setattr(module, "find_section", find_section)
+    for module in (line_fix, recordings_score):
+        monkeypatch.setattr(module, "position_on_line", position_on_line)
     return found
 
 

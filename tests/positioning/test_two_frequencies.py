@@ -17,18 +17,17 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline.channels import signal_delays
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.frequency_stage import NAME
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.two_frequencies import (
     Combined,
-    SecondCodes,
     TwoFrequencyLimits,
     TwoFrequencyState,
     combine_codes,
     share_of_second,
 )
+from railfix.ranges.second_codes import SecondCodes, signal_delays
 from railfix.run.processor import make_processor
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory

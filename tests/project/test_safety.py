@@ -22,7 +22,7 @@ TESTS = {
 def test_each_hazard_and_condition_has_a_test_that_exists_or_says_that_it_is_not_checked() -> None:
     rows = list(safety_rows(TEXT))
     numbers = [number for number, _, _ in rows]
-    assert numbers == [f"H{k}" for k in range(1, 18)] + [f"C{k}" for k in range(1, 12)]
+    assert sorted(numbers) == sorted([f"H{k}" for k in range(1, 32)] + [f"C{k}" for k in range(1, 18)])
     assert [test for _, _, tests in rows for test in tests if test not in TESTS] == []
     without = [number for number, _, tests in rows if not tests]
     assert without == re.findall(r"\| (C\d+) \|[^|]*\| \*\*not checked\*\*", TEXT)
@@ -37,7 +37,7 @@ def test_statuses_and_reasons_of_the_tables_exist() -> None:
 
 
 def test_the_page_is_short() -> None:
-    assert len(TEXT.split()) <= 1200
+    assert len(TEXT.split()) <= 1900
 
 
 RESULTS = """<testsuites><testsuite>

@@ -19,20 +19,13 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.corrected_ranges import Models
 from railfix.pipeline.processor import EpochProcessor
-from railfix.positioning.normal_equations import Ranges
+from railfix.pipeline.range_stage import Models
+from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.atmosphere import SeenFrom, model_delays
-from railfix.ranges.corrected import (
-    CodeNoise,
-    NominalErrors,
-    apply_long_term,
-    channel_order,
-    code_sigma_m,
-    first_available,
-    sbas_delays,
-)
+from railfix.ranges.channels import channel_order, first_available
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel, FaultRate
+from railfix.ranges.range_sigma import CodeNoise, NominalErrors, code_sigma_m
 from railfix.ranges.sbas import (
     IonosphereDelays,
     IonosphereState,
@@ -41,6 +34,7 @@ from railfix.ranges.sbas import (
     SbasCorrections,
     read_sbas,
 )
+from railfix.ranges.sources import apply_long_term, sbas_delays
 from railfix.run.processor import make_processor
 from recordings_score import straight_line
 

@@ -27,8 +27,8 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import collect_conditions
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.range_stage import collect_conditions
 from railfix.ranges.error_model import read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run import RunOptions, read_record, run_files

@@ -13,8 +13,8 @@ from railfix.core.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.ranges.atmosphere import SeenFrom
-from railfix.ranges.corrected import sbas_delays
 from railfix.ranges.sbas import SatelliteState
+from railfix.ranges.sources import sbas_delays
 from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("C2")

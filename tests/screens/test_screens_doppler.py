@@ -196,8 +196,8 @@ def test_mode_sigma() -> None:
     limits = DopplerLimits(mode="sigma", factor=4.0, doppler_sigma_mps=0.0, jerk_mps3=0.0)
     result, _ = screened(time, code, doppler, limits=limits, code_sigma_m=sigma)
     # 4 sqrt(2 (1 - e^-1)) = 4.498
-    np.testing.assert_allclose(result.limit_m[1:, 0], 4.498, atol=1e-3)
-    np.testing.assert_allclose(result.limit_m[1:, 1], 44.98, atol=1e-2)
+    np.testing.assert_allclose(result.limit[1:, 0], 4.498, atol=1e-3)
+    np.testing.assert_allclose(result.limit[1:, 1], 44.98, atol=1e-2)
     assert result.reject[2].tolist() == [True, False, False, False, False]
     assert np.isnan(result.metric[:, 2]).all(), "no sigma, no verdict"
     with pytest.raises(ValueError, match="code_sigma_m"):
@@ -216,7 +216,7 @@ def test_mode_receiver_finds_the_scale_of_the_receiver() -> None:
         )  # fmt: skip
         expected = max(float(doppler_limit_m(1.0)) - 1 / 12, 5.0 * np.sqrt(2.0) * noise)
         # the median of twelve, and the mean of logarithms, come out some tenth too small
-        assert 0.8 * expected < result.limit_m[-1, 0] < 1.05 * expected
+        assert 0.8 * expected < result.limit[-1, 0] < 1.05 * expected
     fixed, _ = screened(time, code, np.zeros(code.shape), satellite=satellite)
     assert result.reject[100:].mean() < 0.002 < 0.3 < fixed.reject[100:].mean()
 
@@ -232,7 +232,7 @@ def _pieces(limits: DopplerLimits, size: int, *arrays: np.ndarray) -> tuple[np.n
             code_sigma_m=sigma[:, there], break_before=broken,
         )  # fmt: skip
         whole = [np.full(code.shape, fill) for fill in (np.nan, False, np.nan, np.nan)]
-        values = (result.metric, result.reject, result.limit_m, result.level_m)
+        values = (result.metric, result.reject, result.limit, result.level_m)
         for target, value in zip(whole, values, strict=True):
             target[:, there] = value
         parts.append(whole)
@@ -334,7 +334,7 @@ def test_recordings(recordings: Path, name: str) -> None:
     fixed, _ = rates(log, DopplerLimits(mode="fixed"))
     letter, _ = rates(log, DopplerLimits(mode="fixed", hold_s=0.0))
     own, result = rates(log, DopplerLimits(mode="receiver", prior_epochs=10.0))
-    limit = float(np.nanmedian(result.limit_m))
+    limit = float(np.nanmedian(result.limit))
     print(f"{name}: fixed {fixed:.4f}, without hold {letter:.4f}, receiver {own:.4f} at {limit:.2f} m")
     assert fixed <= RECORDINGS[name][0]
     assert own <= RECORDINGS[name][1]

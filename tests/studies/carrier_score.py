@@ -42,8 +42,10 @@ from railfix.positioning.carrier import (
     smooth_codes,
     track_jumps,
 )
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups, constrained_position
+from railfix.positioning.normal_equations import position_on_line
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
 from railfix.ranges.atmosphere import saastamoinen_delay_m
+from railfix.ranges.channels import clock_groups
 from railfix.run.processor import make_processor
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
@@ -126,7 +128,7 @@ def delays(case: Case, result: AntennaResult) -> tuple[np.ndarray, np.ndarray]:
 def solved_on_line(ranges: Ranges, case: Case, result: AntennaResult) -> np.ndarray:
     """Constrained positions of other codes, from the pipeline's sections; its epochs only."""
     vertex = np.where(np.isfinite(result.arc_m), result.section.vertex, -1)
-    return constrained_position(ranges, case.trajectory, vertex).arc_m
+    return position_on_line(ranges, case.trajectory, vertex).arc_m
 
 
 def on_track(case: Case, result: AntennaResult, slips: Slips, used: np.ndarray) -> tuple[np.ndarray, TrackJumps]:

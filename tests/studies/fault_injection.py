@@ -25,9 +25,9 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.raim import (
     LinearModel,
     RaimLimits,
-    constrained_model,
     detect,
     exclude,
+    linear_model,
     noncentrality,
     reliability,
     threshold,
@@ -36,7 +36,9 @@ from railfix.integrity.raim.model import compact
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position
+from railfix.positioning.normal_equations import position_on_line
+from railfix.positioning.range_arrays import ClockTies, Ranges
+from railfix.ranges.channels import clock_groups
 from railfix.run.processor import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
@@ -121,8 +123,8 @@ class Clean:
         """Solved again at `epochs` (n,), with `error_m` (n, M) added to the codes."""
         part = self.ranges.take(epochs)
         part = replace(part, code_m=part.code_m + error_m)
-        got = constrained_position(part, self.trajectory, self.vertex[epochs])
-        return constrained_model(part, self.trajectory, got.arc_m, section=got.section)
+        got = position_on_line(part, self.trajectory, self.vertex[epochs])
+        return linear_model(part, self.trajectory, got.arc_m, section=got.section)
 
     def in_noise(self, generator: np.random.Generator) -> Clean:
         """The same geometry with codes that fit the line but for Gaussian noise of the weights times the scale."""
@@ -136,8 +138,8 @@ class Clean:
 
 
 def solved(ranges: Ranges, trajectory: Trajectory, vertex: Indices, scale: float) -> Clean:
-    got = constrained_position(ranges, trajectory, vertex)
-    model = constrained_model(ranges, trajectory, got.arc_m, section=got.section)
+    got = position_on_line(ranges, trajectory, vertex)
+    model = linear_model(ranges, trajectory, got.arc_m, section=got.section)
     found = detect(model.wsse, model.residual_m, model.freedom, limits=LIMITS, scale=scale)
     return Clean(ranges, trajectory, vertex, model, scale, found.testable & ~found.detected)
 

@@ -27,7 +27,7 @@ from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.pipeline import along_track
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.smoothing import Replay, SmoothedTrack, smooth
-from railfix.ranges.corrected import code_sigma_m
+from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import budget, classify_source

@@ -34,13 +34,14 @@ import psutil
 
 from ground_load import BEARERS_OF, centre_file
 from railfix.cli import main as main_of_railfix
-from railfix.ground.interlocking import HEAD, Interlocking, from_documents
+from railfix.ground.authority import Authority
 from railfix.ground.layout import overlap
-from railfix.ground.links import TrainLinks, first_sequence
+from railfix.ground.links import TrainLinks
+from railfix.ground.on_board import OnBoard
 from railfix.ground.serve import run_centre
+from railfix.ground.state import HEAD, Interlocking, from_documents
 from railfix.ground.store import Store
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
-from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import encode, to_json
 
 #: Station and direction of each train at the start.
@@ -171,7 +172,7 @@ class KilledCentre:
             inner = LINE.stations[station].inner_m
             front = inner[1] - 100.0 if direction > 0 else inner[0] + 100.0
             self.trains[number] = SimulatedTrain(
-                number=number, front_m=front, tracks={station: 1 if direction > 0 else 2}, sequence=first_sequence(),
+                number=number, front_m=front, tracks={station: 1 if direction > 0 else 2},
                 on_board=OnBoard(direction=direction, end_m=front),
             )  # fmt: skip
         self.address = f"sqlite:///{folder / 'centre.db'}" if self.server is None else Server.ADDRESS

@@ -24,15 +24,16 @@ from pathlib import Path
 import numpy as np
 
 import paths  # noqa: F401
+from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre
+from railfix.ground.keys import write_keys
 from railfix.ground.layout import Layout
-from railfix.ground.links import TrainLinks, create_bearers, first_sequence
-from railfix.ground.quic import write_keys
+from railfix.ground.links import TrainLinks, create_bearers
+from railfix.ground.on_board import OnBoard
 from railfix.ground.serve import COLLECTION, STEP_S
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, line_with_loops
-from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import encode
 
 CENTRE = {"A": ("127.0.1.1", 4433), "B": ("127.0.2.1", 4433)}
@@ -47,7 +48,7 @@ def line(trains: int) -> tuple[Layout, dict[int, SimulatedTrain]]:
         inner = layout.stations[k // 2].inner_m
         front = inner[1] - 30.0 if direction > 0 else inner[0] + 30.0
         found[k + 1] = SimulatedTrain(
-            number=k + 1, front_m=front, tracks={k // 2: 1 + k % 2}, sequence=first_sequence(),
+            number=k + 1, front_m=front, tracks={k // 2: 1 + k % 2},
             on_board=OnBoard(direction=direction, end_m=front),
         )  # fmt: skip
     return layout, found

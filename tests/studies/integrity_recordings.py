@@ -25,16 +25,17 @@ from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs, range_errors
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.integrity.protection import ProtectionLevel, along_track_level
-from railfix.integrity.raim import constrained_model
+from railfix.integrity.protection import ProtectionLevel, protection_level
+from railfix.integrity.raim import linear_model
 from railfix.integrity.stanford import Region, Stanford, stanford
 from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, constrained_position, fit
+from railfix.positioning.normal_equations import misfit, position_on_line
+from railfix.positioning.range_arrays import FILLER_SATELLITE_M, ClockTies, Ranges
+from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run.driver import open_inputs
@@ -312,8 +313,8 @@ def _with_scale(one: Recording, result: AntennaResult, config: Config, scale: np
     """The levels of the run with another scale of the ranges' sigmas."""
     has = np.isfinite(result.protection.level.level_m)
     arc, section = np.where(has, result.constrained.arc_m, np.nan), np.maximum(result.constrained.section, 0)
-    return along_track_level(
-        constrained_model(ranges_of(result), one.trajectory, arc, section=section),
+    return protection_level(
+        linear_model(ranges_of(result), one.trajectory, arc, section=section),
         [name[0] for name in result.satellite[result.columns].tolist()],
         risk=get_risk_budget(config),
         scale=scale,
@@ -328,7 +329,7 @@ def ranges_of(result: AntennaResult, reasons: int = -1) -> Ranges:
     sigma, code = result.sigma_m[:, columns], result.corrected_code_m[:, columns]
     used = ((result.reason[:, columns] & reasons) == 0) & np.isfinite(sigma) & np.isfinite(code)
     return Ranges(
-        sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, SOMEWHERE_ABOVE_M),
+        sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, FILLER_SATELLITE_M),
         code_m=np.where(used, code, 0.0),
         weight=np.where(used, 1.0 / np.where(used, sigma, 1.0) ** 2, 0.0),
         groups=clock_groups(result.satellite[columns].astype("<U1")),
@@ -344,7 +345,7 @@ def _moved(one: Recording, result: AntennaResult, used: np.ndarray, place: np.nd
     ranges = ranges_of(result)
     arc = np.where(np.isfinite(result.arc_m), result.constrained.arc_m, np.nan)
     section = np.maximum(result.constrained.section, 0)
-    model = constrained_model(ranges, one.trajectory, arc, section=section)
+    model = linear_model(ranges, one.trajectory, arc, section=section)
     gain = np.einsum("tkj,tj->tk", model.design, model.covariance_m2[:, 0]) * model.root_weight
     offset = np.zeros(used.shape)
     if ranges.ties is not None:
@@ -404,8 +405,8 @@ def _where(one: Judged, t: int) -> str:
     straight = float(np.linalg.norm(line.at_arc(result.arc_m[t : t + 1])[0] - one.place_ecef_m[t]))
     ranges = ranges_of(result, ~int(Reason.FAULT_EXCLUDED)).take(np.array([t]))
     ranges = replace(ranges, weight=np.where(one.outside[t] > OUTSIDE, 0.0, ranges.weight))
-    best = int(np.argmin(fit(ranges.take(np.zeros(len(line.ecef_m), dtype=np.intp)), line.ecef_m)))
-    other = constrained_position(ranges, line, np.array([best]))
+    best = int(np.argmin(misfit(ranges.take(np.zeros(len(line.ecef_m), dtype=np.intp)), line.ecef_m)))
+    other = position_on_line(ranges, line, np.array([best]))
     again = float(np.linalg.norm(line.at_arc(other.arc_m)[0] - one.place_ecef_m[t]))
     return (
         f"found {straight:.0f} m away in a straight line, {abs(float(result.arc_m[t] - true_arc[0])):.0f} m along it, "

@@ -31,13 +31,14 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection import LevelStatus, RiskBudget
 from railfix.integrity.protection.risk import set_sums
-from railfix.integrity.raim import constrained_model
+from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.noise_scale import map_information
-from railfix.positioning.normal_equations import Ranges, normal_equations
+from railfix.positioning.normal_equations import normal_equations
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.receiver_noise import map_information
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
@@ -456,13 +457,13 @@ def reweighted(
     """Movement along the line by Student's t weights of the residuals, in sigmas of the level, shape (T,) [m]."""
     section = np.maximum(section, 0)
     residual = np.nan_to_num(
-        constrained_model(ranges, line, arc, section=section).residual / np.maximum(scale, 1.0)[:, None]
+        linear_model(ranges, line, arc, section=section).residual / np.maximum(scale, 1.0)[:, None]
     )
     elevation, _ = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(np.nan_to_num(arc)))
     weighed = (elevation <= how.elevation_deg) & (ranges.n_used - ranges.n_clocks - 1 >= how.redundancy)[:, None]
     factor = np.where(weighed, how.tails.weight(residual, residual**2, residual.shape[1]), 1.0)
     weight = ranges.weight * factor
-    return np.nan_to_num(constrained_model(replace(ranges, weight=weight), line, arc, section=section).step_m[:, 0])
+    return np.nan_to_num(linear_model(replace(ranges, weight=weight), line, arc, section=section).step_m[:, 0])
 
 
 def late_rows() -> Iterator[str]:

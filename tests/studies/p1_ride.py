@@ -17,12 +17,12 @@ from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, Strin
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.core.settings import write_toml
 from railfix.gnss.observations import Observations
+from railfix.integrity.point_validation import PointStatus
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.solve import PointStatus
 from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.run.processor import make_processor

@@ -92,7 +92,12 @@ def reached(item: dict[str, Any]) -> str:
 
 def _largest() -> str:
     cells = [f"{name} {figures('corrected', 'all data', f'G       {name}, SBAS')[8]}" for name in SINGLE]
-    return f"{', '.join(cells)} m"
+    galileo = figures("commercial", "ways without tunnels", "G+J+E   p1 ")[8]
+    filtered = [figures("filtered", "ways without tunnels", f"{systems:7s} filter ")[8] for systems in ("G+J", "G+J+E")]
+    return (
+        f"{', '.join(cells)} m; without tunnels `p1` with Galileo {galileo} m, the filter along the track "
+        f"{filtered[0]} m (G+J) and {filtered[1]} m (G+J+E)"
+    )
 
 
 def _rate() -> str:

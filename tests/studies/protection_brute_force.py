@@ -23,10 +23,11 @@ import paths  # noqa: F401
 import raim_oracle
 import synthetic
 from railfix.core.geodesy import range_with_rotation
-from railfix.integrity.protection import ProtectionLevel, RiskBudget, along_track_level
-from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude
+from railfix.integrity.protection import ProtectionLevel, RiskBudget, protection_level
+from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, exclude, linear_model
 from railfix.integrity.raim.model import compact
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.range_arrays import Ranges
+from railfix.ranges.channels import clock_groups
 from railfix.track.trajectory import Trajectory
 
 #: Ten of each of three clocks to choose from.
@@ -162,7 +163,7 @@ def geometries(count: int, seed: int, risk: RiskBudget) -> Iterator[Geometries]:
     members = np.concatenate([[[-1, -1]], singles, pairs])
     for piece, first in enumerate(range(0, count, 250)):
         ranges, line, arc = drawn(min(250, count - first), seed * 1000 + piece, MAP_SIGMA_M[piece % len(MAP_SIGMA_M)])
-        level = along_track_level(constrained_model(ranges, line, arc), list(SYSTEMS), risk=risk)
+        level = protection_level(linear_model(ranges, line, arc), list(SYSTEMS), risk=risk)
         good = np.isfinite(level.level_m) & np.isfinite(level.k_two_faults) & (level.level_m < 300.0)
         ranges, arc = ranges.take(np.flatnonzero(good)), arc[good]
         level = ProtectionLevel(**{name: getattr(level, name)[good] for name in ProtectionLevel.__dataclass_fields__})
@@ -420,15 +421,15 @@ def excluding(draws: int, seed: int, risk: RiskBudget, systems: str = "GGGGGGEEE
         faulty = rng.random((draws, n)).argsort(axis=1).argsort(axis=1) < faults
         size = rng.uniform(2.0, 15.0, (draws, n)) * rng.choice([-1.0, 1.0], (draws, n)) / np.sqrt(ranges.weight)
         if faults == 2:
-            size = least_shown(constrained_model(ranges, raim_oracle.LINE, arc), faulty, size)
+            size = least_shown(linear_model(ranges, raim_oracle.LINE, arc), faulty, size)
         ranges = replace(ranges, code_m=ranges.code_m + faulty * size)
-        model = constrained_model(ranges, raim_oracle.LINE, arc)
+        model = linear_model(ranges, raim_oracle.LINE, arc)
         found = exclude(model, limits=RaimLimits())
-        rest: LinearModel = constrained_model(
+        rest: LinearModel = linear_model(
             replace(ranges, weight=np.where(found.excluded, 0.0, ranges.weight)), raim_oracle.LINE, arc
         )
         out = found.excluded.sum(axis=1)
-        got = along_track_level(rest, list(systems), risk=risk, n_excluded=out)
+        got = protection_level(rest, list(systems), risk=risk, n_excluded=out)
         told = np.isin(found.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
         error = np.abs(rest.step_m[:, 0])
         result[faults] = [

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.stats import norm
 
-from railfix.integrity.protection import RiskBudget, along_track_level
+from railfix.integrity.protection import RiskBudget, protection_level
 from railfix.integrity.protection.risk import set_sums
 from railfix.integrity.raim import LinearModel
 
@@ -45,7 +45,7 @@ def hand_model(error_m: tuple[float, ...]) -> LinearModel:
 
 def main() -> None:
     """Hypotheses with the same information together, then the level."""
-    got = along_track_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
+    got = protection_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
     k_alarm, level = float(got.k_false_alarm[0]), float(got.level_m[0])
     alike: dict[tuple[int, float], list[str]] = {}
     for size in (0, 1, 2):

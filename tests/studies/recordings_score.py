@@ -19,25 +19,27 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.core.timescale import timedelta
 from railfix.evaluate import Score, along_track_error, interpolate_reference, score, straight_distance
 from railfix.integrity.raim import Outcome as RaimOutcome
-from railfix.integrity.raim import constrained_model, exclude
+from railfix.integrity.raim import exclude, linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.noise_scale import (
+from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
+from railfix.positioning.range_arrays import Ranges, without
+from railfix.positioning.receiver_noise import (
     NoiseState,
     OffsetState,
+    epoch_sigma_m,
     map_information,
     noise_scale,
-    own_sigma_m,
     robust_fit,
     tie_clocks,
 )
-from railfix.positioning.normal_equations import Constrained, Ranges, clock_groups, constrained_position, single_point
-from railfix.positioning.section_search import SearchIndex, search
+from railfix.positioning.search_index import SearchIndex
+from railfix.positioning.section_search import find_section
 from railfix.positioning.windows import Windows
-from railfix.ranges.corrected import code_sigma_m
+from railfix.ranges.channels import clock_groups
+from railfix.ranges.range_sigma import code_sigma_m
 from railfix.run.processor import make_processor
 from railfix.track import Track, from_positions
 from railfix.track.trajectory import Trajectory
@@ -214,8 +216,8 @@ def smartloc_chain(
 
     def place(part: Ranges) -> Constrained:
         began = np.where(np.isnan(start_ecef_m), middle, start_ecef_m)
-        vertex = search(part, index, single_point(part, began), limits=config.section).vertex
-        return constrained_position(part, trajectory, np.where(part.n_used >= config.min_satellites, vertex, -1))
+        vertex = find_section(part, index, point_position(part, began), limits=config.section).vertex
+        return position_on_line(part, trajectory, np.where(part.n_used >= config.min_satellites, vertex, -1))
 
     got = place(ranges)
     known = np.isfinite(got.arc_m)
@@ -229,13 +231,13 @@ def smartloc_chain(
     scale, _ = noise_scale(windows, wsse, agreeing.freedom, known, one, new.robust[None], limits=limits)
     failed = np.zeros(len(ranges), dtype=bool)
     if "raim" in config.screens:
-        model = constrained_model(ranges, trajectory, got.arc_m, section=got.section)
+        model = linear_model(ranges, trajectory, got.arc_m, section=got.section)
         exclusion = exclude(model, limits=config.raim, scale=scale)
         failed = np.isin(exclusion.outcome, [RaimOutcome.INSEPARABLE, RaimOutcome.UNRESOLVED])
         ranges = without(ranges, exclusion.excluded)
         got = place(ranges)
     redundancy = ranges.n_used - ranges.n_clocks - 1
-    failed |= own_sigma_m(redundancy, got.wsse, got.exact_map_sigma_m, scale) > config.largest_sigma_m
+    failed |= epoch_sigma_m(redundancy, got.wsse, got.exact_map_sigma_m, scale) > config.largest_sigma_m
     arc = np.where(got.dilution <= config.dilution_limit, got.arc_m, np.nan)
     if movement is not None:
         arc = arc + movement(ranges, trajectory, got.arc_m, got.section, scale)
@@ -257,7 +259,7 @@ def smartloc(data: Path, config: Config = SETTINGS, movement: Movement | None = 
         groups=clock_groups([str(s)[0] for s in log.satellite]),
     )
     start = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
-    point = single_point(ranges, start)
+    point = point_position(ranges, start)
     clocks = tuple(CLOCK_GROUP[str(log.satellite[group.start])[0]] for group in ranges.groups)
     ties, _ = tie_clocks(log.time, clocks, "G", ranges, point, [OffsetState()], limits=config.clock_offsets)
     ranges = replace(ranges, ties=ties)

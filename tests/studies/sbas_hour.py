@@ -21,18 +21,19 @@ import numpy as np
 import paths
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.gnss.orbits import satellite_states
-from railfix.integrity.protection import along_track_level
+from railfix.integrity.protection import protection_level
 from railfix.integrity.protection.level import RangeBounds
-from railfix.integrity.raim import constrained_model
+from railfix.integrity.raim import linear_model
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.level_stage import get_risk_budget
-from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.range_arrays import FILLER_SATELLITE_M, Ranges
 from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
-from railfix.ranges.corrected import CodeNoise, apply_long_term, code_sigma_m
+from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorModel, read_error_model
+from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
+from railfix.ranges.sources import apply_long_term
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from sbas_levels import sbas_level
@@ -135,7 +136,7 @@ def sigmas_of_sbas(
 
 def ranges_at(above: Sky, place: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> Ranges:
     """The ranges as geometry has them."""
-    satellites = np.where(used[..., None], above.position_ecef_m, SOMEWHERE_ABOVE_M)
+    satellites = np.where(used[..., None], above.position_ecef_m, FILLER_SATELLITE_M)
     return Ranges(
         sat_ecef_m=satellites,
         code_m=np.where(used, range_with_rotation(satellites, place[:, None, :])[0], 0.0),
@@ -178,9 +179,9 @@ def _at_point(
     risk = get_risk_budget(parse_config({"sbas": ["messages"]}))
     enough = used.sum(axis=1) >= 3
     ranges = ranges_at(above, place, np.sqrt((sigmas**2).sum(axis=-1)), used)
-    model = constrained_model(ranges, line, np.where(enough, arc, np.nan), section=np.full(len(used), section))
+    model = linear_model(ranges, line, np.where(enough, arc, np.nan), section=np.full(len(used), section))
     systems = [name[0] for name in above.satellite.tolist()]
-    level = along_track_level(model, systems, risk=risk, overbound=RangeBounds(bias_m=np.where(used, bias, 0.0)))
+    level = protection_level(model, systems, risk=risk, overbound=RangeBounds(bias_m=np.where(used, bias, 0.0)))
     gain = np.einsum("tkj,tj->tk", model.design, model.covariance_m2[:, 0]) * model.root_weight
     parts = (gain[..., None] ** 2 * np.where(used[..., None], sigmas, 0.0) ** 2).sum(axis=1)
     rest = model.covariance_m2[:, 0, 0] - parts.sum(axis=1)

@@ -80,6 +80,47 @@ def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return sum(argument.arg not in ("self", "cls") for argument in every)
 
 
+#: Modules of the public stages by hand with the filter, and of the processor with the tables of results.
+STAGES = (
+    "ranges.corrected", "ranges.sources", "positioning.approximate", "positioning.inter_system", "positioning.line_fix",
+    "integrity.fault_exclusion", "integrity.protection.level", "screens.elevation", "tracking.filter",
+)  # fmt: skip
+PROCESSOR = ("pipeline.processor", "pipeline.tables")
+
+
+def import_closure(trees: dict[Path, ast.Module], source: Path, modules: tuple[str, ...]) -> set[Path]:
+    """Return the files that modules of the package import, directly or not, and their own."""
+    names = {".".join(path.relative_to(source).with_suffix("").parts): path for path in trees}
+    found: set[Path] = set()
+    waiting = [names[module] for module in modules]
+    while waiting:
+        path = waiting.pop()
+        if path in found:
+            continue
+        found.add(path)
+        for node in ast.walk(trees[path]):
+            if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("railfix"):
+                continue
+            inner = (node.module or "").removeprefix("railfix").lstrip(".")
+            for name in (inner, *(f"{inner}.{alias.name}".lstrip(".") for alias in node.names)):
+                # a face imports its names where they are asked for: each name counts as its own file
+                waiting.extend(names[each] for each in (name, f"{name}.__init__") if each in names)
+                stub = source / inner.replace(".", "/") / "__init__.pyi"
+                if stub.exists():
+                    waiting.extend(_behind_face(stub, inner, {alias.name for alias in node.names}, names))
+    return found
+
+
+def _behind_face(stub: Path, package: str, wanted: set[str], names: dict[str, Path]) -> list[Path]:
+    """Return the files that names of a lazily imported package come from."""
+    found = []
+    for node in ast.parse(stub.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and wanted & {alias.name for alias in node.names}:
+            module = f"{package}.{node.module}"
+            found.extend(names[each] for each in (module, f"{module}.__init__") if each in names)
+    return found
+
+
 def main() -> int:
     source = Path(sys.argv[1]) if len(sys.argv) > 1 else paths.ROOT / "src" / "railfix"
     files = [p for p in sorted(source.rglob("*.py")) if p.parent != source or not p.name.startswith("__")]
@@ -101,6 +142,9 @@ def main() -> int:
     print(f"import arrows   {sum(len(others & set(graph)) for others in graph.values())}")
     print(f"files           {len(trees)}")
     print(f"lines           {sum(sizes.values())}")
+    for title, modules in (("stages, filter", STAGES), ("processor", PROCESSOR)):
+        closure = import_closure(trees, source, modules)
+        print(f"{title:15s} {sum(sizes[path] for path in closure)} lines in {len(closure)} files that they import")
     print(f"dataclasses     {sum('dataclass' in ast.dump(d) for c in classes for d in c.decorator_list)}")
     print(f"__post_init__   {sum(node.name == '__post_init__' for node, _ in functions)}")
     print(f"participles     {len(participles)} of {len(functions)} functions")

@@ -13,7 +13,7 @@ import pytest
 
 import integrity_recordings
 from integrity_recordings import ALARM_LIMITS_M, Group
-from railfix.integrity.raim import constrained_model
+from railfix.integrity.raim import linear_model
 from railfix.integrity.stanford import Region
 
 pytestmark = [pytest.mark.requirement("C2"), pytest.mark.slow]
@@ -135,7 +135,7 @@ def test_the_level_follows_from_what_the_result_tells(groups):
     (one,) = groups["urbannav_f9p", "all others"]
     result = one.result
     arc = np.where(np.isfinite(result.arc_m), result.constrained.arc_m, np.nan)
-    model = constrained_model(
+    model = linear_model(
         integrity_recordings.ranges_of(result), one.trajectory, arc, section=np.maximum(result.constrained.section, 0)
     )
     level, scale = result.protection.level, result.noise_scale

@@ -29,7 +29,7 @@ from railfix.core.reasons import Reason
 from railfix.evaluate import interpolate_reference
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult
-from railfix.ranges.corrected import CodeNoise, code_sigma_m
+from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.simulate import LineSettings, RunSettings, Scenario, Simulation, SkySettings, write_run
 from railfix.simulate.environment import ElectrificationSettings, Environment, EnvironmentSettings, SectionSettings
 from railfix.simulate.environment.settings import Kind

@@ -85,12 +85,12 @@ def numbers(settings: Config) -> set[float]:
     correct = processor.correct_ranges
 
     def correct_ranges(obs: Any, channels: Any, *others: Any, **named: Any) -> Any:
-        ranges = correct(obs, channels, *others, **named)
+        ranges, near = correct(obs, channels, *others, **named)
         states, at = ranges.satellites, (EPOCH, int(np.flatnonzero(ranges.reason[EPOCH] == 0)[-1]))
         code = float(ranges.code_m[at])
         found.update((code, float(code + states.clock_m[at] - states.group_delay_m[at])))
         found.add(float(ranges.corrected_code_m[at]))
-        return ranges
+        return ranges, near
 
     processor.correct_ranges = correct_ranges  # type: ignore[assignment]
     run(settings)

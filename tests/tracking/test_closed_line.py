@@ -19,8 +19,9 @@ from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.pipeline.smoothing import Replay, smooth
-from railfix.positioning.normal_equations import constrained_position, single_point
-from railfix.positioning.section_search import SearchIndex, SectionLimits, search
+from railfix.positioning.normal_equations import point_position, position_on_line
+from railfix.positioning.search_index import SearchIndex
+from railfix.positioning.section_search import SectionLimits, find_section
 from railfix.run.inputs import TrackReading
 from railfix.run.sources import open_line
 from railfix.simulate.scenario_file import load_recipe
@@ -186,12 +187,12 @@ def test_single_epochs_at_the_join_are_placed_and_have_one_place() -> None:
     true = np.array([length - 8.0, 8.0, 0.0, 1500.0])
     ranges = synthetic.ranges(closed, true, sigma_m=0.0)
     for start in (0, len(closed) - 1):
-        found = constrained_position(ranges.take(np.arange(3)), closed, np.full(3, start))
+        found = position_on_line(ranges.take(np.arange(3)), closed, np.full(3, start))
         np.testing.assert_allclose(round_the_ring(found.arc_m, true[:3], length), 0.0, atol=1e-3)
         np.testing.assert_allclose(found.overshoot_m, 0.0, atol=1e-3)
     noisy = synthetic.ranges(closed, true, sigma_m=5.0)
-    point = single_point(noisy, closed.ecef_m[:4])
-    assert (search(noisy, SearchIndex(closed), point).excess > SectionLimits().threshold).all()
+    point = point_position(noisy, closed.ecef_m[:4])
+    assert (find_section(noisy, SearchIndex(closed), point).excess > SectionLimits().threshold).all()
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from railfix.kernels.tracking.constants import ACROSS_LOST
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.state import StateIndex, TrackState
+from railfix.tracking.state import Monitors, StateIndex, TrackState
 from railfix.tracking.velocity import singer_step
 from tracking_cases import Ride, bent_line, corner_line, part, reflected, ride, wheel, with_codes_behind, without_epochs
 
@@ -348,29 +348,25 @@ def test_codes_count_at_once_when_they_come_back() -> None:
     # a second of codes that contradict the place counts as a second, not as one epoch of it
     late = case.epochs.code_m + np.where(np.arange(400) >= 200, 300.0, 0.0)[:, None] * np.linspace(-1, 1, 10)
     _, state = track(part(replace(case.epochs, code_m=late), slice(0, 225)), case.line)
-    assert state.weak_code_s == pytest.approx(3.0)
+    assert state.monitors.weak_code_s == pytest.approx(3.0)
 
 
 @pytest.mark.requirement("E5")
 def test_nothing_learnt_outlives_a_reset() -> None:
     """Every field of the state but the times, the satellites and what withholds a level is that of an empty one."""
-    kept = {"time", "satellite", "seen", "previous", "measured", "withheld_s", "open_s"}
+    kept = {"time", "satellite", "seen", "previous", "measured"}
     case = ride(60)
     _, state = track(case.epochs, case.line, levels=True)
     learnt = [item.name for item in fields(TrackState) if item.name not in kept]
-    for name in learnt:
-        value = getattr(state, name)
-        if isinstance(value, float):
-            setattr(state, name, 1.5)
-        elif isinstance(value, tuple):
-            setattr(state, name, (0.25, 0.5))
+    state.monitors = Monitors(**dict.fromkeys((item.name for item in fields(Monitors)), 1.5))
     state.reset()
     empty = TrackState.empty()
+    assert state.monitors == Monitors(level_hold_s=1.5, ambiguity_hold_s=1.5)
     for name in learnt:
         value, begun = getattr(state, name), getattr(empty, name)
         if isinstance(value, np.ndarray):
             assert not value.any(), name
-        else:
+        elif name != "monitors":
             assert value == begun or str(value) == str(begun) == "NaT", name
     assert state.time == case.epochs.time[-1]
 
@@ -385,7 +381,7 @@ def test_an_improbable_place_hides_no_other() -> None:
     for arc in (StateIndex.ARC, StateIndex.PREVIOUS_ARC):
         state.mean[:, arc] += [600.0, 50.0]
     state.log_probability, state.origin_m = np.array([0.0, -36.0]), state.mean[:, StateIndex.ARC].copy()
-    state.across = ACROSS_LOST
+    state.monitors = replace(state.monitors, across=ACROSS_LOST)
     result, _ = track(case.epochs.take(slice(30, None)), case.line, state)
     assert result.hypotheses[0] == 3
     np.testing.assert_allclose(result.arc_m, case.arc_m[30:], atol=1.5)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plain_kernels import named_tuple, parameters, plain, work_space
+from plain_kernels import named_tuple, plain
 from railfix.core.arrays import copy_with
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.kernels.tracking import layout
@@ -23,8 +23,8 @@ from railfix.kernels.tracking.constants import (
 from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.chunk import prepare_chunk
 from railfix.tracking.filter import Recursion
-from railfix.tracking.handover import Handover
-from railfix.tracking.state import CLOCKS, OFFSETS, StateIndex
+from railfix.tracking.packing import pack_state
+from railfix.tracking.state import CLOCKS, OFFSETS, Monitors, StateIndex
 from railfix.tracking.velocity import compute_velocity
 from tracking_cases import Ride, bent_line, part, reflected, ride, without_epochs
 
@@ -117,28 +117,13 @@ def test_as_plain_python_the_recursion_gives_the_same(name: str, first: int, mon
             np.testing.assert_array_equal(one, other, err_msg=field.name)
 
 
-def _design(rows: Any, work: Any, h: int) -> np.ndarray:
-    """Design of codes, phases and Dopplers over the unknowns in use and those of an epoch."""
-    nc, nph, nd, _ = (int(count) for count in rows.counts)
-    width, size = work.mean.shape[1], nc + layout.COMBINED
-    combine = np.zeros((size, width))
-    share = work.share[h, :size] * work.root[h, :size, None]
-    np.add.at(combine, (np.arange(size)[:, None], work.unknown[h, :size]), share)
-    design = np.zeros((nc + nph + nd, size))
-    design[np.arange(nc), np.arange(nc)] = design[:nc, nc] = 1.0
-    for kind, first, count in ((layout.C_WAY, nc, nph), (layout.C_RIGHT, nc + nph, nd)):
-        at = slice(first, first + count)
-        design[at, nc + kind : nc + kind + 4] = work.design[h, at]
-    return np.asarray(design @ combine)
-
-
-def _dense_update(handed: Handover, recursion: Recursion, t: int, h: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same of a hypothesis, innovations and variances."""
-    rows, work = handed.rows, handed.work
-    nc, nph, nd, _ = rows.counts.tolist()
-    kinds = [(0, rows.codes[:nc]), (1, rows.phases[:nph]), (2, rows.dopplers[:nd])]
-    variance = np.concatenate([recursion.epochs.variance[kind, t, channels] for kind, channels in kinds])
-    return _design(rows, work, h), work.innovation[h, : nc + nph + nd], variance
+def _design(rows: Any, equations: Any, unknowns: int) -> np.ndarray:
+    """Measurement matrix of all measurements over the unknowns."""
+    codes, size = rows.code.stop, len(equations.unknown)
+    quantities = np.zeros((size, unknowns))
+    np.add.at(quantities, (np.arange(size)[:, None], equations.unknown), equations.coefficient)
+    moving = equations.design[codes : rows.sensor.start] @ quantities[codes : codes + layout.MOTION]
+    return np.concatenate([quantities[:codes], moving, quantities[codes + layout.MOTION :]])
 
 
 @pytest.mark.requirement("E5", "C2")
@@ -149,21 +134,19 @@ def test_the_update_of_each_sub_filter_keeps_its_digits(monkeypatch: pytest.Monk
     phase = np.where(np.arange(case.epochs.phase_m.shape[1]) == 0, case.epochs.phase_m, np.nan)
     advance = plain("tracking.recursion").advance
     names: dict[str, Any] = unwrap(advance).__globals__["advance_subfilters"].__globals__
-    update, errors = names["_update"], list[float]()
+    correct_state, errors = names["correct_state"], list[float]()
 
-    def updated(inputs: Any, t: int, rows: Any, best: int, work: Any, h: int) -> None:
-        update(inputs, t, rows, best, work, h)
-        design, prior = (a.astype(np.longdouble) for a in (_design(rows, work, h), work.spread[h]))
-        variance = (work.masked[: len(design)] / work.weight[h, : len(design)]).astype(np.longdouble)
-        prior, n = prior[: design.shape[1], : design.shape[1]], work.new_mean.shape[1] - 1
-        for row, own in zip(design[np.isfinite(variance)], variance[np.isfinite(variance)], strict=True):
-            gain = prior @ row  # one after the other: nothing is inverted
-            prior = prior - np.outer(gain, gain) / (row @ gain + own)
-        sigma = np.sqrt(np.diag(prior)[:n])
-        difference = work.new_covariance[h][:n, :n] - prior[:n, :n]
-        errors.append(float(np.abs(difference / np.outer(sigma, sigma)).max()))
+    def corrected(rows: Any, equations: Any, variance: Any, weight: Any, x: Any, P: Any) -> None:
+        design, prior = (a.astype(np.longdouble) for a in (_design(rows, equations, len(x)), P))
+        correct_state(rows, equations, variance, weight, x, P)
+        own = (variance / weight).astype(np.longdouble)
+        for row, noise in zip(design[np.isfinite(own)], own[np.isfinite(own)], strict=True):
+            gain = prior @ row  # one after the other, without phases and Dopplers compressed
+            prior = prior - np.outer(gain, gain) / (row @ gain + noise)
+        sigma = np.sqrt(np.diag(prior))
+        errors.append(float(np.abs((P - prior) / np.outer(sigma, sigma)).max()))
 
-    monkeypatch.setitem(names, "_update", updated)
+    monkeypatch.setitem(names, "correct_state", corrected)
     monkeypatch.setattr("railfix.tracking.filter._kernel", lambda: advance)
     track(part(replace(case.epochs, phase_m=phase), slice(0, 4)), case.line, levels=True)
     assert len(errors) > 20
@@ -180,31 +163,29 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
     state.mean[1, 0] += 5.0
     state.covariance[:, :, 0] *= 0.3
     state.covariance[:, 0] *= 0.3
-    state.log_scale = (0.0, 0.0)
+    state.monitors = replace(state.monitors, log_doppler_scale=0.0, log_phase_scale=0.0)
     for name in ("log_probability", "log_code", "log_least", "log_recent", "origin_m"):
         setattr(state, name, np.repeat(getattr(state, name), 2) + np.log(0.5) * (name == "log_probability"))
-    epochs = part(case.epochs, slice(20, 21))
+    epochs, recursion = part(case.epochs, slice(20, 21)), plain("tracking.recursion")
     chunk = prepare_chunk(epochs, state, limits)
-    recursion = Recursion(chunk, case.line, SensorEpochs(), limits, Tracked.empty(epochs.time, 10), levels=False)
-    handed = Handover(recursion, state, 0, 1)
-    assert handed.run(layout.WHOLE) == 1
-    density, work = [], handed.work
-    for h in range(2):
-        design, value, variance = _dense_update(handed, recursion, 0, h)
-        assert len(value) == 30
-        prior = work.spread[h]
-        innovation = design @ prior @ design.T + np.diag(variance)
+    given = Recursion(chunk, case.line, SensorEpochs(), limits, state, levels=False).given
+    packed = pack_state(state, chunk.time[0], limits, levels=False)
+    recursion._predict_all(given, 0, packed)
+    rows = plain("tracking.measurements").choose_measurements(given, 0, packed)
+    assert rows.sensor.stop == 30
+    density, evidence = [], []
+    for one in recursion._correct_hypotheses(given, 0, packed, rows)[0]:
+        design, prior, value = _design(rows, one.equations, len(one.x)), one.P_prior, one.innovation
+        innovation = design @ prior @ design.T + np.diag(rows.variance)
         gain = prior @ design.T @ np.linalg.inv(innovation)
-        n = len(handed.full)
-        row = int(np.flatnonzero(work.kept[:2] == h)[0])
-        np.testing.assert_allclose(handed.memory.mean[row], (work.mean[h] + gain @ value)[:n], rtol=1e-6, atol=1e-6)
-        after = (prior - gain @ design @ prior)[:n, :n]
-        np.testing.assert_allclose(handed.memory.covariance[row], after, rtol=1e-5, atol=1e-6)
-        fitted = gain @ value, prior - gain @ design @ prior
-        np.testing.assert_allclose(work.residual[h, :30], value - design @ fitted[0], atol=1e-5)
-        np.testing.assert_allclose(work.fitted[h, :30], np.diagonal(design @ fitted[1] @ design.T), rtol=1e-4)
+        np.testing.assert_allclose(one.x, one.x_prior + gain @ value, rtol=1e-6, atol=1e-6)
+        left = np.eye(len(prior)) - gain @ design
+        after = left @ prior @ left.T + gain * rows.variance @ gain.T  # Joseph's form keeps its digits
+        np.testing.assert_allclose(one.P, after, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(one.fit.residual, value - design @ gain @ value, atol=1e-5)
+        np.testing.assert_allclose(one.fit.fitted, np.diagonal(design @ after @ design.T), rtol=1e-4)
         density.append(-0.5 * (value @ np.linalg.solve(innovation, value) + np.linalg.slogdet(innovation)[1]))
-    evidence = work.evidence[:2] + work.code_evidence[:2]
+        evidence.append(sum(recursion.compute_evidence(rows, (1e9, 1e9), limits.passes, one)))
     assert abs(density[0] - density[1]) > 0.3
     assert evidence[0] - evidence[1] == pytest.approx(density[0] - density[1], abs=1e-4)
 
@@ -232,7 +213,7 @@ def _ranged(case: Ride, *, kept: float) -> SensorEpochs:
 def test_ranges_to_ground_units_give_the_place_to_decimetres() -> None:
     case = ride(60, noise=1.0, seed=5)
     found, state = track(case.epochs, case.line, sensors=_ranged(case, kept=0.6), levels=True)
-    assert found.used[:, 3 + layout.RANGE_ROW].sum() > 40
+    assert found.used[:, 3 + layout.RANGE_COLUMN].sum() > 40
     assert np.abs(found.arc_m - case.arc_m)[10:].max() < 0.4
     assert state.bank is not None
     assert "range" in state.bank.without
@@ -269,109 +250,94 @@ def test_what_is_no_number_in_a_sub_filter_bounds_nothing_and_in_the_filter_begi
     assert TrackStatus.TRACKING in found.status
 
 
-def _made_epoch(counts: tuple[int, int, int, int]) -> tuple[layout.Rows, layout.Work, np.ndarray]:
-    """Random measurements of an epoch in work space, and the covariance of what they are combinations of."""
-    random, work = np.random.default_rng(7), work_space(1)
-    rows = named_tuple(layout.Rows, counts=np.array(counts))
-    size = counts[0] + layout.COMBINED + counts[3]
+def _made_epoch() -> tuple[Any, Any]:
+    """Random measurements, 4 codes, 3 phases, 4 Dopplers, 2 sensors, and a correction without weights."""
+    random, update, size = np.random.default_rng(7), plain("tracking.update"), 4 + layout.MOTION + 2
+    rows = named_tuple(
+        layout.Rows, code=slice(0, 4), phase=slice(4, 7), doppler=slice(7, 11), sensor=slice(11, 13),
+        variance=random.uniform(1.0, 4.0, 13),
+    )  # fmt: skip
+    index = np.full((size, layout.TERMS), StateIndex.WHEEL)
+    index[:, 0], index[:, 1] = StateIndex.ARC, StateIndex.SPEED
+    coefficient, design = random.normal(size=index.shape), np.zeros((13, layout.MOTION))
+    design[4:7, :4], design[7:11, 2:] = random.normal(size=(3, 4)), random.normal(size=(4, 4))
+    equations = update.Equations(index, coefficient, design, 20.0 * random.normal(size=13) + 7.0)
     mixed = random.normal(size=(size, 2 * size))
     covariance = mixed @ mixed.T
-    work.root[0, :size] = np.sqrt(np.diagonal(covariance))
-    work.own[0, :size, :size] = covariance / np.outer(work.root[0, :size], work.root[0, :size])
-    work.information[0, :size, :size] = np.linalg.inv(work.own[0, :size, :size])
-    work.design[:] = random.normal(size=work.design.shape)
-    work.sensed[:] = random.normal(size=work.sensed.shape)
-    work.value[:] = 20.0 * random.normal(size=work.value.shape) + 7.0
-    work.variance[:] = random.uniform(1.0, 4.0, work.variance.shape)
-    return rows, work, covariance
+    one = named_tuple(
+        update.Correction, equations=equations, covariance=covariance, fit=update.new_fit(rows),
+        without_clock=np.diagonal(covariance) * random.uniform(0.1, 1.0, size),
+    )  # fmt: skip
+    return rows, one
 
 
 def _expected_weights(
-    rows: layout.Rows,
-    work: layout.Work,
-    covariance: np.ndarray,
-    degrees: tuple[float, float],
-    free: tuple[float, float],
+    rows: Any, one: Any, covariance: np.ndarray, without_clock: np.ndarray, degrees: tuple[float, float]
 ) -> np.ndarray:
     """Student's weights of innovations less the median of their kind, the clock of the kind known."""
-    (nc, nph, nd, ns), (usual, late) = rows.counts.tolist(), degrees
-    shift, d = work.value[0].copy(), work.design[0]
-    kinds, first = np.split(np.arange(nc + nph + nd), [nc, nc + nph]), nc + 1
-    for kind in kinds:
+    shift, (usual, late) = one.equations.value.copy(), degrees
+    for kind in (rows.code, rows.phase, rows.doppler):
         shift[kind] -= np.median(shift[kind])
-    way_right_up, right_up_speed = first + np.array([0, 2, 3]), first + np.array([2, 3, 4])
-    spread = np.concatenate([
-        np.diagonal(covariance)[:nc] + free[0] * d[kinds[0], 0] ** 2,
-        [x[[0, 2, 3]] @ covariance[np.ix_(way_right_up, way_right_up)] @ x[[0, 2, 3]] + free[0] * x[0] ** 2
-         for x in d[kinds[1]]],
-        [x[:3] @ covariance[np.ix_(right_up_speed, right_up_speed)] @ x[:3] + free[1] * x[2] ** 2 for x in d[kinds[2]]],
-        np.diagonal(covariance)[len(covariance) - ns :]
-        + free[0] * work.sensed[0, :ns, 0] ** 2 + free[1] * work.sensed[0, :ns, 2] ** 2,
-    ])  # fmt: skip
-    size = len(spread)
-    own = np.where((np.arange(size) < nc) & (shift[:size] > 0.0), late, usual)
-    return (usual + 1.0) / usual * own / (own + shift[:size] ** 2 / (spread + work.variance[:size]))
+    spread = np.concatenate([without_clock[:4], np.zeros(7), without_clock[-2:]])
+    for kind, clock in ((rows.phase, layout.M_CLOCK), (rows.doppler, layout.M_DRIFT)):
+        known = np.delete(np.arange(layout.MOTION), clock)
+        design = one.equations.design[kind][:, known]
+        spread[kind] = np.diagonal(design @ covariance[np.ix_(4 + known, 4 + known)] @ design.T)
+    own = np.where((np.arange(13) < 4) & (shift > 0.0), late, usual)
+    return np.asarray((usual + 1.0) / usual * own / (own + shift**2 / (spread + rows.variance)))
 
 
 @pytest.mark.requirement("E5")
 def test_first_weights_are_students_with_the_clock_of_each_kind_known() -> None:
-    rows, work, covariance = _made_epoch((4, 3, 4, 2))
-    plain("tracking.update").first_weights(rows, work.variance, (4.0, 1.5), 50.0, 3.0, work, 0, 1)
-    expected = _expected_weights(rows, work, covariance, (4.0, 1.5), (50.0, 3.0))
-    np.testing.assert_allclose(work.weight[1, :13], expected, rtol=1e-9)
+    (rows, one), degrees = _made_epoch(), (4.0, 1.5)
+    expected = one.covariance, one.without_clock
+    plain("tracking.update").write_first_weights(rows, one.equations, expected, rows.variance, degrees, one.fit.weight)
+    np.testing.assert_allclose(one.fit.weight, _expected_weights(rows, one, *expected, degrees), rtol=1e-9)
 
 
 @pytest.mark.requirement("E5")
-def test_a_second_start_sets_place_and_speed_free_by_their_own_variances(monkeypatch: pytest.MonkeyPatch) -> None:
-    update, given, weights = plain("tracking.update"), parameters(TrackingLimits()), list[np.ndarray]()
-    rows, work, covariance = _made_epoch((4, 3, 4, 2))
-    reweight = update.reweight
-    update.first_weights(rows, work.variance, given.degrees, 0.0, 0.0, work, 0, 0)
-    work.log_after[0] = reweight(rows, work.variance, given.degrees, given.passes, work, 0, 0, 0)
+def test_a_second_fit_sets_place_and_speed_free_by_their_own_variances(monkeypatch: pytest.MonkeyPatch) -> None:
+    (rows, one), degrees, evidence = _made_epoch(), (4.0, 1.0), plain("tracking.evidence")
+    weights, covariances, reweight = list[np.ndarray](), list[np.ndarray](), evidence.reweight
+    reweight(rows, one.equations, one.covariance, rows.variance, degrees, 4, one.fit)
 
-    def reweighted(*arguments: Any) -> Any:
-        weights.append(work.weight[1, :13].copy())
-        return reweight(*arguments)
+    def reweighted(rows: Any, equations: Any, covariance: Any, *others: Any) -> None:
+        weights.append(others[-1].weight.copy())
+        covariances.append(covariance)
+        reweight(rows, equations, covariance, *others)
 
-    monkeypatch.setattr(update, "reweight", reweighted)
-    update.second_start(given, rows, work, 0, 1)
-    free = FREEDOM_PLACE_M2, FREEDOM_SPEED_M2PS2
-    np.testing.assert_allclose(weights[0], _expected_weights(rows, work, covariance, given.degrees, free), rtol=1e-9)
-    place, speed = np.zeros(len(covariance)), np.zeros(len(covariance))
-    place[:4], place[4 + layout.C_WAY], place[-2:] = work.design[0, :4, 0], 1.0, work.sensed[0, :2, 0]
-    speed[4 + layout.C_SPEED], speed[-2:] = 1.0, work.sensed[0, :2, 2]
-    freed = covariance + free[0] * np.outer(place, place) + free[1] * np.outer(speed, speed)
-    root, found = work.root[0, : len(freed)], work.own[1, : len(freed), : len(freed)]
-    upper = np.triu_indices(len(freed))
-    np.testing.assert_allclose((found * np.outer(root, root))[upper], freed[upper], rtol=1e-9, atol=1e-9)
+    monkeypatch.setattr(evidence, "reweight", reweighted)
+    evidence.refit_inflated_prior(rows, degrees, 4, one)
+    place, speed = one.equations.coefficient[:, 0], one.equations.coefficient[:, 1]
+    inflated = one.covariance + FREEDOM_PLACE_M2 * np.outer(place, place) + FREEDOM_SPEED_M2PS2 * np.outer(speed, speed)
+    without_clock = one.without_clock + FREEDOM_PLACE_M2 * place**2 + FREEDOM_SPEED_M2PS2 * speed**2
+    np.testing.assert_allclose(covariances[0], inflated, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(covariances[1], one.covariance)
+    np.testing.assert_allclose(weights[0], _expected_weights(rows, one, inflated, without_clock, degrees), rtol=1e-9)
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.parametrize("size", range(1, 12))
-def test_factors_in_whole_vectors_are_those_of_numpy(size: int) -> None:
-    algebra: Any = plain("tracking.algebra")
-    random = np.random.default_rng(size)
-    root, right = random.normal(size=(size, size)), random.normal(size=(size, 5))
-    wide = np.zeros((2, size, 16))
-    matrix = wide[1, :, :size] = root @ root.T + np.eye(size)
-    factor, inverse, pivots = np.full((12, 16), np.nan), np.full((1, 12, 16), np.nan), np.ones((3, 16))
-    lower = np.concatenate([np.zeros((16, 16)), np.eye(17, 16)])
-    algebra.invert(wide, 1, size, factor, pivots, lower, inverse, 0)
-    solved = np.zeros((size, 8))
-    solved[:, :5] = right
-    algebra.solve_forward(factor, size, pivots, solved)
-    determinant = algebra.log_determinant(pivots, size)
-    np.testing.assert_allclose(determinant, np.linalg.slogdet(matrix)[1], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(inverse[0, :size, :size], np.linalg.inv(matrix), rtol=1e-9, atol=1e-12)
-    back = np.triu(factor[:size, :size]).T @ (pivots[0, :size, None] * solved[:, :5])
-    np.testing.assert_allclose(back, right, rtol=1e-9, atol=1e-12)
+def test_six_rows_are_equivalent_to_all_phases_and_dopplers() -> None:
+    """Corrected quantities, determinant and distance against one system of all measurements, not compressed."""
+    rows, one = _made_epoch()
+    plain("tracking.update").fit(rows, one.equations, one.covariance, rows.variance, one.fit)
+    design = np.zeros((13, 4 + layout.MOTION + 2))
+    design[:4, :4], design[4:11, 4:10], design[11:, 10:] = np.eye(4), one.equations.design[4:11], np.eye(2)
+    innovation = design @ one.covariance @ design.T + np.diag(rows.variance)
+    fitted = one.covariance @ design.T @ np.linalg.solve(innovation, one.equations.value)
+    np.testing.assert_allclose(one.fit.residual, one.equations.value - design @ fitted, rtol=0, atol=1e-9)
+    after = one.covariance - one.covariance @ design.T @ np.linalg.solve(innovation, design @ one.covariance)
+    np.testing.assert_allclose(one.fit.fitted, np.diagonal(design @ after @ design.T), rtol=1e-9)
+    determinant = np.linalg.slogdet(innovation)[1] - np.log(rows.variance).sum()
+    distance = fitted @ np.linalg.solve(one.covariance, fitted)
+    np.testing.assert_allclose(one.fit.summary, [determinant, distance], rtol=1e-9)
 
 
-@pytest.mark.parametrize("size", [1, 2, 5, 8])
-def test_the_median_of_a_part_of_a_row_is_that_of_numpy(size: int) -> None:
-    values = np.random.default_rng(size).normal(size=(3, 12))
-    found = plain("tracking.algebra").median(values, 1, 2, size, np.empty(12))
-    assert found == pytest.approx(np.median(values[1, 2 : 2 + size]), abs=1e-15)
+@pytest.mark.parametrize("size", [0, 1, 2, 5, 8])
+def test_the_median_is_that_of_numpy(size: int) -> None:
+    values = np.random.default_rng(size).normal(size=size)
+    found = plain("tracking.update").median(values)
+    assert np.isnan(found) if size == 0 else found == pytest.approx(np.median(values), abs=1e-15)
 
 
 @pytest.mark.requirement("E5")
@@ -396,7 +362,9 @@ def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
     nothing = without_epochs(part(case.epochs, slice(50, 60)), np.ones(10, dtype=bool))
     own, banks = [], []
     for log_variance in (0.0, 5.0):
-        _, after = track(nothing, case.line, copy_with(state, map_log_variance=log_variance), levels=True)
+        _, after = track(
+            nothing, case.line, copy_with(state, monitors=Monitors(map_log_variance=log_variance)), levels=True
+        )
         assert after.bank is not None
         assert len(after.bank.without) > 10
         own.append(after.covariance[0, StateIndex.ARC, StateIndex.ARC])
@@ -430,3 +398,40 @@ def test_velocities_by_phases_or_dopplers_are_those_of_each_epoch_alone() -> Non
         alone = compute_velocity(*(a[row] for a, row in zip(given, rows, strict=True)))  # type: ignore[arg-type]
         np.testing.assert_allclose(alone.velocity_mps[0], whole.velocity_mps[t], atol=1e-9)
         np.testing.assert_allclose(alone.covariance[0], whole.covariance[t], rtol=1e-9)
+
+
+def _coming_and_going(case: Ride) -> GnssEpochs:
+    """Each satellite is there at three of five epochs, drawn anew at every epoch, phases at half of them."""
+    random = np.random.default_rng(11)
+    there, joined = random.random(case.epochs.code_m.shape) < 0.6, random.random(case.epochs.code_m.shape) < 0.5
+    values = {name: np.where(there, getattr(case.epochs, name), np.nan) for name in ("code_m", "phase_m", "rate_mps")}
+    return replace(case.epochs, **values, phase_joined=case.epochs.phase_joined & joined)
+
+
+@pytest.mark.requirement("E5", "A8")
+@pytest.mark.parametrize("how", ["one by one", "in chunks", "permuted"])
+def test_satellites_that_come_and_go_at_every_epoch_give_the_same_however_they_are_handed_over(how: str) -> None:
+    case = ride(90, noise=1.0, seed=12)
+    epochs = _coming_and_going(case)
+    whole, _ = track(epochs, case.line, levels=True)
+    order, sizes = np.arange(10), {"one by one": 1, "in chunks": 7, "permuted": 90}[how]
+    if how == "permuted":
+        order = np.random.default_rng(2).permutation(10)
+        values = {f.name: getattr(epochs, f.name) for f in fields(epochs)}
+        values = {
+            name: value[order] if name in ("satellite", "clock") else value[:, order]
+            for name, value in values.items()
+            if name in ("satellite", "clock") or (value is not None and value.shape[1:2] == (10,))
+        }
+        epochs = replace(epochs, **values)
+    state, parts = None, []
+    for first in range(0, 90, sizes):
+        result, state = track(part(epochs, slice(first, first + sizes)), case.line, state, levels=True)
+        parts.append(result)
+    for name in ("arc_m", "sigma_m", "speed_mps", "level_m", "separation_m"):
+        joined = np.concatenate([getattr(result, name) for result in parts])
+        np.testing.assert_allclose(joined, getattr(whole, name), rtol=0.0, atol=1e-6, err_msg=name)
+    weights = np.concatenate([result.weight for result in parts])
+    np.testing.assert_allclose(weights, whole.weight[:, :, order], rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(np.concatenate([result.status for result in parts]), whole.status)
+    assert np.abs(whole.arc_m - case.arc_m)[30:].max() < 5.0

@@ -11,12 +11,13 @@ import pytest
 from scipy.stats import norm
 
 import belief_campaign
-from plain_kernels import memory, named_tuple, parameters, plain, subfilters, work_space
+from plain_kernels import given, kernel_state, plain
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.kernels.tracking import layout
 from railfix.tracking import GnssEpochs, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
-from railfix.tracking.state import StateIndex, TrackState
+from railfix.tracking.result import EPOCH_RESULT
+from railfix.tracking.state import SATELLITES, StateIndex, TrackState
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
@@ -38,65 +39,68 @@ def level_of(
     """
     probability, apart, ground, sigma = branch or (0.0, 0.0, 0.0, 0.0)
     count = 1 if branch is None else 2
-    held = memory(
-        np.array([100.0, 100.0 + apart])[:count],
-        np.array([1.0, sigma])[:count],
+    state = kernel_state(
+        [100.0, 100.0 + apart][:count] + place_m,
+        [1.0, sigma][:count] + sigma_m,
         np.log(np.maximum([1.0 - probability, probability], 1e-300))[:count],
+        LIMITS,
+        names,
     )
-    work = work_space(count, len(names))
-    far = probability if apart > LIMITS.start_separation_m else 0.0
-    work.branch[1:count] = 0.0 if far else apart, ground, sigma, probability
-    bank = subfilters(names, place_m, sigma_m, LIMITS, weak_s)
+    state.source["contradicted_s"][: len(names)] = weak_s
     if in_view is not None:
-        bank.running[-1], bank.mean[-1, 0], bank.covariance[-1, 0, 0] = True, in_view[0], in_view[1] ** 2
+        state.source["running"][-1], state.x[-1, 0], state.P[-1, 0, 0] = True, in_view[0], in_view[1] ** 2
+    far, level = probability if apart > LIMITS.start_separation_m else 0.0, plain("tracking.level")
+    branches = level.Alternatives(
+        *np.array([[0.0 if far else apart], [ground], [sigma], [probability]])[:, : count - 1]
+    )
+    result = np.zeros(1, dtype=EPOCH_RESULT)
+    level.write_level(given(LIMITS), state, branches, far, result[0])
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
-    answers = named_tuple(layout.Outputs, **{name: np.full(1, np.nan) for name in fields})
-    plain("tracking.level").write_level(held, count, far, bank, parameters(LIMITS), work, answers, 0)
-    return {name: float(getattr(answers, name)[0]) for name in fields}
+    return {name: float(result[name][0]) for name in fields}
 
 
 @pytest.mark.requirement("C2")
 def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
     """Against the equation by quadrature, with sources of every kind; not a multiple of each that is alike."""
-    given = budget(LIMITS)
-    assert given.risk == pytest.approx(1e-7 / 60.0)
+    risks = budget(LIMITS)
+    assert risks.risk == pytest.approx(1e-7 / 60.0)
     place, sigma = np.array([0.4, -2.0, 0.1, 1.0]), np.array([1.6, 2.5, 1.1, 3.0])
     found = level_of(["G01", "E", "G", "wheel"], list(100.0 + place), list(sigma))
     level, noise, apart = found["level_m"], found["level_noise_m"], found["separation_m"]
     assert found["ground_level_m"] == level
-    prior = np.array([given.prior[kind] for kind in (0, 1, 1, 2)])
+    prior = np.array([risks.prior[kind] for kind in (0, 1, 1, 2)])
     spent = 2.0 * norm.sf(level) + prior @ (norm.sf((level - place) / sigma) + norm.sf((level + place) / sigma))
-    assert spent == pytest.approx(given.risk, rel=1e-6)
+    assert spent == pytest.approx(risks.risk, rel=1e-6)
     assert apart == pytest.approx(2.0)
-    assert noise == pytest.approx(norm.isf(0.5 * given.risk))
+    assert noise == pytest.approx(norm.isf(0.5 * risks.risk))
 
 
 @pytest.mark.requirement("C6")
 @pytest.mark.parametrize("probability", [1e-12, 1e-9, 1e-6, 1e-3, 0.4])
 def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
     """Against the equation: near along the line, or at another place of it that is near on the ground."""
-    given = budget(LIMITS)
+    risks = budget(LIMITS)
     for apart, ground in ((40.0, 35.0), (1815.0, 3.0), (900.0, 18.0)):
         found = level_of(["G01"], [101.0], [2.0], branch=(probability, apart, ground, 2.0))
 
         def spent(level: float, distance: float) -> float:
-            own = given.prior[0] * (norm.sf((level - 1.0) / 2.0) + norm.sf((level + 1.0) / 2.0))
+            own = risks.prior[0] * (norm.sf((level - 1.0) / 2.0) + norm.sf((level + 1.0) / 2.0))
             other = probability * (norm.sf((level - distance) / 2.0) + norm.sf((level + distance) / 2.0))
             return float(2.0 * norm.sf(level) + own + other)
 
-        assert spent(found["ground_level_m"], ground) == pytest.approx(given.risk, rel=1e-5)
-        if apart > LIMITS.start_separation_m and probability > given.risk:
+        assert spent(found["ground_level_m"], ground) == pytest.approx(risks.risk, rel=1e-5)
+        if apart > LIMITS.start_separation_m and probability > risks.risk:
             assert found["level_m"] == np.inf
         else:
             distance = apart if apart <= LIMITS.start_separation_m else 0.0
-            assert spent(found["level_m"], distance) == pytest.approx(given.risk, rel=1e-5)
+            assert spent(found["level_m"], distance) == pytest.approx(risks.risk, rel=1e-5)
 
 
 @pytest.mark.requirement("C2")
 @pytest.mark.parametrize("in_view", [None, (103.0, 1.1)])
 def test_two_faulty_satellites_are_a_hypothesis_of_the_level(in_view: tuple[float, float] | None) -> None:
     """Against the equation, with what is known without both by information that adds up; the pair asks for most."""
-    given = budget(LIMITS)
+    risks = budget(LIMITS)
     shift, sigma = np.array([1.5, -2.5, 0.1]), np.array([1.25, 1.3, 1.01])
     found = level_of(["G01", "G02", "G03"], list(100.0 + shift), list(sigma), in_view=in_view)
     one, other = (0, 0, 1), (1, 2, 2)
@@ -105,25 +109,25 @@ def test_two_faulty_satellites_are_a_hypothesis_of_the_level(in_view: tuple[floa
     left = known[[*one]] + known[[*other]] - whole
     apart = ((known * shift)[[*one]] + (known * shift)[[*other]] - whole * (with_all - 100.0)) / left
     place, spread = np.append(shift, apart), np.append(sigma, left**-0.5)
-    prior = np.append(np.full(3, given.prior[0]), np.full(3, given.prior[0] ** 2))
+    prior = np.append(np.full(3, risks.prior[0]), np.full(3, risks.prior[0] ** 2))
     level = found["level_m"]
     parts = prior * (norm.sf((level - place) / spread) + norm.sf((level + place) / spread))
     assert parts.argmax() == 3
     assert found["separation_m"] == pytest.approx(2.5)
-    assert 2.0 * norm.sf(level) + parts.sum() == pytest.approx(given.risk, rel=5e-3)
+    assert 2.0 * norm.sf(level) + parts.sum() == pytest.approx(risks.risk, rel=5e-3)
 
 
 @pytest.mark.requirement("C2")
 def test_many_pairs_that_ask_for_little_spend_no_more_than_is_taken_off_for_them() -> None:
-    given, sigma = budget(LIMITS), 1.05
+    risks, sigma = budget(LIMITS), 1.05
     level = level_of([f"G{k:02d}" for k in range(20)], [100.0] * 20, [sigma] * 20)["level_m"]
     pair = (2.0 * sigma**-2.0 - 1.0) ** -0.5
     parts = [
         norm.sf(level),
-        20 * given.prior[0] * norm.sf(level / sigma),
-        190 * given.prior[0] ** 2 * norm.sf(level / pair),
+        20 * risks.prior[0] * norm.sf(level / sigma),
+        190 * risks.prior[0] ** 2 * norm.sf(level / pair),
     ]
-    assert 0.9 * given.risk < 2.0 * sum(parts) <= given.risk
+    assert 0.9 * risks.risk < 2.0 * sum(parts) <= risks.risk
 
 
 @pytest.mark.requirement("C2")
@@ -185,36 +189,35 @@ def test_the_sub_filter_with_all_in_view_begins_without_codes_too_and_ends_besid
 @pytest.mark.requirement("C6")
 def test_what_a_map_is_off_across_is_off_along_after_a_bend() -> None:
     """By hand, 60 degrees to the left: the way on the map has it, what the phases measure has not."""
-    work, random, turn = work_space(1), np.random.default_rng(3), np.radians(60.0)
-    width = work.mean.shape[1]
-    mean, root = random.normal(size=width), random.normal(size=(width, width))
-    work.mean[0], work.spread[0] = mean, root @ root.T
-    work.axes[1] = np.eye(3)
-    work.axes[0, 0] = np.cos(turn), -np.sin(turn), 0.0
-    work.axes[0, 1] = np.sin(turn), np.cos(turn), 0.0
-    plain("tracking.level")._turn_map(30.0, work, 0)
-    length = width - layout.OF_EPOCH + layout.MAP_LENGTH_ERROR
-    step = np.eye(width)
-    step[layout.ARC, layout.RIGHT] = -np.sin(turn)
-    step[length, layout.RIGHT] = np.sin(turn)
-    step[layout.RIGHT, layout.RIGHT] = np.cos(turn)
+    random, turn = np.random.default_rng(3), np.radians(60.0)
+    mean, root = random.normal(size=SATELLITES), random.normal(size=(SATELLITES, SATELLITES))
+    mean[StateIndex.ARC], mean[StateIndex.PREVIOUS_ARC] = 100.0, 0.0
+    vertex = np.zeros(3, dtype=layout.VERTEX)
+    vertex["arc_m"], vertex["axes"] = [0.0, 100.0, 200.0], np.eye(3)
+    vertex["axes"][1:, 0] = np.cos(turn), -np.sin(turn), 0.0
+    vertex["axes"][1:, 1] = np.sin(turn), np.cos(turn), 0.0
+    x, P = mean.copy(), root @ root.T
+    plain("tracking.subfilters").rotate_map_error(given(LIMITS)._replace(vertex=vertex), x, P)
+    step = np.eye(SATELLITES)
+    right = StateIndex.MAP_RIGHT
+    step[StateIndex.ARC, right] = -np.sin(turn)
+    step[StateIndex.MAP_LENGTH_ERROR, right] = np.sin(turn)
+    step[right, right] = np.cos(turn)
     expected = step @ root @ root.T @ step.T
-    expected[layout.RIGHT, layout.RIGHT] += (30.0 * np.sin(turn)) ** 2
-    np.testing.assert_allclose(work.mean[0], step @ mean, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(work.spread[0], expected, rtol=0, atol=1e-9)
+    expected[right, right] += (LIMITS.level_map_m * np.sin(turn)) ** 2
+    np.testing.assert_allclose(x, step @ mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(P, expected, rtol=0, atol=1e-9)
 
 
 @pytest.mark.requirement("C6")
 @pytest.mark.parametrize("name", OTHERS)
 def test_only_the_map_that_lies_aside_withholds_the_level(name: str) -> None:
     """A displacement of 9 m does in the sub-filter of the map, in no other."""
-    held = memory(np.array([100.0]), np.ones(1), np.zeros(1))
-    bank = subfilters([], [], [], LIMITS)
-    at = list(OTHERS).index(name)
-    bank.running[at], bank.mean[at, layout.RIGHT], bank.covariance[at, layout.RIGHT, layout.RIGHT] = True, 9.0, 1.0
-    held.scalars[layout.BRANCH_S] = LIMITS.level_start_s
-    plain("tracking.monitors").watch(parameters(LIMITS), held, bank, np.nan, 0.0, 0.0, 1.0, 1.0)
-    assert held.scalars[layout.WITHHELD] == (LIMITS.level_hold_s if name == "map" else 0.0)
+    state = kernel_state([100.0], [1.0], [0.0], LIMITS, ["G"], branch_s=LIMITS.level_start_s)
+    at, right = 1 + list(OTHERS).index(name), StateIndex.MAP_RIGHT
+    state.source["running"][at], state.x[1 + at, right], state.P[1 + at, right, right] = True, 9.0, 1.0
+    plain("tracking.monitors").update_monitors(given(LIMITS).parameters[0], state, np.nan, 0.0, 0.0, 1.0, 1.0)
+    assert state.monitors["level_hold_s"][0] == (LIMITS.level_hold_s if name == "map" else 0.0)
 
 
 @pytest.mark.requirement("C6")
@@ -226,7 +229,7 @@ def test_a_map_that_may_be_wrong_is_so_where_nothing_is_measured() -> None:
     _, after = track(without_epochs(case.epochs, gap), case.line, limits=LIMITS, levels=True)
     assert before.bank is not None
     assert after.bank is not None
-    kept = np.exp(-2.0 * after.distance_since_code_m / LIMITS.map_absolute_m)
+    kept = np.exp(-2.0 * after.monitors.distance_since_code_m / LIMITS.map_absolute_m)
     assert kept < 0.5
     for name, wrong_m in (("map", LIMITS.level_map_m), ("G", 0.0)):
         old, new = (

@@ -42,7 +42,7 @@ def test_on_a_right_map_nothing_is_learnt(rate_hz: float) -> None:
     run = ride(240, trajectory=bent_line(5000.0), noise=1.0, seed=3, rate_hz=rate_hz)
     found, state = track(run.epochs, run.line)
     assert found.map_scale.max() < 1.1
-    mean, variance = state.code_shift
+    mean, variance = state.monitors.code_shift, state.monitors.code_shift_variance
     assert abs(mean) < 3.0 * np.sqrt(variance)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plain_kernels import memory, parameters, plain, work_space
+from plain_kernels import given, kernel_state, plain
 from posterior_score import bounds
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Track
@@ -83,13 +83,15 @@ def judged(
     dt: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Probabilities after an epoch's evidence for branches at places, and the part of them by codes."""
-    count = len(places)
-    held = memory(np.zeros(count), np.ones(count), log_probability, BRANCH_S=branch_s, BRANCH_M=branch_m)
-    held.log_code[:] = log_code
-    work = work_space(count)
-    work.evidence[:count], work.code_evidence[:count], work.places[:count] = motion, code, places
-    plain("tracking.branches").judge(parameters(TrackingLimits()), held, work, count, dt)
-    return held.log_probability, held.log_code
+    limits = TrackingLimits()
+    state = kernel_state(
+        np.zeros(len(places)), np.ones(len(places)), log_probability, limits, branch_s=branch_s, branch_m=branch_m
+    )
+    state.hypothesis["log_code"] = log_code
+    arc = np.zeros(len(places))
+    parameters = given(limits).parameters[0]
+    plain("tracking.hypotheses").reweigh(parameters, state, motion, code, places, arc, dt)
+    return state.hypothesis["log_probability"], state.hypothesis["log_code"]
 
 
 def _after(seconds_: int, motion: float, code: float, *, speed_mps: float = 10.0) -> np.ndarray:
@@ -154,26 +156,29 @@ def test_of_laps_within_the_error_of_the_map_codes_of_the_last_half_minute_choos
     apart_m: float, along_m: float, goes: int
 ) -> None:
     """The choice is no evidence: probabilities are those without it, and what codes said is forgotten."""
-    branches = plain("tracking.branches")
-    held, work = memory(np.zeros(2), np.ones(2), np.log([0.6, 0.4]), BRANCH_S=60.0, BRANCH_M=600.0), work_space(2)
-    work.places[:2], work.new_mean[1, 0] = [[0.0, 0.0, 0.0], [apart_m, 0.0, 0.0]], along_m
+    limits, branches = TrackingLimits(), plain("tracking.hypotheses")
+    state = kernel_state([0.0, along_m], np.ones(2), np.log([0.6, 0.4]), limits, branch_s=60.0, branch_m=600.0)
+    points, one = np.array([[0.0, 0.0, 0.0], [apart_m, 0.0, 0.0]]), state.hypothesis
+    parameters = given(limits).parameters[0]
+
+    def step(code: float) -> None:
+        one["log_probability"], one["log_code"] = np.log([0.6, 0.4]), 0.0
+        branches.reweigh(parameters, state, np.zeros(2), np.array([0.0, code]), points, state.x[:, 0], 1.0)
 
     def after(seconds_: int, code: float) -> int:
         for _ in range(seconds_):
-            held.log_probability[:], held.log_code[:], work.code_evidence[:2] = np.log([0.6, 0.4]), 0.0, [0.0, code]
-            before = held.log_recent.copy()
-            branches.judge(parameters(TrackingLimits()), held, work, 2, 1.0)
-            assert (np.abs(held.log_recent) <= 3.0).all()
+            before = one["log_recent"].copy()
+            step(code)
+            assert (np.abs(one["log_recent"]) <= 3.0).all()
             if not code:
-                np.testing.assert_allclose(held.log_recent, before * np.exp(-1.0 / 30.0))
-        return int(branches.leading(held, 2))
+                np.testing.assert_allclose(one["log_recent"], before * np.exp(-1.0 / 30.0))
+        return int(branches.find_leading(one, 2))
 
     assert after(1, 0.5) == 0
     assert after(60, 0.5) == goes
-    bare, _ = judged(np.log([0.6, 0.4]), np.zeros(2), np.zeros(2), np.zeros(2), work.places[:2], 60.0, 600.0)
-    held.log_probability[:], held.log_code[:], work.code_evidence[:2] = np.log([0.6, 0.4]), 0.0, 0.0
-    branches.judge(parameters(TrackingLimits()), held, work, 2, 1.0)
-    np.testing.assert_allclose(held.log_probability, bare)
+    bare, _ = judged(np.log([0.6, 0.4]), np.zeros(2), np.zeros(2), np.zeros(2), points, 60.0, 600.0)
+    step(0.0)
+    np.testing.assert_allclose(one["log_probability"], bare)
     assert after(200, 0.0) == 0
 
 

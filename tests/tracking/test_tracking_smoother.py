@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from railfix.tracking import BackwardInformation, Step, TrackingLimits, TrackState, smooth_steps, track
+from railfix.tracking.smoother import transition
 from railfix.tracking.state import StateIndex
-from railfix.tracking.velocity import transition
 from tracking_cases import Ride, bent_line, part, ride, without_epochs
 
 LIMITS = TrackingLimits()
@@ -27,9 +27,8 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
     means, combined = [], []
     for t, step in enumerate(trace):
         assert step.updated is not None
-        prior, combine, information = (getattr(step.updated, name)[0] for name in ("prior", "combine", "information"))
-        precise = np.linalg.inv(step.updated.covariance[0])
-        combined.append((combine, precise - information, precise @ step.updated.change[0]))
+        prior, combine, value, variance = (array[0] for array in vars(step.updated).values())
+        combined.append((combine, np.diag(1.0 / variance), value / variance))
         innovation_free = _prediction(step)
         if t == 0:
             joint[0, :, 0] = prior
@@ -64,9 +63,12 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _prediction(step: Step) -> np.ndarray:
-    made = step.updated
-    assert made is not None
-    return np.asarray(step.mean[0] - made.prior[0] @ made.combine[0].T @ made.information[0] @ made.change[0])
+    """Mean before the measurements."""
+    assert step.updated is not None
+    prior, row, value, variance = (array[0] for array in vars(step.updated).values())
+    whitened = row / np.sqrt(variance)[:, None]
+    system = np.eye(len(row)) + whitened @ prior @ whitened.T
+    return np.asarray(step.mean[0] - prior @ whitened.T @ np.linalg.solve(system, value / np.sqrt(variance)))
 
 
 @pytest.mark.requirement("E5")

@@ -6,7 +6,7 @@ import signal
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -17,7 +17,7 @@ from railfix.cli.options import check_outputs, from_models
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.core.settings import Settings, option
 from railfix.core.tables import plain_table, plural
-from railfix.ground.train import OnBoardLimits
+from railfix.ground.on_board import OnBoardLimits
 from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
 
@@ -202,6 +202,9 @@ class KeyChoices(Settings):
 
     train: tuple[int, ...] = option("Trains, from 1.", metavar="N")
     days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
+    renew: Literal["add", "renew"] = option(
+        "Make new ones for the centre and these trains; those before stay valid until their end.", "add", name="--renew"
+    )
 
 
 @app.command("keys", cls=Command)
@@ -211,20 +214,32 @@ def keys(
     *,
     out: Annotated[Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; made where absent.")],
 ) -> None:
-    """Make keys and certificates of a centre and its trains.
+    """Make keys and certificates of a centre and its trains; add trains, and renew certificates.
 
-    They are signed by an authority whose key is not kept: for another train make a new set. Keys can be read by their
-    owner alone; each train gets authority.pem and its own two files only.
+    They are signed by an authority, whose key (authority.key) stays in DIR: the centre gets authority.pem and its own
+    two files, each train authority.pem and its own two. In a DIR with an authority trains are added. The serial number
+    of each is printed: in revoked.txt of the centre's folder it revokes that certificate. Keys can be read by their
+    owner alone.
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
-    Exit codes as `railfix --help` says; 8 where a file is there already.
+    Exit codes as `railfix --help` says; 8 where every certificate is there already.
     """
-    from railfix.ground.quic import write_keys
+    from cryptography.x509 import load_pem_x509_certificate
+
+    from railfix.ground.keys import renew_keys, write_keys
 
     if not all(0 < number < 1 << 32 for number in choices.train):
         raise SettingsError("--train: a number from 1 to 4294967295 was expected")
-    show_files(TableConsole(), write_keys(out, sorted(set(choices.train)), valid_days=choices.days))
+    make = renew_keys if choices.renew == "renew" else write_keys
+    files = make(out, sorted(set(choices.train)), valid_days=choices.days)
+    console = TableConsole()
+    show_files(console, files)
+    for path in files:
+        if path.suffix == ".pem":
+            certificate = load_pem_x509_certificate(path.read_bytes())
+            ends = certificate.not_valid_after_utc.date().isoformat()
+            console.print(f"{path.name}: serial number {certificate.serial_number:#x}, ends on {ends}")
 
 
 class DemoChoices(Settings):
@@ -290,7 +305,12 @@ class CentreChoices(Settings):
 
     page: str = option("Of the page; port 0 takes a free one.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(
-        "Password for orders in its first line; a new one is printed without it.", None, metavar="FILE"
+        "Password for orders in its first line, NAME PASSWORD of a person in others; one is printed without it.",
+        None,
+        metavar="FILE",
+    )
+    orders: str | None = option(
+        "Take orders at an address of their own, and none at that of the page.", None, metavar="HOST:PORT"
     )
     for_s: float | None = option("End after this time; else at a signal.", None, name="--for", metavar="S", ge=0)
 
@@ -325,21 +345,25 @@ def centre(
     import asyncio
     import secrets
 
-    from railfix.ground.serve import parse_address, read_password, run_centre
+    from railfix.ground.serve import parse_address, read_passwords, run_centre
 
     console, password = TableConsole(), choices.password
     try:
         address = parse_address(choices.page)
+        desk = None if choices.orders is None else parse_address(choices.orders)
     except ValueError as error:
-        raise SettingsError(f"--page {choices.page!r}: {error}") from None
-    word = secrets.token_urlsafe(12) if password is None else read_password(password)
+        raise SettingsError(f"--page {choices.page!r}, --orders {choices.orders!r}: {error}") from None
+    word, people = (secrets.token_urlsafe(12), {}) if password is None else read_passwords(password)
+    words = iter(("the page, to open in a browser", "orders, to open in a browser"))
 
     def announce(url: str) -> None:
-        console.print(f"the page, to open in a browser: {url}")
+        console.print(f"{next(words)}: {url}")
         if password is None:
             console.print(f"password for orders: {word}")
 
-    work = run_centre(path, page=address, password=word, for_s=choices.for_s, announce=announce)
+    work = run_centre(
+        path, page=address, orders=desk, password=word, people=people, for_s=choices.for_s, announce=announce
+    )
     terminated, figures = asyncio.run(work)
     _show_figures(figures)
     if terminated:

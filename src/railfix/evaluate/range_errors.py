@@ -27,12 +27,12 @@ from railfix.io.logs import scan_observations
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.base_station import BaseStation
 from railfix.pipeline.carrier_stage import CarrierState
-from railfix.pipeline.corrected_ranges import collect_conditions
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.range_stage import collect_conditions
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.state import State
-from railfix.positioning.noise_scale import RobustClock, robust_clock
-from railfix.positioning.normal_equations import clock_groups
+from railfix.positioning.receiver_noise import RobustClock, robust_clock
+from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource, condition_differences
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, faulty_stretches, fit_bins
 from railfix.run.driver import open_inputs

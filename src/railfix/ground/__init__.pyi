@@ -1,19 +1,14 @@
 # The names of `railfix.ground`, imported at their first use (lazy-loader).
 
+from .authority import Authority, BrakeOrder
+from .braking import BrakeLimits, Supervised, supervise
 from .centre import CentreLimits, ReferenceCurve, TrainRecord, TrainState, report_received, time_passed
-from .interlocking import (
-    Interlocking,
-    InterlockingLimits,
-    PointState,
-    TrainInterval,
-    extend_authorities,
-    release_points,
-    route_requested,
-)
-from .layout import Layout, LoopStation
+from .interlocking import extend_authorities, release_points, route_requested
+from .layout import Gradient, Layout, LoopStation
+from .on_board import OnBoard, OnBoardLimits
+from .state import Interlocking, InterlockingLimits, PointState, Restriction, TrainInterval
 from .station_fixes import StationFixes, station_fixes
 from .supervision import Supervision
-from .train import Authority, OnBoard, OnBoardLimits
 from .triangle import (
     MonitorLimits,
     MonitorState,
@@ -28,7 +23,10 @@ from .triangle import (
 
 __all__ = [
     "Authority",
+    "BrakeLimits",
+    "BrakeOrder",
     "CentreLimits",
+    "Gradient",
     "Interlocking",
     "InterlockingLimits",
     "Layout",
@@ -39,7 +37,9 @@ __all__ = [
     "OnBoardLimits",
     "PointState",
     "ReferenceCurve",
+    "Restriction",
     "StationFixes",
+    "Supervised",
     "Supervision",
     "TrainInterval",
     "TrainRecord",
@@ -56,5 +56,6 @@ __all__ = [
     "report_received",
     "route_requested",
     "station_fixes",
+    "supervise",
     "time_passed",
 ]

@@ -113,9 +113,11 @@ class CentreLimits(Settings):
     lost_s: float = Field(default=3.0, gt=0)
     error_s: float = Field(default=120.0, gt=0)  #: After this time without a report the train is in error.
     age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it was sent; older reports are rejected.
-    #: A sequence number further ahead of the newest counts once the next report goes on from there: one wrong number
-    #: does not make all later ones old.
+    #: The clock of a train may be behind the instants of its places by so much, and its delays vary by so much unseen.
+    clock_s: float = Field(default=1.0, ge=0)
+    #: A sequence number may be further ahead of the newest by so many, and by so many a second since then.
     jump: int = Field(default=1000, ge=1)
+    rate: float = Field(default=20.0, gt=0)
 
     @model_validator(mode="after")
     def _lost_before_error(self) -> Self:
@@ -131,7 +133,10 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 without one.
-    ahead: int = -1  #: Number far ahead of it that the next report has to confirm, -1 without one.
+    session: int = 0  #: Start on board that it is of.
+    retired: tuple[int, ...] = ()  #: Starts on board before: what comes late of them counts for nothing.
+    counted_s: float | None = None  #: Centre's clock when that number came in.
+    rejected: str | None = None  #: Why the newest report did not count.
     message: TrainMessage | None = None  #: Newest report with a place.
     heard_s: float = 0.0  #: Centre's clock (monotonic) when that report came in.
     measured_s: float = 0.0  #: Centre's clock at the instant its place is valid at.
@@ -146,11 +151,16 @@ class Rejection(Enum):
     UNKNOWN_TRAIN = "of a train that is not supervised"
     OTHER_TRAIN = "of another train"
     REPEATED = "repeated or older than the newest"
-    FAR_AHEAD = "number far ahead of the newest, to be confirmed by the next"
+    EARLIER_START = "of an earlier start on board"
+    FAR_AHEAD = "number further ahead than a train can have counted; start its unit again"
     NO_PLACE = "without a place"
     NO_FACING = "the direction in which the front end looks is unknown"
     NO_FRONT_END = "where the front end is is unknown"
-    TOO_OLD = "place too old when it was sent, or the train's clock was stepped"
+    TOO_OLD = "place too old when it was sent, or later than the train's clock; set that clock"
+
+
+#: Starts on board that are remembered.
+_RETIRED = 16
 
 
 def report_received(
@@ -163,26 +173,37 @@ def report_received(
     """
     if message.train != record.train:
         return record, Rejection.OTHER_TRAIN
+    session = message.session or 0
+    if session != record.session:
+        if session in record.retired:
+            return record, Rejection.EARLIER_START
+        retired = record.retired if record.sequence < 0 else (*record.retired[1 - _RETIRED :], record.session)
+        record = replace(record, session=session, sequence=-1, retired=retired, counted_s=None)
     if message.sequence <= record.sequence:
         return record, Rejection.REPEATED
-    far = record.sequence >= 0 and message.sequence > record.sequence + limits.jump
-    if far and not 0 <= record.ahead < message.sequence <= record.ahead + limits.jump:
-        return replace(record, ahead=message.sequence), Rejection.FAR_AHEAD
-    record, age_ns = replace(record, sequence=message.sequence, ahead=-1), message.sent_ns - message.time_ns
+    if record.counted_s is not None:
+        most = limits.jump + limits.rate * (now_s - record.counted_s)
+        if message.sequence > record.sequence + most:
+            return replace(record, rejected=Rejection.FAR_AHEAD.value), Rejection.FAR_AHEAD
+    record, age_ns = replace(record, sequence=message.sequence, counted_s=now_s), message.sent_ns - message.time_ns
+    reason = None
     if message.status not in (MessageStatus.POSITION, MessageStatus.COASTING):
-        return record, Rejection.NO_PLACE
-    if message.facing == 0:
-        return record, Rejection.NO_FACING
-    if Unknown.FRONT_END in message.unknown:
-        return record, Rejection.NO_FRONT_END
-    if not 0 <= age_ns <= limits.age_s * 1e9:
-        return record, Rejection.TOO_OLD
+        reason = Rejection.NO_PLACE
+    elif message.facing == 0:
+        reason = Rejection.NO_FACING
+    elif Unknown.FRONT_END in message.unknown:
+        reason = Rejection.NO_FRONT_END
+    elif not -limits.clock_s * 1e9 <= age_ns <= limits.age_s * 1e9:
+        reason = Rejection.TOO_OLD
+    record = replace(record, rejected=None if reason is None else reason.value)
+    if reason is not None:
+        return record, reason
     assert message.chainage_cm is not None
     place, jump = message.chainage_cm / 100.0, record.jump_m
     if record.state in (TrainState.SIMULATED, TrainState.ERROR) and record.shown_m is not None:
         jump = message.facing * (place - record.shown_m)
     after = replace(
-        record, state=TrainState.TRACKED, message=message, heard_s=now_s, measured_s=now_s - age_ns / 1e9,
+        record, state=TrainState.TRACKED, message=message, heard_s=now_s, measured_s=now_s - max(age_ns, 0) / 1e9,
         shown_m=place, jump_m=jump,
     )  # fmt: skip
     return after, None

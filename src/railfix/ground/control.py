@@ -6,27 +6,28 @@ what its trains know.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
+from railfix.ground.authority import Authority, BrakeOrder
 from railfix.ground.centre import ReferenceCurve, TrainRecord, TrainState, time_passed
-from railfix.ground.interlocking import HEAD, Interlocking, from_documents, stop_orders, stop_trains, to_documents
+from railfix.ground.desk import OrderDesk
+from railfix.ground.interlocking import stop_orders
 from railfix.ground.layout import PointName
-from railfix.ground.stops import close_section, open_section, release_train
-from railfix.ground.store import DatabaseError, Store
-from railfix.ground.supervision import Supervision
+from railfix.ground.reports import stands
+from railfix.ground.state import HEAD, Interlocking, TrainInterval, from_documents, stop_trains, to_documents
+from railfix.ground.stops import CLOSED, release_train
+from railfix.ground.store import Store
+from railfix.ground.supervision import Supervision, is_obeyed
 from railfix.ground.triangle import STOPPING, MonitorLimits, MonitorState, TriangleVerdict, advance, release
 from railfix.ground.triangle import Order as MonitorOrder
 from railfix.ground.web import Order
+from railfix.ground.writer import Commits
 from railfix.io.train_message import MessageError, SuspectedInterference, TrainMessage, decode
 
-#: Time between attempts to write to a database that fails [s].
-RETRY_S = 1.0
-#: The release of a silent train is ordered a second time so long after the first, at least and at most [s].
-AGAIN_S = 3.0, 60.0
 #: Name of the stored document.
 _CAUSE = "cause of the stop"
 
@@ -49,10 +50,10 @@ class StopOrder:
 
     def take_report(self, message: TrainMessage, now_s: float) -> bool:
         """Take a report; return whether the train has come to rest by it."""
-        taken = message.authority is not None and message.authority >= self.number
+        taken = is_obeyed(message, self.number)
         if taken and self.acknowledged_s is None:
             self.acknowledged_s = now_s - self.sent_s
-        rests = message.standstill and self.rest_s is None and (taken or message.authority is None)
+        rests = stands(message) and self.rest_s is None and (taken or message.authority is None)
         if rests:
             self.rest_s = now_s - self.sent_s
         return rests
@@ -80,14 +81,14 @@ class ControlCentre:
     rejected: Counter[str] = field(default_factory=Counter)  #: Reports that did not count, by reason.
     stop_s: float | None = None
     stops: dict[int, StopOrder] = field(default_factory=dict)  #: Trains that are ordered to stop.
-    #: Why the database does not take the state: nothing is granted meanwhile, and the trains stop in time.
-    database: str | None = None
+    commits: Commits = field(default_factory=Commits)  #: Of the store; in a thread where the centre is a process.
+    #: Asks the field what points are detected at; `Supervision.set_detected` takes the answer.
+    ask: Callable[[PointName], None] = lambda _: None
     #: What the newest report of each train suspects.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)
 
-    _asked_s: dict[int, float] = field(default_factory=dict)
-    _failed_s: float = 0.0
     _routes: dict[int, int] = field(init=False)
+    _alarm: str | None = None
     _verdict: tuple[TriangleVerdict, int] | None = None
     _judged: TriangleVerdict | None = None
     _saved: Interlocking | None = None
@@ -100,27 +101,34 @@ class ControlCentre:
     def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
         """Return the centre with what a process before has stored; at the first start as `supervision` has it.
 
-        Trains are unknown until they are heard, and points that were moving are moved again. Where a triangle judges
-        satellite positioning, the first start is a stop, to be released by hand.
+        Trains are unknown until they are heard; the field is asked what its points are detected at. Where a triangle
+        judges satellite positioning, the first start is a stop, to be released by hand; a stop of before lasts.
         """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
+        asked: tuple[PointName, ...] = ()
+        stopped = supervision.state.stopped
         if texts:
             supervision.state = state = from_documents(texts)
-            supervision.records = store.records()
+            supervision.records, stopped = store.records(), state.stopped
             if judged:
                 cause = store.document(_CAUSE)
-                monitor = MonitorState(
-                    stopped=state.stopped, cause=TriangleVerdict[cause] if state.stopped and cause else None
-                )
+                monitor = MonitorState(stopped=stopped, cause=TriangleVerdict[cause] if stopped and cause else None)
         centre = cls(supervision=supervision, store=store, monitor=monitor, **rest)
         if monitor is not None:
             centre.monitor = replace(monitor, complete_s=centre.clock(), since_s=centre.clock())
-        supervision.state = replace(supervision.state, stopped=monitor is not None and monitor.stopped)
-        for name, point in supervision.state.points.items():
-            if point.detected is None:
-                supervision.command(name, point.wanted)
+            stopped = monitor.stopped
+        supervision.state = replace(supervision.state, stopped=stopped)
+        if texts:
+            asked = supervision.begin_again(centre.clock())
+        for point in asked:
+            centre.ask(point)
         centre.log("centre started again; every train is unknown" if texts else "centre started")
         return centre
+
+    @property
+    def database(self) -> str | None:
+        """Why the database does not take the state, None where it does."""
+        return self.commits.alarm
 
     def log(self, text: str, *, train: int | None = None) -> None:
         """Write a line of the log."""
@@ -140,29 +148,42 @@ class ControlCentre:
             return
         trains = self.supervision.state.trains
         before = self.supervision.records.get(number, TrainRecord(train=number))
-        if message.sequence > before.sequence:
-            self._hear_interference(message)
         reason = self.supervision.report(message, self.clock())
+        after = self.supervision.records.get(number, before)
+        if after.session != before.session and before.sequence >= 0:
+            self.log(f"train {number}: started again on board", train=number)
+        if after.rejected != before.rejected:
+            word = "reports count again" if after.rejected is None else f"report does not count: {after.rejected}"
+            self.log(f"train {number}: {word}", train=number)
+        if after.sequence != before.sequence or after.session != before.session:
+            self._hear_interference(message)
+            if (order := self.stops.get(number)) is not None and order.take_report(message, self.clock()):
+                self.log(f"train {number}: order to stop {order}", train=number)
         if reason is not None:
             self.rejected[reason.value] += 1
             return
-        was, known = trains[number], self.supervision.state.trains[number]
-        if known.stop is not None and known.stop != was.stop:
-            self.rejected["contradicts what is known of the train"] += 1
-            self.log(f"train {number}: stopped, {known.stop}", train=number)
-        if known.direction != message.facing and known.stop is None:
-            self.rejected["change of ends outside its station, or of an incomplete train"] += 1
-        if was.asked_m is not None and known.asked_m is None:
-            what = "has given its route back" if known.held else "keeps its route"
-            self.log(f"train {number}: {what}", train=number)
-        if (order := self.stops.get(number)) is not None and order.take_report(message, self.clock()):
-            self.log(f"train {number}: order to stop {order}", train=number)
+        self._note_report(trains[number], self.supervision.state.trains[number], message)
         self.reports += 1
-        after = self.supervision.records[number]
         if before.state in (TrainState.SIMULATED, TrainState.ERROR):
             self.log(f"train {number}: heard again, place jumps by {after.jump_m or 0.0:.1f} m", train=number)
         elif before.state is TrainState.UNKNOWN:
             self.log(f"train {number}: heard", train=number)
+
+    def _note_report(self, was: TrainInterval, known: TrainInterval, message: TrainMessage) -> None:
+        """Count and log what a report contradicts, and what it answers."""
+        number = known.train
+        if known.contradiction is not None:
+            self.rejected["contradicts what is known of the train"] += 1
+            if known.contradiction != was.contradiction:
+                word = "stopped" if was.stop is None else "stopped before; now"
+                self.log(f"train {number}: {word}, {known.contradiction}", train=number)
+        elif known.stop is not None and was.stop is None:
+            self.log(f"train {number}: stopped, {known.stop}", train=number)
+        elif known.direction != message.facing:
+            self.rejected["change of ends outside its station, or of an incomplete train"] += 1
+        if was.asked_m is not None and known.asked_m is None:
+            what = "has given its route back" if known.held else "keeps its route"
+            self.log(f"train {number}: {what}", train=number)
 
     def _hear_interference(self, message: TrainMessage) -> None:
         """Note what a train suspects, also in a report without a place, and log where that changes."""
@@ -175,8 +196,12 @@ class ControlCentre:
 
     @property
     def alarms(self) -> list[str]:
-        """Interference that trains suspect, a sentence each."""
-        return [f"train {n} suspects {kind.name.lower()}" for n, kind in sorted(self.interference.items()) if kind]
+        """What the centre waits for after a start, and interference that trains suspect, a sentence each."""
+        awaited = self.supervision.awaited_text
+        waits = [f"nothing is granted until heard since the start: {awaited} (confirm-start)"] if awaited else []
+        return waits + [
+            f"train {n} suspects {kind.name.lower()}" for n, kind in sorted(self.interference.items()) if kind
+        ]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
         """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
@@ -190,18 +215,71 @@ class ControlCentre:
             self._verdict = verdict, receiver
 
     def step(self) -> None:
-        """Judge, release, route, extend; commit; then send. To be called several times a second."""
+        """Judge; send orders to brake; release, route, extend; commit; then send. To be called several times a second.
+
+        Orders to brake need no store. Authorities, and commands to points, leave once their state is committed.
+        """
         now = self.clock()
-        if self.database is not None and now - self._failed_s < RETRY_S:
-            return
         self._monitor(now)
-        authorities = self.supervision.advance(now)
-        state, limits = self.supervision.state, self.supervision.centre
-        for number, train in state.trains.items():
-            before, self._routes[number] = self._routes[number], train.station
+        for order in self.supervision.watch(now):
+            self._order(order, now)
+        self.settle()
+        if not self.commits.may_begin(now):
+            return
+        authorities = self.supervision.work(now)
+        self._note_routes()
+        self._pass_time(now)
+        state, records = self.supervision.state, self.supervision.records
+        cause = "" if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
+        changed = [record for n, record in records.items() if self._saved_sequences.get(n) != record.sequence]
+        documents = {**to_documents(state, self._saved), _CAUSE: cause}
+
+        def then() -> None:
+            self._saved = state
+            self._saved_sequences.update((record.train, record.sequence) for record in changed)
+            self.supervision.command_points(state)
+            for authority in authorities:
+                self._send(authority)
+
+        self.commits.begin(partial(self.store.save, *changed, documents=documents), then, now)
+        self.settle()
+
+    def settle(self) -> None:
+        """Send what waits for a commit that is done, and log where the database begins or ends to fail."""
+        self.commits.settle(self.clock())
+        alarm = self.commits.alarm
+        if alarm is not None and self._alarm is None:
+            self.log(f"ALARM: {alarm}")
+        elif alarm is None and self._alarm is not None:
+            self.log("the database is written again")
+        self._alarm = alarm
+
+    def _order(self, order: BrakeOrder, now: float) -> None:
+        """Send an order to brake."""
+        first = self.supervision.ordered[order.train][1]
+        if (known := self.stops.get(order.train)) is None or known.number != first:
+            self.stops[order.train] = StopOrder(number=first, sent_s=now)
+        self.send(order.train, order.encode())
+
+    def _send(self, authority: Authority) -> None:
+        """Send an authority, unless its train has been ordered to brake meanwhile, or is no longer supervised."""
+        if authority.train not in self.supervision.state.trains:
+            return
+        if authority.train not in self.supervision.ordered:
+            self.stops.pop(authority.train, None)
+        elif not authority.stopped:
+            return
+        self.send(authority.train, authority.encode())
+
+    def _note_routes(self) -> None:
+        for number, train in self.supervision.state.trains.items():
+            before, self._routes[number] = self._routes.get(number, train.station), train.station
             if train.direction * (train.station - before) > 0:
                 station = self.supervision.layout.stations[train.station].name
                 self.log(f"train {number}: route to {station}, track {train.tracks[train.station]}", train=number)
+
+    def _pass_time(self, now: float) -> None:
+        state, limits = self.supervision.state, self.supervision.centre
         for number, record in self.supervision.records.items():
             rests = number in self.stops and state.trains[number].standstill  # it is not shown as running on
             curves = {} if rests else self.curves
@@ -209,37 +287,15 @@ class ControlCentre:
             if after.state is not record.state:
                 self.log(f"train {number}: {after.state.value}", train=number)
             self.supervision.records[number] = after
-        if not self._save_whole(now):
-            return
-        for authority in authorities:
-            if not authority.stopped:
-                self.stops.pop(authority.train, None)
-            elif authority.train not in self.stops:
-                self.stops[authority.train] = StopOrder(number=authority.number, sent_s=now)
-            self.send(authority.train, authority.encode())
-
-    def _save_whole(self, now: float) -> bool:
-        """Commit what has changed since the last time; return whether the database has taken it."""
-        state, records = self.supervision.state, self.supervision.records
-        cause = "" if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
-        changed = [record for n, record in records.items() if self._saved_sequences.get(n) != record.sequence]
-        try:
-            self.store.save(*changed, documents={**to_documents(state, self._saved), _CAUSE: cause})
-        except DatabaseError as error:
-            if self.database is None:
-                self.log(f"ALARM: {error}; nothing is granted until it can")
-            self.database, self._failed_s = f"{error}; nothing is granted", now
-            return False
-        if self.database is not None:
-            self.log("the database is written again")
-        self.database, self._saved = None, state
-        self._saved_sequences.update((record.train, record.sequence) for record in changed)
-        return True
 
     def release(self) -> str | None:
         """Release a stop by hand; return the reason of a refusal."""
         if self.monitor is None:
-            return "there is no stop to release"
+            if not self.supervision.state.stopped:
+                return "there is no stop to release"
+            self.supervision.state = replace(self.supervision.state, stopped=False)
+            self.log("stop released by hand; nothing judges satellite positioning")
+            return None
         self.monitor, orders, reason = release(self.monitor, self.clock(), limits=self.times)
         if orders:
             self.supervision.state = replace(self.supervision.state, stopped=False)
@@ -255,52 +311,29 @@ class ControlCentre:
         self.log("every train stopped by hand" if train is None else f"train {train}: stopped by hand", train=train)
         return None
 
-    def close_section(self, name: str) -> str | None:
-        """Close a station or a section by hand: its trains are stopped, others stay out; return a refusal's reason."""
-        block = self.supervision.layout.sections.get(name)
-        if block is None:
-            return f"there is no section {name!r}"
-        layout, reason = self.supervision.layout, f"{name} is closed"
-        self.supervision.state = close_section(self.supervision.state, block, layout, reason)
-        self.log(f"{name}: closed by hand")
+    def confirm_start(self) -> str | None:
+        """Go on without the trains that have not been heard since the start; return the reason of a refusal."""
+        if not self.supervision.awaited:
+            return "every train has been heard since the start"
+        self.supervision.awaited.clear()
         return None
 
-    def open_section(self, name: str) -> str | None:
-        """Open a station or a section that was closed by hand; return the reason of a refusal."""
-        block = self.supervision.layout.sections.get(name)
-        if block not in self.supervision.state.closed or block is None:
-            return f"{name!r} is not closed"
-        self.supervision.state = open_section(self.supervision.state, block)
-        self.log(f"{name}: opened by hand; its trains are released one by one")
-        return None
+    def released(self, train: int) -> tuple[Interlocking, str | None]:
+        """Return the state with the stop of a train released, and the reason of a refusal."""
+        return release_train(self.supervision.state, train, self.supervision.layout)
 
-    def release_train(self, train: int) -> str | None:
-        """Release the stop of a train by hand; return the reason of a refusal.
-
-        Nothing says of a silent train that it still is where it was: its release is ordered twice (`AGAIN_S`).
-        """
-        now, (least_s, most_s), asked_s = self.clock(), AGAIN_S, self._asked_s.pop(train, -math.inf)
-        silent = self.supervision.records.get(train, TrainRecord(train=train)).state is not TrainState.TRACKED
-        state, reason = release_train(self.supervision.state, train, self.supervision.layout)
-        if reason is None and silent and not least_s <= now - asked_s <= most_s:
-            self._asked_s[train] = now
-            reason = f"train {train} is silent: order it again in {least_s:g} to {most_s:g} s if it stands, whole"
-        else:
-            self.supervision.state = state
-        return self._by_hand(train, "release asked for by hand", reason)
+    def changed(self, state: Interlocking) -> None:
+        """Take a state in which an order has changed trains; of those that are gone nothing is kept."""
+        self.supervision.forget([number for number in self.supervision.state.trains if number not in state.trains])
+        self.supervision.state = state
 
     def set_route(self, train: int) -> str | None:
         """Set a train's route to the next station by hand; return the reason of a refusal."""
-        return self._by_hand(train, "route asked for by hand", self.supervision.set_route(train))
+        return self.supervision.set_route(train)
 
     def ask_route_back(self, train: int) -> str | None:
         """Ask a train by hand to give its route to the next station back; return the reason of a refusal."""
-        return self._by_hand(train, "asked for its route back", self.supervision.ask_route_back(train))
-
-    def _by_hand(self, train: int, order: str, reason: str | None) -> str | None:
-        """Log an order and the reason of its refusal, which is returned."""
-        self.log(f"train {train}: {order}{'' if reason is None else f', refused: {reason}'}", train=train)
-        return reason
+        return self.supervision.ask_route_back(train)
 
     def _monitor(self, now: float) -> None:
         if self.monitor is None:
@@ -329,6 +362,7 @@ class ControlCentre:
                 "number": number, "state": record.state.value, "shown": record.shown_m, "speed": abs(speed) / 100.0,
                 "place": self._place(train.direction, record.shown_m),
                 "direction": train.direction, "rear": rear, "front": front, "end": train.end_m, "jump": record.jump_m,
+                "rejected": record.rejected, "contradiction": train.contradiction,
                 "interference": self.interference.get(number, SuspectedInterference.NONE).name.lower(),
                 "stop": None if number not in stopped else f"{stopped[number]}; {self.stops.get(number, 'not sent')}",
                 "pieces": [[0 if lane == 0 else 2 - lane % 2, low, high] for lane, low, high in pieces],
@@ -343,10 +377,11 @@ class ControlCentre:
             "stations": [{"name": s.name, "begin": s.begin_m, "end": s.end_m, "points": s.points_m}
                          for s in layout.stations],
             "sections": [
-                {"name": name, "low": layout.block_m(block)[0], "high": layout.block_m(block)[1],
-                 "closed": block in state.closed}
-                for name, block in layout.sections.items()
+                {"name": name, "low": layout.section_m(name)[0], "high": layout.section_m(name)[1],
+                 "closed": (name, CLOSED) in state.bars, "bars": sorted(kind for of, kind in state.bars if of == name)}
+                for name in layout.sections
             ],
+            "restrictions": [{"name": name, **limit._asdict()} for name, limit in state.restrictions.items()],
             "monitor": self._monitor_values(), "routes": self.supervision.routes, "rejected": dict(self.rejected),
         }  # fmt: skip
 
@@ -375,25 +410,5 @@ class ControlCentre:
 
 
 def list_orders(centre: ControlCentre) -> dict[str, Order]:
-    """Return the orders of the page: stops of one train and of all, their release, and routes."""
-
-    def of_train(order: Callable[[int], str | None]) -> Order:
-        def given(values: dict[str, Any]) -> str | None:
-            train = values.get("train")
-            return order(train) if type(train) is int else "train: a number was expected"
-
-        return given
-
-    def of_section(order: Callable[[str], str | None]) -> Order:
-        return lambda values: order(str(values.get("section", "")))
-
-    return {
-        "close-section": of_section(centre.close_section),
-        "open-section": of_section(centre.open_section),
-        "release": lambda _: centre.release(),
-        "route": of_train(centre.set_route),
-        "route-back": of_train(centre.ask_route_back),
-        "stop": of_train(centre.stop),
-        "stop-all": lambda _: centre.stop(None),
-        "release-train": of_train(centre.release_train),
-    }
+    """Return the orders of the page by name."""
+    return OrderDesk(centre=centre).orders()

@@ -20,19 +20,20 @@ from pydantic import Field
 from railfix.core.arrays import Floats
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
 from railfix.core.settings import Settings
+from railfix.ground.authority import Authority
 from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
+from railfix.ground.keys import write_keys
 from railfix.ground.links import BEARERS, CentreLinks, LinkLimits, LinkName, TrainLinks, create_bearers, draw_coverage
-from railfix.ground.quic import write_keys
+from railfix.ground.on_board import OnBoard
 from railfix.ground.station_fixes import StationFixes, fixes_of_ranges
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops
-from railfix.ground.train import Authority, OnBoard
 from railfix.ground.triangle import MonitorState, TriangleLimits, TriangleVerdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io.train_message import TrainMessage, encode
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
 
 
 class RelaySettings(Settings):

@@ -6,9 +6,10 @@ not cryptography. A receiver takes each frame once, whichever link brings it fir
 
 from __future__ import annotations
 
+import secrets
 import struct
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 from typing import Final, NamedTuple
@@ -17,13 +18,19 @@ from pydantic import Field
 
 from railfix.core.settings import Settings
 
-_HEAD: Final = struct.Struct("!BIQq")
+_HEAD: Final = struct.Struct("!BIQQq")
 _ECHO: Final = struct.Struct("!Qqqq")
 _CHECK: Final = struct.Struct("!I")
 #: Longest payload [bytes]: with the head it fits a datagram of QUIC.
 LONGEST_PAYLOAD: Final = 1100
-#: Sequence numbers behind the newest that are remembered one by one.
+#: Sequence numbers behind the newest that are remembered one by one, and starts of the sender before the present one.
 REMEMBERED: Final = 4096
+RETIRED: Final = 64
+
+
+def draw_session() -> int:
+    """Return the number of a start: no clock decides which of two starts is the newer."""
+    return secrets.randbits(62)
 
 
 class FrameKind(IntEnum):
@@ -55,6 +62,7 @@ class Frame:
 
     kind: FrameKind
     sender: int
+    session: int  #: Start of the sender, a number drawn at random.
     sequence: int
     time_ns: int  #: Sender's monotonic clock when it was sent.
     payload: bytes = b""
@@ -63,7 +71,7 @@ class Frame:
         """Return the bytes of the frame with their check."""
         if len(self.payload) > LONGEST_PAYLOAD:
             raise ValueError(f"a payload of {len(self.payload)} bytes; at most {LONGEST_PAYLOAD} fit a frame")
-        data = _HEAD.pack(self.kind, self.sender, self.sequence, self.time_ns) + self.payload
+        data = _HEAD.pack(self.kind, self.sender, self.session, self.sequence, self.time_ns) + self.payload
         return data + _CHECK.pack(zlib.crc32(data))
 
 
@@ -95,33 +103,31 @@ class ReceiverLimits(Settings):
     delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest one seen.
     #: Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: Larger steps of the sequence number count once the next frame goes on from there, so that one wrong number does
-    #: not make all later ones old.
+    #: A sequence number may be further ahead of the newest by so many, and by so many a second since then.
     jump: int = Field(default=1000, ge=1)
+    rate: float = Field(default=100.0, gt=0)
 
 
 @dataclass(kw_only=True)
 class _Seen:
-    """Sequence numbers that have come: the newest, and the last ones as bits."""
+    """Sequence numbers that have come: the newest and when, and the last ones as bits."""
 
     newest: int = -1
+    at_ns: int = 0
     bits: int = 0
-    ahead: int = -1
 
-    def is_alone(self, sequence: int, jump: int) -> bool:
-        """Return whether a number is far ahead of the newest, and does not go on from one that was."""
-        if self.newest < 0 or sequence <= self.newest + jump:
-            self.ahead = -1
-            return False
-        before, self.ahead = self.ahead, sequence
-        return not 0 <= before < sequence <= before + jump
+    def is_alone(self, sequence: int, now_ns: int, limits: ReceiverLimits) -> bool:
+        """Return whether a number is further ahead of the newest than the sender can have counted."""
+        most = limits.jump + limits.rate * (now_ns - self.at_ns) / 1e9
+        return self.newest >= 0 and sequence > self.newest + most
 
     def has(self, sequence: int) -> bool:
         behind = self.newest - sequence
         return behind >= REMEMBERED or (behind >= 0 and bool(self.bits >> behind & 1))
 
-    def add(self, sequence: int) -> None:
+    def add(self, sequence: int, now_ns: int) -> None:
         if sequence > self.newest:
+            self.at_ns = now_ns
             step = sequence - self.newest
             self.bits = ((self.bits << step) | 1) & ((1 << REMEMBERED) - 1) if step < REMEMBERED else 1
             self.newest = sequence
@@ -137,6 +143,8 @@ class FrameReceiver:
     limits: ReceiverLimits = field(default_factory=ReceiverLimits)
     #: Frames that were rejected, by threat; deletions are the numbers that a newer one has skipped.
     threats: Counter[Threat] = field(default_factory=Counter)
+    _session: int | None = None
+    _retired: deque[int] = field(default_factory=lambda: deque(maxlen=RETIRED))
     _accepted: _Seen = field(default_factory=_Seen)
     _links: dict[tuple[str, FrameKind], _Seen] = field(default_factory=dict)
     _shortest_ns: float | None = None
@@ -150,14 +158,18 @@ class FrameReceiver:
         frame = self._decode(data)
         if frame is None:
             return None, None
+        if frame.session != self._session:
+            if frame.session in self._retired:
+                return self._reject(Threat.RESEQUENCING)
+            self._begin(frame.session)
         on_link = self._links.setdefault((link, frame.kind), _Seen())
         if on_link.has(frame.sequence):
             return self._reject(Threat.REPETITION)
-        if on_link.is_alone(frame.sequence, self.limits.jump):
+        if on_link.is_alone(frame.sequence, now_ns, self.limits):
             return self._reject(Threat.INSERTION)
         if self._late(frame, now_ns):
             return self._reject(Threat.DELAY)
-        on_link.add(frame.sequence)
+        on_link.add(frame.sequence, now_ns)
         if frame.kind is not FrameKind.DATA or self._accepted.has(frame.sequence):
             return frame, None
         if frame.sequence < self._accepted.newest:
@@ -165,12 +177,14 @@ class FrameReceiver:
             return frame, None
         if self._accepted.newest >= 0:
             self.threats[Threat.DELETION] += frame.sequence - self._accepted.newest - 1
-        self._accepted.add(frame.sequence)
+        self._accepted.add(frame.sequence, now_ns)
         return frame, frame
 
-    def clock_restarted(self) -> None:
-        """Forget the shortest delay: the sender was started again, its clock has another origin."""
-        self._shortest_ns = None
+    def _begin(self, session: int) -> None:
+        """Begin with a start of the sender: its numbers and its clock have another origin; what is late is refused."""
+        if self._session is not None:
+            self._retired.append(self._session)
+        self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None
 
     def _decode(self, data: bytes) -> Frame | None:
         if not _HEAD.size + _CHECK.size <= len(data) <= _HEAD.size + _CHECK.size + LONGEST_PAYLOAD:
@@ -180,7 +194,7 @@ class FrameReceiver:
         if zlib.crc32(body) != _CHECK.unpack(data[-_CHECK.size :])[0]:
             self.threats[Threat.CORRUPTION] += 1
             return None
-        kind, sender, sequence, time_ns = _HEAD.unpack(body[: _HEAD.size])
+        kind, sender, session, sequence, time_ns = _HEAD.unpack(body[: _HEAD.size])
         if sender != self.sender:
             self.threats[Threat.MASQUERADE] += 1
             return None
@@ -188,7 +202,9 @@ class FrameReceiver:
             self.threats[Threat.INSERTION] += 1
             return None
         payload = body[_HEAD.size :]
-        return Frame(kind=FrameKind(kind), sender=sender, sequence=sequence, time_ns=time_ns, payload=payload)
+        return Frame(
+            kind=FrameKind(kind), sender=sender, session=session, sequence=sequence, time_ns=time_ns, payload=payload
+        )
 
     def _late(self, frame: Frame, now_ns: int) -> bool:
         """Return whether a frame took too long; clocks of both ends need not agree."""

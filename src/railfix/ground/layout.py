@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Final, Literal, Self
@@ -21,6 +21,8 @@ from railfix.track.network import Network
 
 #: Points: station and side, -1 at its lower end of chainage, 1 at its upper.
 PointName = tuple[int, int]
+#: Most changes of gradient in one authority.
+MOST_PARTS: Final = 16
 #: Piece of track: lane and chainages, lower first [m]. Lane 0 is the single line with the points,
 #: 2 k + t is track t of station k.
 Piece = tuple[int, float, float]
@@ -48,10 +50,18 @@ class LoopStation(Settings):
         return self.begin_m + self.points_m, self.end_m - self.points_m
 
 
+class Gradient(Settings):
+    """Gradient from a chainage on to the next; before the first the line is level."""
+
+    from_m: float
+    permille: float = Field(ge=-1000, le=1000)  #: Uphill with rising chainage positive.
+
+
 class Layout(Settings):
     """Line of stations in order of chainage."""
 
     stations: Annotated[tuple[LoopStation, ...], Field(min_length=2)]
+    gradients: tuple[Gradient, ...] = ()  #: In order of chainage.
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
@@ -61,6 +71,10 @@ class Layout(Settings):
         for one, other in zip(self.stations[:-1], self.stations[1:], strict=True):
             if other.begin_m <= one.end_m:
                 raise ValueError(f"{other.name} begins at {other.begin_m} m, before the end of {one.name}")
+        if any(other.from_m <= one.from_m for one, other in pairwise(self.gradients)):
+            raise ValueError("gradients are in order of chainage")
+        if len(self.sections) < 4 * len(names) - 1:
+            raise ValueError("a station has the name of a section")
         return self
 
     @cached_property
@@ -82,15 +96,41 @@ class Layout(Settings):
         return range(bisect_left(self._borders_m, low_m), bisect_right(self._borders_m, high_m) + 1)
 
     @cached_property
-    def sections(self) -> dict[str, int]:
-        """Blocks by name: stations, and the sections between them."""
-        names = [station.name for station in self.stations]
-        between = {f"{one} to {other}": 2 * k + 2 for k, (one, other) in enumerate(pairwise(names))}
-        return {name: 2 * k + 1 for k, name in enumerate(names)} | between
+    def sections(self) -> dict[str, tuple[Piece, ...]]:
+        """Pieces of track by name: of each station with its points, of each of its tracks, and between stations."""
+        found: dict[str, tuple[Piece, ...]] = {}
+        for k, station in enumerate(self.stations):
+            first, last = station.inner_m
+            tracks = {f"{station.name} track {t}": ((2 * k + t, first, last),) for t in (1, 2)}
+            points = ((0, station.begin_m, first), (0, last, station.end_m))
+            found[station.name] = (points[0], *(piece for (piece,) in tracks.values()), points[1])
+            found |= tracks
+        for one, other in pairwise(self.stations):
+            found[f"{one.name} to {other.name}"] = ((0, one.end_m, other.begin_m),)
+        return found
 
-    def block_m(self, block: int) -> tuple[float, float]:
-        """Return the chainages of a block of `sections`, lower first [m]."""
-        return self._borders_m[block - 1], self._borders_m[block]
+    def section_m(self, name: str) -> tuple[float, float]:
+        """Return the chainages of a section, lower first [m]."""
+        pieces = self.sections[name]
+        return pieces[0][1], pieces[-1][2]
+
+    def gradients_between(self, low_m: float, high_m: float, direction: int) -> tuple[tuple[int, int], ...]:
+        """Return chainages [cm] and gradients [1/1000] between two places, rounded downhill for a running direction.
+
+        Where there are more than `MOST_PARTS`, the steepest descent of the others stands for them.
+        """
+        ends = [gradient.from_m for gradient in self.gradients[1:]] + [math.inf] * bool(self.gradients)
+        parts = [
+            (round(100.0 * g.from_m), direction * math.floor(direction * g.permille))
+            for g, end in zip(self.gradients, ends, strict=True)
+            if g.from_m < high_m and end > low_m
+        ]
+        parts, others = (parts[:MOST_PARTS], parts[MOST_PARTS:]) if direction > 0 else (
+            parts[-MOST_PARTS:], parts[:-MOST_PARTS])  # fmt: skip
+        if others:
+            steepest = direction * min(direction * permille for _, permille in (*others, *parts))
+            parts = [(chainage, steepest) for chainage, _ in parts]
+        return tuple(parts)
 
     def zone_m(self, point: PointName) -> tuple[float, float]:
         """Return the chainages of points, lower first [m]."""
@@ -127,8 +167,8 @@ class Layout(Settings):
 
     def is_reached(self, station: int, front_m: float, direction: int) -> bool:
         """Return whether a front that runs in a direction is beyond the entry of a station."""
-        begin, end = self.block_m(2 * station + 1)
-        return front_m > begin if direction > 0 else front_m < end
+        here = self.stations[station]
+        return front_m > here.begin_m if direction > 0 else front_m < here.end_m
 
     def station_at(self, low_m: float, high_m: float) -> int | None:
         """Return the station whose tracks hold a whole interval, None where there is none."""
@@ -145,9 +185,14 @@ def along(between_m: tuple[float, float], direction: int) -> tuple[float, float]
     return (low, high) if direction > 0 else (-high, -low)
 
 
-def overlap(first: list[Piece], second: list[Piece]) -> bool:
+def shares(one: Piece, other: Piece) -> bool:
+    """Return whether two pieces share some track."""
+    return one[0] == other[0] and one[1] < other[2] and other[1] < one[2]
+
+
+def overlap(first: Iterable[Piece], second: Sequence[Piece]) -> bool:
     """Return whether two lists of pieces share some track."""
-    return any(a[0] == b[0] and a[1] < b[2] and b[1] < a[2] for a in first for b in second)
+    return any(shares(a, b) for a in first for b in second)
 
 
 #: Distance between centrelines from which two tracks are clear of each other [m].

@@ -8,6 +8,7 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -19,8 +20,9 @@ from pydantic import Field
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
-from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
-from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen, read_revoked
+from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat, draw_session
+from railfix.ground.keys import WARNING_DAYS, Revoked, list_ending, read_revoked
+from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen
 
 #: Results that are kept: an hour of ten frames a second.
 KEPT: Final = 36_000
@@ -207,11 +209,6 @@ BEARERS: tuple[LinkName, LinkName] = ("A", "B")
 RETRY_S = 1.0
 
 
-def first_sequence() -> int:
-    """Return the number that a sender begins with: above those of its last start at up to 10 frames a second."""
-    return int(time.time() * 10)
-
-
 class Bearer(NamedTuple):
     """A bearer of the links: the centre's address on it, and the train's own."""
 
@@ -225,7 +222,7 @@ def create_bearers(addresses: dict[LinkName, tuple[str, int]], local: dict[LinkN
 
 
 class TrainLinks:
-    """The train's end: two connections, one on each bearer, with the keys of `railfix.ground.quic.write_keys`.
+    """The train's end: two connections, one on each bearer, with the keys of `railfix.ground.keys.write_keys`.
 
     `received` is called with the payload of each new frame of the centre.
     """
@@ -246,7 +243,7 @@ class TrainLinks:
         self.receiver = FrameReceiver(sender=CENTRE)
         self.protocols: dict[LinkName, LinkProtocol] = {}
         self._keys, self._bearers = keys, bearers
-        self._received, self._sequence = received, first_sequence()
+        self._received, self._session, self._sequence = received, draw_session(), 0
         self._newest: bytes | None = None
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -262,9 +259,10 @@ class TrainLinks:
 
     async def _keep(self, name: LinkName) -> None:
         idle_s = self.meters[name].limits.idle_s
-        settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
         while True:
             try:
+                # read each time: new certificates are taken over by the next connection
+                settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
                 async with connection(
                     self._bearers[name].centre,
                     settings,
@@ -272,8 +270,6 @@ class TrainLinks:
                     received=lambda _, data: self._frame(name, data),
                     timeout_s=3.0,
                 ) as protocol:
-                    if not self.protocols:
-                        self.receiver.clock_restarted()
                     self.protocols[name] = protocol
                     self._resend(name)
                     while not (protocol.ended or protocol.has_expired):
@@ -299,7 +295,10 @@ class TrainLinks:
     def _put(self, name: LinkName, kind: FrameKind, payload: bytes, now_ns: int) -> None:
         if (protocol := self.protocols.get(name)) is None:
             return
-        frame = Frame(kind=kind, sender=self.train, sequence=self._sequence, time_ns=now_ns, payload=payload)
+        frame = Frame(
+            kind=kind, sender=self.train, session=self._session, sequence=self._sequence, time_ns=now_ns,
+            payload=payload,
+        )  # fmt: skip
         protocol.send(frame.encode())
 
     def _resend(self, name: LinkName) -> None:
@@ -345,11 +344,13 @@ class CentreLinks:
         self._keys, self._hosts, self._ports, self._received = keys, hosts, ports or {}, received
         self._limits, self._wait_s = limits or ReceiverLimits(), wait_s
         self._peers: dict[tuple[int, LinkName], LinkProtocol] = {}
-        # of each train alone: `first_sequence` allows 10 frames a second
+        self._session = draw_session()
         self._sequence: dict[tuple[int, FrameKind], int] = {}
         self._stack = AsyncExitStack()
         self.alarm: str | None = None
-        self._revoked: frozenset[str] = frozenset()
+        self._revoked = Revoked()
+        #: Certificates of trains that end soon, by name, and those of the centre, a sentence each.
+        self._ending: dict[str, str] = {}
 
     async def start(self) -> None:
         """Listen.
@@ -374,6 +375,10 @@ class CentreLinks:
         """End all connections."""
         await self._stack.aclose()
 
+    def alarms(self) -> list[str]:
+        """Return what is wrong with the certificates, a sentence each."""
+        return [*([] if self.alarm is None else [self.alarm]), *self._ending.values()]
+
     def threats(self) -> Counter[Threat]:
         """Return what was rejected from all trains."""
         total: Counter[Threat] = Counter({Threat.MASQUERADE: self.masquerades})
@@ -396,16 +401,32 @@ class CentreLinks:
             except InputFileError as error:
                 self.alarm = f"{error}; the certificates revoked before are still rejected"
             for protocol in self._peers.values():
-                if protocol.peer is not None and (protocol.has_expired or protocol.peer in self._revoked):
+                if protocol.certificate is None:
+                    continue
+                if protocol.has_expired or self._revoked.has(protocol.certificate):
                     protocol.reject()
+            self._note_ending()
             await asyncio.sleep(RETRY_S)
+
+    def _note_ending(self) -> None:
+        """Note the certificates that end within `WARNING_DAYS`: those of the centre, and of trains that are here."""
+        limit = datetime.now(UTC) + timedelta(days=WARNING_DAYS)
+        ends = {p.peer: p.certificate.not_valid_after_utc for p in self._peers.values() if p.peer and p.certificate}
+        self._ending = {text: text for text in list_ending(self._keys, "centre")} | {
+            name: f"the certificate of {name} ends on {end.date().isoformat()}; renew it (railfix ground keys --renew)"
+            for name, end in ends.items()
+            if end <= limit
+        }
 
     def _masquerade(self) -> None:
         self.masquerades += 1
 
     def _encode(self, train: int, kind: FrameKind, payload: bytes) -> bytes:
-        sequence = self._sequence[train, kind] = self._sequence.get((train, kind), first_sequence()) + 1
-        frame = Frame(kind=kind, sender=CENTRE, sequence=sequence, time_ns=time.monotonic_ns(), payload=payload)
+        sequence = self._sequence[train, kind] = self._sequence.get((train, kind), 0) + 1
+        now_ns = time.monotonic_ns()
+        frame = Frame(
+            kind=kind, sender=CENTRE, session=self._session, sequence=sequence, time_ns=now_ns, payload=payload
+        )
         return frame.encode()
 
     def _echo(self, train: int, answered: Frame, received_ns: int) -> bytes:
@@ -414,15 +435,12 @@ class CentreLinks:
 
     def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:
         kind, _, name_of_train = (protocol.peer or "").partition("-")
-        if kind != "train" or not name_of_train.isdigit() or protocol.peer in self._revoked:
+        known = protocol.certificate
+        if kind != "train" or not name_of_train.isdigit() or known is None or self._revoked.has(known):
             protocol.reject()
             return
         train, now_ns = int(name_of_train), time.monotonic_ns()
         receiver = self.receivers.setdefault(train, FrameReceiver(sender=train, limits=self._limits))
-        if self._peers.get((train, name)) is not protocol and all(
-            known.ended for (number, _), known in self._peers.items() if number == train
-        ):
-            receiver.clock_restarted()
         answer, use = receiver.receive(name, data, now_ns)
         if answer is None:
             return

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import os
 import ssl
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -23,11 +22,9 @@ from aioquic.quic.configuration import QuicConfiguration
 from aioquic.quic.connection import QuicConnection
 from aioquic.quic.events import ConnectionTerminated, DatagramFrameReceived, HandshakeCompleted, QuicEvent
 from aioquic.tls import Alert, Epoch, verify_certificate
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509 import Certificate
 
-from railfix.core.errors import InputFileError, OutputError
+from railfix.ground.keys import name_of
 
 #: Name of the protocol in the handshake.
 PROTOCOL: Final = "railfix-link/1"
@@ -37,11 +34,13 @@ IDLE_S: Final = 10.0
 WAIT_S: Final = 0.2
 #: Acknowledgements of QUIC wait so long for a frame that they can go with [s].
 ACKNOWLEDGE_S: Final = 1.5
+#: Handshakes that a peer may have under way.
+MOST_HANDSHAKES: Final = 64
 _REJECTED: Final = 0x101
 
 
 def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = IDLE_S) -> QuicConfiguration:
-    """Return the settings of an end from the files that `railfix.ground.quic.write_keys` wrote."""
+    """Return the settings of an end from the files that `railfix.ground.keys.write_keys` wrote."""
     settings = QuicConfiguration(
         is_client=is_client,
         alpn_protocols=[PROTOCOL],
@@ -55,11 +54,35 @@ def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = I
     return settings
 
 
+class Handshakes:
+    """Handshakes that are not done, of each peer at most `MOST_HANDSHAKES`: with another one the oldest ends."""
+
+    def __init__(self) -> None:
+        self._open: dict[str, dict[LinkProtocol, None]] = {}
+        self.ended = 0  #: Handshakes that were ended so.
+
+    def begin(self, protocol: LinkProtocol, peer: str) -> None:
+        """Note the first packet of a connection."""
+        mine = self._open.setdefault(peer, {})
+        mine[protocol] = None
+        if len(mine) > MOST_HANDSHAKES:
+            oldest = next(iter(mine))
+            del mine[oldest]
+            self.ended += 1
+            oldest.close()
+
+    def end(self, protocol: LinkProtocol) -> None:
+        """Note that a handshake is done, or its connection has ended."""
+        for peer, mine in list(self._open.items()):
+            mine.pop(protocol, None)
+            if not mine:
+                del self._open[peer]
+
+
 class LinkProtocol(QuicConnectionProtocol):
     """One end of a connection that carries datagrams.
 
-    `peer` is the common name of the other end's certificate, None before it was verified; `ends`, when that ends to be
-    valid.
+    `peer` is the common name of the other end's certificate, None before it was verified, and `certificate` that one.
     """
 
     def __init__(
@@ -70,10 +93,12 @@ class LinkProtocol(QuicConnectionProtocol):
         received: Callable[[LinkProtocol, bytes], None],
         rejected: Callable[[], None] = lambda: None,
         wait_s: float = 0.0,
+        handshakes: Handshakes | None = None,
     ) -> None:
         super().__init__(quic, stream_handler)
+        self._handshakes, self._begun = handshakes, False
         self.peer: str | None = None
-        self.ends: datetime | None = None
+        self.certificate: Certificate | None = None
         self.ended = False
         self._received = received
         self._rejected = rejected
@@ -97,6 +122,8 @@ class LinkProtocol(QuicConnectionProtocol):
             self._received(self, event.data)
         elif isinstance(event, ConnectionTerminated):
             self.ended = True
+            if self._handshakes is not None:
+                self._handshakes.end(self)
 
     def _verify(self) -> None:
         certificate = self._quic.tls._peer_certificate
@@ -104,11 +131,14 @@ class LinkProtocol(QuicConnectionProtocol):
             if certificate is None:
                 raise ValueError("no certificate")
             verify_certificate(certificate, cadata=self._quic.configuration.cadata)
-            names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
-            self.peer, self.ends = str(names[0].value), certificate.not_valid_after_utc
+            self.peer, self.certificate = name_of(certificate), certificate
+            if self.peer is None:
+                raise ValueError("no name")
+            if self._handshakes is not None:
+                self._handshakes.end(self)
             self._quic._ack_delay = ACKNOWLEDGE_S
             self._quic._loss.max_ack_delay = 2.0 * ACKNOWLEDGE_S
-        except (Alert, ValueError, IndexError):
+        except (Alert, ValueError):
             self.reject()
 
     def reject(self) -> None:
@@ -120,10 +150,13 @@ class LinkProtocol(QuicConnectionProtocol):
     @property
     def has_expired(self) -> bool:
         """Whether the other end's certificate was valid and is so no more."""
-        return self.ends is not None and datetime.now(UTC) > self.ends
+        return self.certificate is not None and datetime.now(UTC) > self.certificate.not_valid_after_utc
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
         """Take a packet; what a verified peer is owed for it waits, where it may: half the packets, half the work."""
+        if self._handshakes is not None and not self._begun:
+            self._begun = True
+            self._handshakes.begin(self, str(addr[0]))
         if self._wait_s == 0.0 or self.peer is None or self.ended:
             super().datagram_received(data, addr)
             return
@@ -181,15 +214,18 @@ async def listen(
 ) -> tuple[QuicServer, tuple[str, int]]:
     """Listen for connections at an address; port 0 takes a free one. Return the server and its address.
 
-    What is owed to a verified peer, answers and acknowledgements, waits up to `wait_s` to go with what is sent.
+    What is owed to a verified peer, answers and acknowledgements, waits up to `wait_s` to go with what is sent. A peer
+    proves that it has its address before anything is kept of it (Retry, RFC 9000, 8.1.2).
     """
+    handshakes = Handshakes()
     with address_errors(*address):
         server = await serve(
             *address,
             configuration=settings,
             create_protocol=lambda quic, stream_handler=None: LinkProtocol(
-                quic, stream_handler, received=received, rejected=rejected, wait_s=wait_s
+                quic, stream_handler, received=received, rejected=rejected, wait_s=wait_s, handshakes=handshakes
             ),
+            retry=True,
         )
     transport: Any = server._transport
     return server, transport.get_extra_info("sockname")[:2]
@@ -223,75 +259,3 @@ async def connection(
         protocol.close()
         await asyncio.sleep(0)
         transport.close()
-
-
-#: Validity of the certificates [days].
-VALID_DAYS: Final = 365
-
-
-def check_keys(folder: Path, name: str) -> None:
-    """Raise InputFileError where a file that an end of the links needs is not there."""
-    for file in ("authority.pem", f"{name}.pem", f"{name}.key"):
-        if not (folder / file).is_file():
-            raise InputFileError(folder / file, "is not there; railfix ground keys writes it")
-
-
-def read_revoked(folder: Path) -> frozenset[str]:
-    """Return the names whose certificates do not count any more: the lines of ``revoked.txt``, such as ``train-7``.
-
-    InputFileError: when the file is there and cannot be read.
-    """
-    path = folder / "revoked.txt"
-    try:
-        return frozenset(path.read_text(encoding="utf-8").split())
-    except FileNotFoundError:
-        return frozenset()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputFileError(path, f"cannot be read ({error})") from None
-
-
-def write_keys(folder: Path, trains: list[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Write ``authority.pem``, and certificate and key of ``centre`` and of each ``train-N``; return the files.
-
-    The key of the authority is not kept: for another train write a new set. Keys can be read by their owner alone.
-    OutputError: when a file is there already, or cannot be written.
-    """
-    now = datetime.now(UTC)
-
-    def certificate(name: str, public: ec.EllipticCurvePublicKey, *, authority: str) -> x509.Certificate:
-        builder = (
-            x509.CertificateBuilder()
-            .subject_name(x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)]))
-            .issuer_name(x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, authority)]))
-            .public_key(public)
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(now - timedelta(hours=1))
-            .not_valid_after(now + timedelta(days=valid_days))
-            .add_extension(x509.BasicConstraints(ca=name == authority, path_length=None), critical=True)
-            .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
-        )
-        return builder.sign(signing, hashes.SHA256())
-
-    pem = serialization.Encoding.PEM
-    signing = ec.generate_private_key(ec.SECP256R1())
-    issuer = "railfix authority"
-    parts: dict[str, bytes] = {
-        "authority.pem": certificate(issuer, signing.public_key(), authority=issuer).public_bytes(pem)
-    }
-    for name in ("centre", *(f"train-{number}" for number in trains)):
-        key = ec.generate_private_key(ec.SECP256R1())
-        parts[f"{name}.pem"] = certificate(name, key.public_key(), authority=issuer).public_bytes(pem)
-        parts[f"{name}.key"] = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    written = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in parts.items():
-            mode = 0o600 if name.endswith(".key") else 0o644
-            with os.fdopen(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-                file.write(data)
-            written.append(folder / name)
-    except FileExistsError as error:
-        raise OutputError(f"{error.filename}: is there already; name an empty folder") from None
-    except OSError as error:
-        raise OutputError(f"{folder}: keys cannot be written ({error.strerror})") from None
-    return written

@@ -9,8 +9,7 @@ import ipaddress
 import json
 import signal
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -24,20 +23,24 @@ from railfix.core.settings import Settings, load_settings
 from railfix.core.timescale import utc_to_gpst
 from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
-from railfix.ground.interlocking import HEAD, InterlockingLimits, TrainInterval
-from railfix.ground.layout import Layout, LoopStation, PointName, derive_layout
+from railfix.ground.field import SimulatedPoints
+from railfix.ground.keys import check_keys
+from railfix.ground.layout import Gradient, Layout, LoopStation, PointName, derive_layout
 from railfix.ground.links import BEARERS, CentreLinks, LinkName
-from railfix.ground.quic import check_keys
+from railfix.ground.state import HEAD, InterlockingLimits, TrainInterval, from_documents
 from railfix.ground.station_fixes import stream_fixes
-from railfix.ground.store import Store
+from railfix.ground.store import MOST_LINES, Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.triangle import MonitorLimits, TriangleLimits, TriangleVerdict, judge_fixes
 from railfix.ground.web import PageServer, Sessions, page_app
+from railfix.ground.writer import ThreadWriter
 from railfix.io import read_navigation
 from railfix.track.network_read import read_network
 
 #: Period of the centre's work [s].
 STEP_S = 0.1
+#: A commit that is under way at the end is waited for so long [s].
+ENDING_S = 3.0
 #: Thresholds of the garbage collection: with a thousand connections a whole one takes 0.3 s, and is made rarely.
 COLLECTION = 10_000, 20, 50
 #: Document with the stations and trains that the database is of.
@@ -92,10 +95,15 @@ class CentreFile(Settings):
     stations: tuple[LoopStation, ...] = ()  #: The line; or else
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
+    gradients: tuple[Gradient, ...] = ()  #: Of the line, in order of chainage.
+    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection: unknown until it answers, by the order
+    #: ``detect-section``.
+    detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
     #: Where they are at the first start; afterwards the database knows.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"  #: File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
+    log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.
     #: Whether a train that nears the end of its track is given the route to the next station.
     routes: Literal["automatic", "by hand"] = "automatic"
     speed_mps: float = Field(default=20.0, gt=0)  #: Of the reference run curve, for simulated running.
@@ -117,6 +125,9 @@ class CentreFile(Settings):
         if self.network:
             return self  # looked at again with its stations
         layout, numbers = self.layout, [train.number for train in self.trains]
+        for name in self.detected_sections:
+            if name not in layout.sections:
+                raise ValueError(f"there is no section {name}; the sections are {', '.join(layout.sections)}")
         if len(set(numbers)) < len(numbers):
             raise ValueError("two trains have the same number")
         for train in self.trains:
@@ -151,7 +162,7 @@ class CentreFile(Settings):
     @property
     def layout(self) -> Layout:
         """Line."""
-        return Layout(stations=self.stations)
+        return Layout(stations=self.stations, gradients=self.gradients)
 
     def intervals(self) -> list[TrainInterval]:
         """Return the intervals of the trains at the first start."""
@@ -170,31 +181,13 @@ class CentreFile(Settings):
         }
 
 
-@dataclass(kw_only=True)
-class SimulatedPoints:
-    """Points that are detected in their new position some seconds after the command."""
-
-    move_s: float
-    clock: Callable[[], float]
-    _moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
-
-    def command(self, point: PointName, track: int) -> None:
-        """Begin to move points to a track."""
-        self._moving[point] = self.clock() + self.move_s, track
-
-    def take_detected(self) -> list[tuple[PointName, int]]:
-        """Return the points that have come to their track since the last call."""
-        done = [(point, track) for point, (until, track) in self._moving.items() if until <= self.clock()]
-        for point, _ in done:
-            del self._moving[point]
-        return done
-
-
 async def run_centre(
     path: Path,
     *,
     page: tuple[str, int] = ("127.0.0.1", 0),
     password: str,
+    people: Mapping[str, str] | None = None,
+    orders: tuple[str, int] | None = None,
     for_s: float | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> tuple[bool, dict[str, Any]]:
@@ -203,7 +196,8 @@ async def run_centre(
     Returns whether SIGTERM ended it, and figures of what happened.
 
     The page is at a host and port, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
-    centre's certificate. `password` is for orders; `announce` is called with its address once trains can connect.
+    centre's certificate. `password` is for orders, those of `people` by their names; orders have an address of their
+    own where one is given, else that of the page. `announce` is called with each address once trains can connect.
     InputFileError: the file, a key or the database cannot be read. SettingsError: a setting is wrong, or an address
     cannot be listened at.
     """
@@ -221,28 +215,37 @@ async def run_centre(
 
     loop.add_signal_handler(signal.SIGINT, end.set)
     loop.add_signal_handler(signal.SIGTERM, terminate)
-    with Store(database) as store:
-        field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
+    with Store(database, most_lines=settings.log_lines) as store:
         store.take_charge()
         _check_line(settings, store, path)
+        field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic, lie=_stored_points(store))
         control, links = _centre(settings, keys, store, field_points)
+        writer = ThreadWriter(lambda: _call_in(loop, control.settle))
+        control.commits.writer = writer
         done = False
 
         def snapshot() -> dict[str, Any]:
-            alarms = [*(text for text in (control.database, links.alarm) if text is not None), *control.alarms]
+            alarms = [*(text for text in (control.database, *links.alarms()) if text is not None), *control.alarms]
             return {**control.snapshot(), "links": _heard(control, links), "alarms": alarms, "done": done}
 
-        app = page_app(snapshot, list_orders(control), sessions=Sessions(password=password))
-        loopback = page[0] == "localhost" or _is_loopback(page[0])
-        certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
+        sessions = Sessions(password=password, others=people or {})
+        given = list_orders(control)
+        apps = {page: page_app(snapshot, {} if orders else given, sessions=sessions)}
+        if orders is not None:
+            apps[orders] = page_app(snapshot, given, sessions=sessions)
+        servers: list[PageServer] = []
         try:
             await links.start()
-            server = PageServer(app, host=page[0], port=page[1], certificate=certificate)
+            for address, app in apps.items():
+                loopback = address[0] == "localhost" or _is_loopback(address[0])
+                certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
+                servers.append(PageServer(app, host=address[0], port=address[1], certificate=certificate))
         except OSError as error:
             await links.stop()
             raise SettingsError(f"{path}: {error.strerror}") from None
-        await server.start()
-        announce(server.url)
+        for server in servers:
+            await server.start()
+            announce(server.url)
         try:
             work = asyncio.create_task(_work(control, field_points))
             ending = asyncio.create_task(end.wait())
@@ -257,7 +260,9 @@ async def run_centre(
         finally:
             done = True
             await links.stop()
-            await server.stop()
+            for server in servers:
+                await server.stop()
+            store.abandoned = not writer.stop(ENDING_S)
         return terminated.is_set(), {
             "reports used": control.reports,
             "routes set": control.supervision.routes_set,
@@ -293,8 +298,24 @@ def _centre(
         clock=time.monotonic,
         wall_ns=time.time_ns,
         times=settings.monitor,
+        ask=points.ask,
     )
+    for section in settings.detected_sections:
+        supervision.set_section_detected(section, None)
     return control, links
+
+
+def _stored_points(store: Store) -> dict[PointName, int]:
+    """Return where the simulated points lie: as they were detected, or commanded, when the process before ended."""
+    texts = store.documents(HEAD)
+    points = from_documents(texts).points if texts else {}
+    return {name: point.detected or point.wanted for name, point in points.items()}
+
+
+def _call_in(loop: asyncio.AbstractEventLoop, work: Callable[[], None]) -> None:
+    """Call some work in the loop, from another thread; not where the loop has ended."""
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(work)
 
 
 def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
@@ -314,7 +335,7 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
     due = loop.time()
     while True:
         begin = loop.time()
-        for point, track in points.take_detected():
+        for point, track in points.take_detected().items():
             control.supervision.set_detected(point, track)
         control.step()
         now = loop.time()
@@ -364,10 +385,10 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def read_password(path: Path) -> str:
-    """Return the first line of a file that its owner alone can read.
+def read_passwords(path: Path) -> tuple[str, dict[str, str]]:
+    """Return the password in the first line of a file, and those of people in the others, each ``NAME PASSWORD``.
 
-    InputFileError: when the file cannot be read, is empty, or others can read it.
+    InputFileError: when the file cannot be read, is empty, has another form, or others than its owner can read it.
     """
     try:
         shared = path.stat().st_mode & 0o077
@@ -378,4 +399,10 @@ def read_password(path: Path) -> str:
         raise InputFileError(path, "others can read it; allow only its owner to (chmod 600)")
     if not lines or not lines[0]:
         raise InputFileError(path, "is empty; a password in its first line was expected")
-    return lines[0]
+    people: dict[str, str] = {}
+    for number, line in enumerate(lines[1:], start=2):
+        name, _, word = line.strip().partition(" ")
+        if line.strip() and not word.strip():
+            raise InputFileError(path, f"line {number}: a name and its password were expected")
+        people |= {name: word.strip()} if line.strip() else {}
+    return lines[0], people

@@ -21,12 +21,13 @@ from railfix.live.settings import LiveSettings
 from railfix.live.stream import ReceivedData, arrivals, fresh_state, next_arrival
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import usable_ranges
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
-from railfix.positioning.normal_equations import Ranges, clock_groups, single_point
+from railfix.positioning.normal_equations import point_position
+from railfix.positioning.range_arrays import Ranges, usable_ranges
 from railfix.ranges.atmosphere import SeenFrom, model_delays
-from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
+from railfix.ranges.range_sigma import code_sigma_m
 
 #: Median C/N0 over the satellites that is this far below that of the log counts as fallen [dB-Hz].
 FALLEN_DBHZ = 6.0
@@ -115,7 +116,7 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
     """
     plane = axes_at(points_ecef_m[0])[:2]
     fixes = [
-        single_point(item, np.broadcast_to(point, (len(time), 3))).ecef_m
+        point_position(item, np.broadcast_to(point, (len(time), 3))).ecef_m
         for item, point in zip(ranges, points_ecef_m, strict=True)
     ]
     return StationFixes(

@@ -7,12 +7,28 @@ lengthen it again by being late.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
-from railfix.ground.interlocking import Interlocking, InterlockingLimits, stop_trains, with_train
-from railfix.ground.layout import Layout, overlap
+from railfix.ground.layout import Layout, Piece, PointName, overlap
+from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
+from railfix.ground.state import stop_trains as stop_trains
 from railfix.io.train_message import TrainMessage
+
+#: Why a section is barred: closed by hand; occupied by vehicles that report nothing, by hand or by its detection;
+#: its detection has not answered. `BARS` are those that stop the trains inside.
+CLOSED: Final = "closed"
+OCCUPIED: Final = "occupied by vehicles that report nothing"
+UNKNOWN: Final = "unknown to its detection"
+BARS: Final = (CLOSED, OCCUPIED)
+#: Bars that end where the detection of a section says that it is free.
+SWEPT: Final = {OCCUPIED, UNKNOWN}
+
+
+def pieces_of(train: TrainInterval, layout: Layout) -> list[Piece]:
+    """Return the pieces of track that a train occupies."""
+    return layout.pieces(*train.span_m, train.tracks)
 
 
 def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
@@ -23,12 +39,20 @@ def overlaps_stopped(state: Interlocking, layout: Layout) -> Interlocking:
             if low >= high:
                 break
             first, second = state.trains[number], state.trains[other]
-            if first.stop and second.stop:
+            if (first.stop and second.stop) or first.parted == other or second.parted == number:
                 continue
-            one, two = (layout.pieces(*train.span_m, train.tracks) for train in (first, second))
-            if overlap(one, two):
+            if overlap(pieces_of(first, layout), pieces_of(second, layout)):
                 state = stop_trains(state, [number], f"its interval meets that of train {other}")
                 state = stop_trains(state, [other], f"its interval meets that of train {number}")
+    return state
+
+
+def parted_cleared(state: Interlocking) -> Interlocking:
+    """Return the state in which trains that were divided, and are apart, count as any others."""
+    for train in [train for train in state.trains.values() if train.parted is not None]:
+        rear = state.trains.get(train.parted or 0)
+        if rear is None or not train.overlaps(*rear.span_m):
+            state = with_train(state, replace(train, parted=None))
     return state
 
 
@@ -36,48 +60,82 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     """Return the state with the stop of one train released by hand, and the reason of a refusal.
 
     Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
-    report names its line and its clock. Its station becomes the furthest that its front has reached, on the track that
-    it has there.
+    report names its line. Its station becomes the furthest that its front has reached, on the track that it has there.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
         return state, f"train {train} is not stopped"
     if not known.standstill:
         return state, f"train {train} does not stand still"
-    if any(known.overlaps(*layout.block_m(block)) for block in state.closed):
-        return state, f"the section where train {train} is or may run is closed"
+    if known.outside_m() > 0.0 and known.reported_m is not None:
+        return state, (
+            "train {} was last reported at {:.0f} to {:.0f} m, outside its interval {:.0f} to {:.0f} m: see where it "
+            "stands and correct its interval by order (correct-train) first"
+        ).format(train, *known.reported_m, *known.span_m)
+    held = known.held_end_m
+    if held is not None and known.direction * (held - known.interval_m[1]) > ROUNDING_M:
+        return state, f"train {train} still holds an authority to {held:.0f} m: it gives it up where it stands by order"
+    if (bar := bar_over(state, known, layout)) is not None:
+        return state, f"the section where train {train} is or may run is {bar[1]}: {bar[0]}"
+    under = [name for name in layout.points_between(*known.span_m) if known.overlaps(*layout.zone_m(name))]
+    if (reason := points_refused(state, known, under, layout)) is not None:
+        return state, reason
     points = dict(state.points)
-    for name in layout.points_between(*known.span_m):
-        if known.overlaps(*layout.zone_m(name)):
-            if not points[name].wanted == points[name].detected == known.tracks.get(name[0]):
-                return state, f"points {layout.stations[name[0]].name} under its interval are not set for train {train}"
-            points[name] = replace(points[name], locked={**points[name].locked, train: None})
+    for name in under:
+        points[name] = replace(points[name], locked={**points[name].locked, train: None})
     direction = known.direction  # where the train ran too far, its authority now ends there
     end = direction * max(direction * known.end_m, direction * known.front_m)
     station = known.station  # after a wrong change of ends one behind the train
     while (station + direction) in known.tracks and layout.is_reached(station + direction, known.front_m, direction):
         station += direction
-    moved = replace(known, stop=None, end_m=end, line=None, measured_ns=None, station=station)
+    moved = replace(known, stop=None, end_m=end, line=None, station=station)
     released_state = with_train(replace(state, points=points), moved)
     if overlaps_stopped(released_state, layout) != released_state:
         return state, f"the interval of train {train} meets another one"
     return released_state, None
 
 
-def close_section(state: Interlocking, block: int, layout: Layout, reason: str) -> Interlocking:
-    """Return the state with a block closed: no authority reaches into it any more, trains that have one are stopped."""
-    state = replace(state, closed=state.closed | {block})
-    touched = [number for number, train in state.trains.items() if train.overlaps(*layout.block_m(block))]
-    return stop_trains(state, touched, reason)
+def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[PointName], layout: Layout) -> str | None:
+    """Return that points under an interval do not lead its train to its tracks."""
+    for name in under:
+        point = state.points[name]
+        if not (point.lies and point.wanted == train.tracks.get(name[0])):
+            station = layout.stations[name[0]].name
+            return f"points {station} under its interval are not set for train {train.train}"
+    return None
 
 
-def open_section(state: Interlocking, block: int) -> Interlocking:
-    """Return the state with a block open; trains that were stopped by it are released one by one."""
-    return replace(state, closed=state.closed - {block})
+def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple[str, str] | None:
+    """Return a section, with its bar, that a train occupies in part and that stops the trains inside."""
+    occupied = pieces_of(train, layout)
+    bars = (bar for bar in sorted(state.bars) if bar[1] in BARS)
+    return next((bar for bar in bars if overlap(layout.sections[bar[0]], occupied)), None)
 
 
-#: Difference of an end that is rounding [m].
-ROUNDING_M: Final = 0.02
+def close_section(
+    state: Interlocking, section: str, layout: Layout, reason: str, *, kind: str = CLOSED
+) -> Interlocking:
+    """Return the state with a section barred: no authority reaches into it any more, trains inside are stopped."""
+    state = replace(state, bars=state.bars | {(section, kind)})
+    pieces = layout.sections[section]
+    inside = [number for number, train in state.trains.items() if overlap(pieces, pieces_of(train, layout))]
+    return stop_trains(state, inside, reason)
+
+
+def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Interlocking:
+    """Return the state without a bar of a section; trains that were stopped by it are released one by one."""
+    return replace(state, bars=state.bars - {(section, kind)})
+
+
+def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[str]) -> Interlocking:
+    """Return the state in which sections are barred that are detected occupied, and not by a train that reports."""
+    for section in sections:
+        pieces = layout.sections[section]
+        if (section, OCCUPIED) not in state.bars and not any(
+            overlap(pieces, pieces_of(train, layout)) for train in state.trains.values()
+        ):
+            state = replace(state, bars=state.bars | {(section, OCCUPIED)})
+    return state
 
 
 def ask_route_back(
@@ -107,11 +165,10 @@ def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
     known = state.trains[message.train]
     if known.asked_m is None or known.stop is not None or message.sequence != known.sequence:
         return state
-    if message.authority is None or message.authority_end_cm is None or message.authority < known.asked_number:
+    if not answers(known, message):
         return state
     direction = known.direction
-    further = max(direction * message.authority_end_cm / 100.0, direction * known.front_m)
-    if further - direction * known.asked_m > ROUNDING_M:  # it holds more, or is further than it agrees to
+    if holds_more_than_asked(known, message):
         return with_train(state, replace(known, asked_m=None))
     base, end = known.station - direction, direction * max(direction * known.asked_m, direction * known.front_m)
     tracks = {station: track for station, track in known.tracks.items() if station != known.station}
@@ -121,3 +178,17 @@ def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
         points[name] = replace(points[name], locked=locked)
     short = replace(known, asked_m=None, held=True, end_m=end, tracks=tracks, station=base)
     return replace(with_train(state, short), points=points)
+
+
+def answers(known: TrainInterval, message: TrainMessage) -> bool:
+    """Return whether a report answers the authority that asks for a shorter end."""
+    held = message.authority
+    return held is not None and message.authority_end_cm is not None and held >= known.asked_number
+
+
+def holds_more_than_asked(known: TrainInterval, message: TrainMessage) -> bool:
+    """Return whether a train holds more than it is asked to, or is further than that."""
+    d = known.direction
+    assert known.asked_m is not None
+    further = max(d * (message.authority_end_cm or 0) / 100.0, d * known.front_m)
+    return further - d * known.asked_m > ROUNDING_M

@@ -8,6 +8,7 @@ from __future__ import annotations
 import fcntl
 import uuid
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
@@ -19,8 +20,9 @@ from railfix.ground.centre import TrainRecord
 from railfix.io.train_message import decode, encode
 
 _META: Final = sql.MetaData()
-#: Lines of the log that are kept while the database fails.
+#: Lines of the log that are kept while the database fails, and in the database.
 MOST_NOTES: Final = 10_000
+MOST_LINES: Final = 1_000_000
 #: Document that names the process in charge.
 _IN_CHARGE: Final = "centre in charge"
 TRAINS: Final = sql.Table(
@@ -28,6 +30,7 @@ TRAINS: Final = sql.Table(
     _META,
     sql.Column("train", sql.BigInteger, primary_key=True, autoincrement=False),
     sql.Column("sequence", sql.BigInteger, nullable=False),
+    sql.Column("session", sql.BigInteger, nullable=False),
     sql.Column("message", sql.LargeBinary),
 )
 DOCUMENTS: Final = sql.Table(
@@ -56,10 +59,9 @@ class Store:
     InputFileError: when the database cannot be opened.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, most_lines: int = MOST_LINES) -> None:
         try:
-            waits = {"connect_timeout": 2} if url.startswith(("postgresql", "mysql", "mariadb")) else {}
-            self._engine = sql.create_engine(url, connect_args=waits)
+            self._engine = sql.create_engine(url, connect_args=_time_outs(url))
             if self._engine.dialect.name == "sqlite":
                 event.listen(self._engine, "connect", _durable)
             _META.create_all(self._engine)
@@ -70,6 +72,8 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
+        self.abandoned = False  #: A commit hangs in another thread: the connection is left to it.
+        self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:
         """Make this process the only one that writes: a centre in charge before cannot commit any more.
@@ -99,30 +103,37 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Commit the lines of the log that are left, and close the database."""
+        """Commit the lines of the log that are left, where the database takes them, and close it."""
+        if self.abandoned:
+            return
         if self._notes and not self._connection.invalidated:
-            self.save()
+            with suppress(DatabaseError, InputFileError):
+                self.save()
         if self._lock is not None:
             self._lock.close()
         self._connection.close()
         self._engine.dispose()
 
-    def save(self, *records: TrainRecord, documents: Mapping[str, str] | None = None) -> None:
-        """Commit reports of trains, named texts and the lines of the log together; they may be acknowledged then.
+    def save(self, *records: TrainRecord, documents: Mapping[str, str | None] | None = None) -> None:
+        """Commit reports of trains, named texts (None removes one) and the lines of the log; they count then.
 
         InputFileError: when another centre has taken charge of the database since `take_charge`. DatabaseError: when
         the database fails; nothing is stored then, and the lines of the log are kept.
         """
+        notes = self._notes[:]  # more may be noted meanwhile, by another thread
         try:
-            self._save(records, documents or {})
+            self._save(records, documents or {}, notes)
         except sql.exc.SQLAlchemyError as error:
             reason = getattr(error, "orig", None) or error
             del self._notes[:-MOST_NOTES]
             raise DatabaseError(f"the database cannot be written ({' '.join(str(reason).split())})") from None
+        del self._notes[: len(notes)]
 
-    def _save(self, records: Iterable[TrainRecord], documents: Mapping[str, str]) -> None:
+    def _save(
+        self, records: Iterable[TrainRecord], documents: Mapping[str, str | None], notes: list[dict[str, Any]]
+    ) -> None:
         trains = [
-            {"train": record.train, "sequence": record.sequence,
+            {"train": record.train, "sequence": record.sequence, "session": record.session,
              "message": None if record.message is None else encode(record.message)}
             for record in records
         ]  # fmt: skip
@@ -131,13 +142,25 @@ class Store:
                 # written before it is read, so that the row stays locked until the commit
                 mine = (DOCUMENTS.c.name == _IN_CHARGE) & (DOCUMENTS.c.text == self._token)
                 if self._connection.execute(DOCUMENTS.update().where(mine).values(text=self._token)).rowcount != 1:
-                    self._notes.clear()
                     raise InputFileError(self._url, "another centre has taken charge of this database; this one ends")
             self._put(TRAINS.c.train, trains)
-            self._put(DOCUMENTS.c.name, [{"name": name, "text": text} for name, text in documents.items()])
-            if self._notes:
-                self._connection.execute(LOG.insert(), self._notes)
-        self._notes.clear()
+            self._put(
+                DOCUMENTS.c.name, [{"name": n, "text": text} for n, text in documents.items() if text is not None]
+            )
+            for name in [name for name, text in documents.items() if text is None]:
+                self._connection.execute(DOCUMENTS.delete().where(DOCUMENTS.c.name == name))
+            if notes:
+                self._connection.execute(LOG.insert(), notes)
+                self._forget_old_lines(len(notes))
+
+    def _forget_old_lines(self, added: int) -> None:
+        """Delete the oldest lines of the log beyond the most that are kept; looked at once in a hundredth of these."""
+        self._written += added
+        if self._written <= self._most_lines // 100:
+            return
+        self._written = 0
+        newest = self._connection.execute(sql.select(sql.func.max(LOG.c.number))).scalar() or 0
+        self._connection.execute(LOG.delete().where(LOG.c.number <= newest - self._most_lines))
 
     def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
         """Take a line of the log, to be committed with the next `save` or at the end."""
@@ -151,6 +174,7 @@ class Store:
             row.train: TrainRecord(
                 train=row.train,
                 sequence=row.sequence,
+                session=row.session,
                 message=(message := None if row.message is None else decode(bytes(row.message))),
                 shown_m=None if message is None or message.chainage_cm is None else message.chainage_cm / 100.0,
             )
@@ -184,6 +208,15 @@ class Store:
                 key.table.delete().where(key == sql.bindparam("of")), [{"of": row[key.name]} for row in rows]
             )
             self._connection.execute(key.table.insert(), rows)
+
+
+def _time_outs(url: str) -> dict[str, Any]:
+    """Return what lets a connection fail rather than hang: times to connect, for a statement, and of a dead network."""
+    if url.startswith("postgresql"):
+        return {"connect_timeout": 2, "tcp_user_timeout": 5000, "options": "-c statement_timeout=5000"}
+    if url.startswith(("mysql", "mariadb")):
+        return {"connect_timeout": 2, "read_timeout": 5, "write_timeout": 5}
+    return {}
 
 
 def _durable(connection: Any, _record: object) -> None:

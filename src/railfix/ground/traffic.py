@@ -7,10 +7,11 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from railfix.ground.interlocking import TrainInterval
+from railfix.ground.authority import Authority
 from railfix.ground.layout import Layout, LoopStation, PointName, along, overlap
+from railfix.ground.on_board import OnBoard
+from railfix.ground.state import TrainInterval
 from railfix.ground.supervision import Supervision, standing_train
-from railfix.ground.train import Authority, OnBoard
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 BRAKING_MPS2: Final = 0.7
@@ -99,18 +100,25 @@ class SimulatedTrain:
         )
 
     def step(self, now_s: float) -> None:
-        """Run for a step of time below the braking curve to the end of the authority."""
-        room = self.direction * (self.on_board.end_m - self.front_m - self.error_m) - self.bound_m - STOP_SHORT_M
-        wanted = min(self.top_mps, self.speed_mps + ACCELERATION_MPS2 * STEP_S)
-        lag = 1.5 * BRAKING_MPS2 * STEP_S
-        wanted = min(wanted, (lag**2 + 2.0 * BRAKING_MPS2 * max(room, 0.0)) ** 0.5 - lag)
+        """Run for a step of time at the speed that is permitted up to the end of the authority."""
+        wanted = min(self.top_mps, self.speed_mps + ACCELERATION_MPS2 * STEP_S, self.permitted_mps())
         if self.on_board.brake_reason(now_s) is not None or now_s < self.blind_until_s:
             wanted = 0.0
         after = max(wanted, self.speed_mps - BRAKING_MPS2 * STEP_S, 0.0)
         after = 0.0 if after < 0.05 else after
         self.front_m += self.direction * 0.5 * (self.speed_mps + after) * STEP_S
         self.speed_mps = after
-        self.on_board.note_position(self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M), after)
+        self.on_board.note_position(self.safe_front_m, after)
+
+    @property
+    def safe_front_m(self) -> float:
+        """Front end with its error and bound, and what the driver leaves before the end of an authority [m]."""
+        return self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M)
+
+    def permitted_mps(self) -> float:
+        """Return the speed that the authority permits [m/s]."""
+        found = self.on_board.supervised()
+        return 0.0 if found is None else found.permitted_mps
 
 
 @dataclass(kw_only=True)
@@ -127,6 +135,7 @@ class Traffic:
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)  #: Invariants that were broken, by kind and in seconds.
     moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
+    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that points lead to; 1 where none is given.
     _stopped_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -172,6 +181,7 @@ class Traffic:
     def command(self, name: PointName, track: int) -> None:
         """Move points; they are detected at their new track after some seconds."""
         self.moving[name] = self.now_s + self.random.uniform(3.0, 7.0), track
+        self.centre.set_detected(name, None)
         low, high = self.layout.zone_m(name)
         for train in self.trains.values():
             if min(train.rear_m, train.front_m) < high and low < max(train.rear_m, train.front_m):
@@ -181,11 +191,12 @@ class Traffic:
         for name, (until, track) in list(self.moving.items()):
             if self.now_s >= until and self.centre_works:
                 del self.moving[name]
+                self.lie[name] = track
                 self.centre.set_detected(name, track)
 
     def _lead(self, train: SimulatedTrain, before_m: float) -> None:
         """Let points lead a train that runs onto them."""
-        for name, point in self.centre.state.points.items():
+        for name in self.centre.state.points:
             near, _ = along(self.layout.zone_m(name), train.direction)
             if not train.direction * before_m < near <= train.direction * train.front_m:
                 continue
@@ -193,8 +204,8 @@ class Traffic:
                 self.violations["train on moving points"] += 1
             facing = name[1] == -train.direction
             if facing:
-                train.tracks[name[0]] = point.wanted
-            elif point.wanted != train.tracks.get(name[0]):
+                train.tracks[name[0]] = self.lie.get(name, 1)
+            elif self.lie.get(name, 1) != train.tracks.get(name[0]):
                 self.violations["points run through from the wrong track"] += 1
 
     def _change_ends(self, train: SimulatedTrain) -> None:

@@ -10,12 +10,12 @@ import json
 import secrets
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import uvicorn
 from starlette.applications import Starlette
@@ -35,8 +35,11 @@ MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
 #: A connection without a whole request for this time ends, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
-#: Connections at a time; further ones are refused.
+#: Connections at a time; further ones are refused. Of a peer, those without a whole request.
 MOST_CONNECTIONS: Final = 500
+MOST_IDLE: Final = 20
+#: Name of who logs in by the password alone.
+OPERATOR: Final = "operator"
 _COOKIE: Final = "railfix-session"
 _LONGEST_BODY: Final = 1000
 _HEADERS: Final = {
@@ -46,33 +49,44 @@ _HEADERS: Final = {
     "Cache-Control": "no-store",
 }
 
-#: An order: takes the values of the request, returns the reason of a refusal.
-Order = Callable[[dict[str, Any]], str | None]
+#: An order: takes the values of the request and who gives it, returns the reason of a refusal.
+Order = Callable[..., str | None]
 
 
 @dataclass(kw_only=True)
 class Sessions:
-    """Log-ins of the page."""
+    """Log-ins of the page.
+
+    `password` is that of the operator ``""``; `others` are passwords by name, each of one person or interface.
+    """
 
     password: str
+    others: Mapping[str, str] = field(default_factory=dict)
     clock: Callable[[], float] = time.monotonic
     _ends: dict[str, float] = field(default_factory=dict)
+    _names: dict[str, str] = field(default_factory=dict)
     _wrong: list[tuple[float, str]] = field(default_factory=list)
 
-    def log_in(self, password: str, address: str = "") -> str | None:
+    def log_in(self, password: str, address: str = "", name: str = "") -> str | None:
         """Open a session and return its token; None where the password is wrong, or too many of the address were."""
         now = self.clock()
         self._wrong = [(at, of) for at, of in self._wrong if now - at < WRONG_S]
         self._ends = {token: end for token, end in self._ends.items() if end > now}
         if sum(of == address for _, of in self._wrong) >= MOST_WRONG:
             return None
-        given, right = (text.encode(errors="surrogatepass") for text in (password, self.password))
-        if not secrets.compare_digest(given, right):
+        known = self.password if not name else self.others.get(name)
+        given, right = (text.encode(errors="surrogatepass") for text in (password, known or secrets.token_urlsafe()))
+        if not secrets.compare_digest(given, right) or known is None:
             self._wrong.append((now, address))
             return None
         token = secrets.token_urlsafe(32)
-        self._ends[token] = now + SESSION_S
+        self._ends[token], self._names[token] = now + SESSION_S, name or OPERATOR
+        self._names = {known: of for known, of in self._names.items() if known in self._ends}
         return token
+
+    def name_of(self, token: str) -> str:
+        """Return who a session is of."""
+        return self._names[token]
 
     def log_out(self, token: str) -> None:
         """End a session."""
@@ -125,7 +139,11 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
 
     async def login(request: Request) -> Response:
         values, address = await _values(request), "" if request.client is None else request.client.host
-        token = None if values is None else sessions.log_in(str(values.get("password", "")), address)
+        token = (
+            None
+            if values is None
+            else sessions.log_in(str(values.get("password", "")), address, str(values.get("name", "")))
+        )
         if token is None:
             return _answer({"refused": "wrong password, or too many wrong ones within a minute"}, 403)
         answer = _answer({"refused": None})
@@ -141,12 +159,13 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
         given = orders.get(request.path_params["name"])
         if given is None:
             return _answer({"refused": "there is no such order"}, 404)
-        if not sessions.valid(request.cookies.get(_COOKIE, "")):
+        token = request.cookies.get(_COOKIE, "")
+        if not sessions.valid(token):
             return _answer({"refused": "log in first"}, 403)
         values = await _values(request)
         if values is None:
             return _answer({"refused": "a JSON object was expected"}, 400)
-        reason = given(values)
+        reason = given(values, sessions.name_of(token))
         return _answer({"refused": reason}, 200 if reason is None else 409)
 
     return Starlette(
@@ -186,17 +205,43 @@ async def _values(request: Request) -> dict[str, Any] | None:
 
 
 class _TimedProtocol(H11Protocol):
-    """HTTP whose connections end without a whole request, however slowly its bytes come."""
+    """HTTP whose connections end without a whole request, however slowly its bytes come.
+
+    Of each peer at most `MOST_IDLE` wait for one: with another the one that has waited longest ends, so that a peer
+    that opens many takes no place of others, nor its own next request's.
+    """
+
+    waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to look at the connection every `REQUEST_S`."""
         super().connection_made(transport)
+        peer = id(self.server_state), self.client[0] if self.client else ""
+        mine = self.waiting.setdefault(peer, {})
+        mine[self] = None
+        idle = [known for known in mine if known.is_idle]
+        for oldest in idle[: max(len(idle) - MOST_IDLE, 0)]:
+            oldest.transport.close()
+        self._peer = peer
         self._look(waited=False)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        mine = self.waiting.get(self._peer, {})
+        mine.pop(self, None)
+        if not mine:
+            self.waiting.pop(self._peer, None)
+        super().connection_lost(exc)
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no request of the connection is being answered."""
+        return self.cycle is None or self.cycle.response_complete
 
     def _look(self, *, waited: bool) -> None:
         if self.transport.is_closing():
             return
-        idle = self.cycle is None or self.cycle.response_complete
+        idle = self.is_idle
         if idle and waited:
             self.transport.close()
         else:

@@ -101,6 +101,9 @@ class TrainMessage(Settings):
     safe_front_cm: Signed | None = None
     safe_rear_cm: Signed | None = None
     unknown: Unknown = Unknown(0)  #: What the sender does not know of the train.
+    #: Start of the train's unit, a number drawn at random: `sequence` begins again with each.
+    session: Annotated[int, Field(ge=0, lt=1 << 62)] | None = None
+    brake_order: Unsigned | None = None  #: Number of the order to brake that the train obeys, None without one.
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:

@@ -47,15 +47,11 @@ def kernel(function: Function) -> Function:
     SettingsError
         No folder for the code can be written.
     """
-    return _kernel(function, OPTIONS)
-
-
-def _kernel(function: Function, options: dict[str, Any]) -> Function:
     if is_plain():
         # Machine code does not warn: integers that wrap around, divisions by zero and NaN are meant.
         return np.errstate(all="ignore")(function)
     try:
-        compiled = numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **OPTIONS)(function)
     except RuntimeError as error:
         raise SettingsError(
             f"compiled kernels cannot be kept on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
@@ -73,20 +69,6 @@ def inner(function: Function) -> Function:
     return cast(Function, numba.njit(**OPTIONS)(function))
 
 
-#: Of functions that take tuples by reference (`railfix.kernels.tracking.references`): arrays are not counted.
-_BORROWING: Final[dict[str, Any]] = {**OPTIONS, "_nrt": False}
-
-
-def borrowing(function: Function) -> Function:
-    """Compile an inner function that makes no array, without counting references to those that it is given."""
-    return function if is_plain() else cast(Function, numba.njit(**_BORROWING)(function))
-
-
-def borrowing_kernel(function: Function) -> Function:
-    """Compile a kernel that makes no array, without counting references to those that it is given."""
-    return _kernel(function, _BORROWING)
-
-
 @cache
 def _files(package: Path, module: str) -> set[Path]:
     """Return the file of a module of this package and those of all that it imports from the package."""
@@ -96,10 +78,20 @@ def _files(package: Path, module: str) -> set[Path]:
 
 
 @cache
+def _tuples(package: Path) -> bytes:
+    """Return the named tuples of all of railfix by their files: numba cannot read code for one that has moved."""
+    named = re.compile(rb"^class \w+\(NamedTuple\)", re.MULTILINE)
+    files = ((path, named.findall(path.read_bytes())) for path in sorted(package.parent.rglob("*.py")))
+    return b"\n".join(
+        b" ".join([str(path.relative_to(package.parent)).encode(), *found]) for path, found in files if found
+    )
+
+
+@cache
 def compute_stamp(package: Path, module: str) -> str:
-    """Return the hash of all that the code of a module depends on: its files and the constants."""
+    """Return the hash of all that the code of a module depends on: its files, the constants, the names of tuples."""
     files = [*sorted(_files(package, module)), package.parent / "core" / "constants.py"]
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    return hashlib.sha256(b"".join([*(path.read_bytes() for path in files), _tuples(package)])).hexdigest()
 
 
 @cache

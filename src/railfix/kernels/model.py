@@ -121,7 +121,10 @@ def linearise_ranges(
         normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
         _invert_scaled(normal, scale, covariance[t])
         if not math.isfinite(x):
-            design[t], misfit[t] = math.nan, math.nan
+            for m in range(channels):
+                misfit[t, m] = math.nan
+                for i in range(3):
+                    design[t, m, i] = math.nan
     return root, clocks, design, covariance, misfit
 
 

@@ -8,11 +8,28 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
-from railfix.kernels.tracking.algebra import insert, middle
 
 #: A suspicion that there is none of: NaT as a number.
 NEVER = np.iinfo(np.int64).min
 _NS = 1_000_000_000
+
+
+@inner
+def insert(ordered: Floats, size: int, value: float) -> None:
+    """Insert a value among `size` others in rising order."""
+    j = size
+    while j > 0 and ordered[j - 1] > value:
+        ordered[j] = ordered[j - 1]
+        j -= 1
+    ordered[j] = value
+
+
+@inner
+def middle(ordered: Floats, size: int) -> float:
+    """Return the median of values in rising order."""
+    if size % 2:
+        return float(ordered[size // 2])
+    return float(0.5 * (ordered[size // 2 - 1] + ordered[size // 2]))
 
 
 @kernel

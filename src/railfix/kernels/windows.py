@@ -53,7 +53,8 @@ def decayed_sums(values: Floats, growth: Floats, decay: Floats, current: Floats,
     for a in range(len(ends)):
         for t in range(first, ends[a]):
             if decay[t] != 1.0:
-                current[a] *= decay[t]
+                for k in range(values.shape[1]):
+                    current[a, k] *= decay[t]
             for k in range(values.shape[1]):
                 before[t, k] = current[a, k] / growth[t]
                 current[a, k] += values[t, k]

@@ -2,8 +2,8 @@
 
 from .base_station import Stations
 from .config import Config, load_config
-from .corrected_ranges import Models
 from .processor import EpochProcessor
+from .range_stage import Models
 from .results import AntennaResult, Result
 from .state import AntennaState, State
 from .tables import observations_table, positions_table, to_xarray, train_table

@@ -18,13 +18,13 @@ from railfix.integrity.interference import WheelSigns, WheelState, wheel_signs
 from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balises import BaliseLimits, find_passings
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.filter_result import COORDINATES, AlongTrack, FilterFix, FilterState, SingleEpochs
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
 from railfix.pipeline.smoothing import Replay, SmoothedTrack
-from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
+from railfix.positioning.carrier import CycleSlipState, Slips, corrected_phase_m, find_slips
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import Screened
 from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory
@@ -60,6 +60,7 @@ _DIRECTION_SIGMAS: Final = 3.0
 
 def along_track(
     ranges: CorrectedRanges,
+    slips: Slips | None,
     single: SingleEpochs,
     trajectory: Trajectory,
     config: Config,
@@ -73,11 +74,11 @@ def along_track(
     Samples are those of the sensors on board since the chunk before; they meet features of the line, ground units and
     balises of `references`.
     """
-    epochs, slips = gnss_epochs(ranges, single.noise_scale, config, state.slips)
+    epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
     epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
     line = Line.of(trajectory) if state.line is None else state.line
     tracked, sensed, replays, after = _run_filter(
-        epochs, trajectory, line, config, copy_with(state, slips=slips), samples, references,
+        epochs, trajectory, line, config, copy_with(state, slips=after_slips), samples, references,
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
@@ -305,7 +306,12 @@ def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Float
 
 
 def gnss_epochs(
-    ranges: CorrectedRanges, noise_scale: Floats, config: Config, state: CycleSlipState | None
+    ranges: CorrectedRanges,
+    noise_scale: Floats,
+    config: Config,
+    state: CycleSlipState | None,
+    *,
+    slips: Slips | None = None,
 ) -> tuple[GnssEpochs, CycleSlipState | None]:
     """Return the measurements of the filter, and the state of the slip detection.
 
@@ -313,7 +319,7 @@ def gnss_epochs(
     the Dopplers; the change of the carrier phase has both taken off.
     """
     obs, columns = ranges.observations, ranges.columns
-    slips, after = ranges.slips, state
+    after = state
     if slips is None:
         slips, after = find_slips(obs, state, frequency_hz=ranges.channels.every_frequency_hz, limits=config.slips)
     healthy = ((ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0) & ~ranges.unsure[:, None]

@@ -15,20 +15,21 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Datetimes, Floats, Masks, copy_with, read_only
-from railfix.core.epoch_rows import join_epochs
+from railfix.core.arrays import Bits, Datetimes, Floats, Masks, copy_with, read_only
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
+from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.integrity.interference import Sign, Suspicion
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.filter_result import COORDINATES, AlongTrack, SingleEpochs
 from railfix.pipeline.interference_stage import with_statuses
 from railfix.pipeline.level_stage import apply_verdicts
+from railfix.pipeline.position_stage import Solution, satellites_rejected
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.solution import Solution, reason_of_all_channels, satellites_rejected
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.map_offset import MapOffsetLimits, beyond_threshold
+from railfix.positioning.two_frequencies import Combined
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.screens.base import on_pairs, pair_epochs
 from railfix.track.track import interpolate_kilometrage
@@ -46,11 +47,23 @@ def with_coordinates(failed_checks: str) -> Masks:
 _NEAREST: Final = ("conventional_arc_m", "conventional_offset_m", "conventional_chainage_m")
 
 
+def reason_of_all_channels(corrected: CorrectedRanges, combined: Combined | None) -> Bits:
+    """Return the reasons of all channels of the observations, shape (T, M)."""
+    not_observed = ~np.isfinite(corrected.observations.code_m) * np.int64(Reason.NOT_OBSERVED)
+    reason = np.asarray(not_observed | corrected.channels.left_out)
+    reason[:, corrected.columns] = corrected.reason
+    if corrected.second is not None and combined is not None:
+        epoch, channel = np.nonzero(np.isfinite(combined.share))
+        reason[epoch, corrected.second.column[epoch, channel]] = corrected.reason[epoch, channel]
+    return reason
+
+
 def antenna_results(
-    corrected: CorrectedRanges, antennas: AntennaRows, solution: Solution, chainage_m: Floats, config: Config
+    chunk: Chunk, antennas: AntennaRows, solution: Solution, chainage_m: Floats, config: Config
 ) -> AntennaResult:
     """Return the result of one antenna, or of the rows of several; `chainage_m` of all positions, shape (T,)."""
-    obs, point, constrained = corrected.observations, solution.point, solution.place.constrained
+    corrected = chunk.corrected
+    obs, point, constrained = corrected.observations, solution.point, solution.fix.constrained
     has = with_coordinates(config.failed_checks)[solution.status]
     arc, chainage = np.where(has, solution.arc_m, np.nan), np.where(has, chainage_m, np.nan)
     protection = solution.protection
@@ -71,7 +84,7 @@ def antenna_results(
     alone: dict[str, Callable[[], Any]] = {
         "ecef_m": lambda: antennas.at_arc(arc),
         "kilometrage_m": lambda: antennas.each(lambda index, rows: _kilometrage(index.trajectory, chainage[rows])),
-        "reason": lambda: reason_of_all_channels(corrected),
+        "reason": lambda: reason_of_all_channels(corrected, chunk.combined),
         "n_rejected": lambda: satellites_rejected(corrected.channels.member, result.reason),
         "n_used": lambda: (corrected.reason == 0).sum(axis=1),
         "elevation_deg": lambda: on_all_channels(corrected.elevation_deg),
@@ -87,10 +100,10 @@ def antenna_results(
         arc_m=arc, along_sigma_m=np.where(has, solution.along_sigma_m, np.nan), own_sigma_m=solution.own_sigma_m,
         noise_scale=solution.noise_scale, conventional_status=solution.point_status, conventional_ecef_m=point.ecef_m,
         cn0_dbhz=obs.cn0_dbhz, satellites=corrected.satellites, columns=corrected.columns, second=corrected.second,
-        combined=corrected.combined, screens=corrected.screens, single_point=point, section=solution.place.section,
+        combined=chunk.combined, screens=chunk.screens, single_point=point, section=solution.fix.section,
         constrained=constrained, phase=solution.phase, raim=raim,
         protection=None if protection is None else apply_verdicts(protection, solution.status, has, chainage, config),
-        map_offset=solution.map_offset, araim=solution.araim, clocks=corrected.clocks,
+        map_offset=solution.map_offset, araim=solution.araim, clocks=corrected.channels.clocks,
         clock_offset_m=solution.ties.offset_m, clock_offset_sigma_m=solution.ties.sigma_m,
         interference=None,  # of each antenna
     )  # fmt: skip
@@ -114,25 +127,6 @@ class PositionVerdict(NamedTuple):
     name: str
     screened: Screened
     status: int
-
-
-def judge_pairs(
-    screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, ranges: Mapping[str, CorrectedRanges]
-) -> dict[str, CorrectedRanges]:
-    """Return the ranges after the screens of common observations, by antenna; `screens` are with their limits."""
-    judged = dict(ranges)
-    for screen, limits in screens if pair is not None else ():
-        for name, verdicts in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
-            judged[name] = judged[name].apply(verdicts)
-    return judged
-
-
-def with_screens(corrected: CorrectedRanges, ranges: Mapping[str, CorrectedRanges]) -> CorrectedRanges:
-    """Return the ranges of all antennas with what the screens and the carrier phases of each have changed."""
-    names = ("reason", "sigma_m", "corrected_code_m", "bound_sigma_m", "bias_m", "combined", "slips")
-    return copy_with(
-        corrected, **{name: join_epochs([getattr(own, name) for own in ranges.values()]) for name in names}
-    )
 
 
 def position_verdicts(

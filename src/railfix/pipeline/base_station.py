@@ -13,15 +13,15 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_w
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises
-from railfix.pipeline.carrier_stage import CarrierState, smooth_ranges, with_slips
+from railfix.pipeline.carrier_stage import CarrierState, find_antenna_slips, smooth_ranges
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import correct_ranges
-from railfix.pipeline.received import Received
+from railfix.pipeline.range_stage import correct_ranges
+from railfix.pipeline.received import Received, correction_source
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import corrected_phase_m, number_arcs
-from railfix.positioning.noise_scale import robust_clock
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.receiver_noise import robust_clock
+from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.base_station import LONGEST_AGE_S, BaseErrors
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -104,7 +104,7 @@ class BaseStation:
             latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
             ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
             index = SearchIndex(Trajectory.from_antenna_path(Track.from_ecef(ends)))
-            self._antenna = ecef_m, AntennaRows.of(index)
+            self._antenna = ecef_m, AntennaRows.on(index)
         return self._antenna[1]
 
     def errors(
@@ -113,16 +113,17 @@ class BaseStation:
         """Return the errors of some epochs, and the state of the carrier-phase stages after them."""
         own = replace(received, base=None)
         channels = self._book.of(obs, received.navigation)
-        corrected = correct_ranges(obs, channels, self._config, own, self._rows(ecef_m))
-        corrected, carrier = with_slips(corrected, self._config, carrier)
-        corrected, carrier = smooth_ranges(corrected, self._config, carrier)
-        slips = corrected.slips
-        assert slips is not None
+        rows, source = self._rows(ecef_m), correction_source(own, self._config)
+        corrected, _ = correct_ranges(obs, channels, self._config, source, rows)
+        slips, states = find_antenna_slips(corrected, rows, self._config, [carrier])
+        corrected, (carrier,) = smooth_ranges(corrected, None, slips, rows, self._config, states)
         used = corrected.reason == Reason.USED
         distance, _ = range_with_rotation(corrected.satellites.position_ecef_m, ecef_m)
         residual = np.where(used, corrected.corrected_code_m - distance, np.nan)
-        clock = robust_clock(residual, corrected.sigma_m, corrected.groups).clock_m
-        of_channel = np.repeat(np.arange(len(corrected.groups)), [g.stop - g.start for g in corrected.groups])
+        clock = robust_clock(residual, corrected.sigma_m, corrected.channels.groups).clock_m
+        of_channel = np.repeat(
+            np.arange(len(corrected.channels.groups)), [g.stop - g.start for g in corrected.channels.groups]
+        )
         phase = corrected_phase_m(
             slips.phase_m[:, corrected.columns], corrected.satellites.clock_m, corrected.ionosphere_m,
             corrected.troposphere_m,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Masks, copy_with
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
+from railfix.core.epoch_rows import take_epochs
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import (
     ArcState,
     ContinuityState,
@@ -20,6 +21,7 @@ from railfix.positioning.carrier import (
     PhasePositions,
     Phases,
     PhaseState,
+    Slips,
     SmoothingState,
     TrackedPhases,
     corrected_phase_m,
@@ -31,7 +33,10 @@ from railfix.positioning.carrier import (
     smooth_codes,
     track_jumps,
 )
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.search_index import SearchIndex
+from railfix.positioning.two_frequencies import Combined
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.track.trajectory import Trajectory
 
 #: Phases of satellites below this elevation are weighted as if at it [deg].
@@ -53,39 +58,55 @@ class CarrierState:
     base_arc: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
 
-def with_slips(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tuple[CorrectedRanges, CarrierState]:
-    """Return the ranges with the cycle slips of all channels of their log."""
-    frequency = ranges.channels.every_frequency_hz
-    slips, after = find_slips(ranges.observations, state.slips, frequency_hz=frequency, limits=config.slips)
-    return replace(ranges, slips=slips), replace(state, slips=after)
+def find_antenna_slips(
+    corrected: CorrectedRanges, antennas: AntennaRows, config: Config, states: Sequence[CarrierState]
+) -> tuple[Slips, list[CarrierState]]:
+    """Return the cycle slips of all channels of the observations, and the new state of each antenna."""
+    frequency = corrected.channels.every_frequency_hz
+
+    def own_slips(_: SearchIndex, rows: slice, state: CarrierState) -> tuple[Slips, CarrierState]:
+        own = take_epochs(corrected.observations, rows)
+        slips, after = find_slips(own, state.slips, frequency_hz=frequency, limits=config.slips)
+        return slips, replace(state, slips=after)
+
+    return antennas.each_with_state(own_slips, states)
 
 
-def smooth_ranges(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tuple[CorrectedRanges, CarrierState]:
+def smooth_ranges(
+    corrected: CorrectedRanges,
+    combined: Combined | None,
+    slips: Slips,
+    antennas: AntennaRows,
+    config: Config,
+    states: Sequence[CarrierState],
+) -> tuple[CorrectedRanges, list[CarrierState]]:
     """Return the ranges with their codes smoothed by their phases; the weights stay those of raw codes.
 
-    Multipath and the error floor are not averaged out as white noise is. The ranges need their slips
-    (`with_slips`); without them nothing is smoothed.
+    Multipath and the error floor are not averaged out as white noise is.
     """
-    obs, slips = ranges.observations, ranges.slips
-    if slips is None:
-        return ranges, state
-    code_m, after = smooth_codes(
-        obs.time, obs.satellite, obs.signal, obs.code_m, slips.phase_m, slips.slip, state.smoothing,
-        limits=config.smoothing,
-    )  # fmt: skip
-    change = code_m - obs.code_m
-    corrected = change[:, ranges.columns]
-    if ranges.second is not None and ranges.combined is not None:
-        other = np.take_along_axis(change, np.maximum(ranges.second.column, 0), axis=1)
-        share = ranges.combined.share
-        corrected = np.where(np.isfinite(share), (1.0 - share) * corrected + share * other, corrected)
-    corrected = ranges.corrected_code_m + corrected
-    return replace(ranges, corrected_code_m=corrected), replace(state, smoothing=after)
+    obs = corrected.observations
+
+    def own_codes(_: SearchIndex, rows: slice, state: CarrierState) -> tuple[Floats, CarrierState]:
+        smoothed, after = smooth_codes(
+            obs.time[rows], obs.satellite, obs.signal, obs.code_m[rows], slips.phase_m[rows], slips.slip[rows],
+            state.smoothing, limits=config.smoothing,
+        )  # fmt: skip
+        return smoothed, replace(state, smoothing=after)
+
+    code_m, after = antennas.each_with_state(own_codes, states)
+    every = code_m - obs.code_m
+    change = every[:, corrected.columns]
+    if corrected.second is not None and combined is not None:
+        other = np.take_along_axis(every, np.maximum(corrected.second.column, 0), axis=1)
+        share = combined.share
+        change = np.where(np.isfinite(share), (1.0 - share) * change + share * other, change)
+    return copy_with(corrected, corrected_code_m=corrected.corrected_code_m + change), after
 
 
 def code_and_phase(
     corrected: CorrectedRanges,
     ranges: Ranges,
+    slips: Slips,
     trajectory: Trajectory,
     arc_m: Floats,
     config: Config,
@@ -93,11 +114,9 @@ def code_and_phase(
 ) -> tuple[PhasePositions, CarrierState]:
     """Return positions from code and phase, each from its own and earlier epochs, and the state (requirement A5; P4).
 
-    The ranges have their slips (`with_slips`); a phase is used where its code is. `arc_m`: positions from the codes
+    A phase is used where its code is. `slips`: of all channels of the observations; `arc_m`: positions from the codes
     alone, shape (T,).
     """
-    slips = corrected.slips
-    assert slips is not None, "with_slips() comes first"
     time, columns, satellites = corrected.time, corrected.columns, corrected.satellites
     satellite, signal = corrected.satellite, corrected.signal
     used, limits, slip = ranges.weight > 0, config.phase, slips.slip[:, columns]

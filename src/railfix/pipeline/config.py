@@ -32,13 +32,15 @@ from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
+from railfix.positioning.line_fix import FixLimits
 from railfix.positioning.map_offset import MapOffsetLimits
-from railfix.positioning.noise_scale import ClockOffsetLimits, LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.normal_equations import ConstrainedLimits, SinglePointLimits
+from railfix.positioning.receiver_noise import ClockOffsetLimits, LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.base_station import BaseLimits
-from railfix.ranges.corrected import DEFAULT_SIGNALS, CodeNoise, NominalErrors
+from railfix.ranges.channels import DEFAULT_SIGNALS
+from railfix.ranges.range_sigma import CodeNoise, NominalErrors
 from railfix.ranges.sbas import SbasLimits
 from railfix.screens import SCREENS
 from railfix.tracking.limits import TrackingLimits
@@ -261,6 +263,11 @@ class Config(ScreenSettings):
         if self.integrity_support is not None and self.sbas:
             raise ValueError("integrity_support states what SBAS does: give one of the two")
         return self
+
+    @cached_property
+    def fix_limits(self) -> FixLimits:
+        """Limits of the stages from 3-D position to position on the line."""
+        return FixLimits(self.min_satellites, self.single_point, self.section, self.constrained)
 
     @cached_property
     def local_risk(self) -> RiskBudget:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, copy_with
+from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.positioning.two_frequencies import TwoFrequencyState, combine_codes, ionosphere_free
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.search_index import SearchIndex
+from railfix.positioning.two_frequencies import Combined, TwoFrequencyState, combine_codes, ionosphere_free
 from railfix.ranges.atmosphere import thin_shell_obliquity
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import Screened, Verdict
 
 #: Key of the verdict.
@@ -24,47 +28,47 @@ _IONOSPHERE_REST: Final = 0.05
 
 
 def combine_frequencies(
-    ranges: CorrectedRanges, config: Config, ionosphere_sigma_m: float, state: TwoFrequencyState
-) -> tuple[CorrectedRanges, TwoFrequencyState]:
-    """Return the ranges with two codes combined, and weighted down where the two disagree."""
-    second = ranges.second
-    if second is None:
-        return ranges, state
-    usable = ranges.reason == 0
-    known = config.noise.floor_sigma_m**2 + (ranges.nominal_m**2 if config.dual_frequency_sbas else 0.0)
-    noise = np.sqrt(np.maximum(ranges.sigma_m**2 - known, 1e-4))
-    vertical = np.hypot(config.nominal.ionosphere_sigma_m, ionosphere_sigma_m)
-    found, state = combine_codes(
-        ranges.time,
-        np.where(usable, ranges.corrected_code_m, np.nan),
-        noise,
-        second,
-        _field_of_ionosphere(ranges, vertical),
-        (ranges.channels.pair_names, ranges.channels.pair_groups),
-        state,
-        config.two_frequencies,
-    )
-    local_m, nominal_m = ranges.bound_sigma_m, np.zeros(usable.shape)
+    corrected: CorrectedRanges,
+    antennas: AntennaRows,
+    config: Config,
+    ionosphere_sigma_m: float,
+    states: Sequence[TwoFrequencyState],
+) -> tuple[CorrectedRanges, Combined, Verdict, list[TwoFrequencyState]]:
+    """Return the ranges with two codes combined, how, a verdict that weighs down where the two disagree, and states."""
+    usable, second = corrected.reason == 0, corrected.second
+    assert second is not None
+    code = np.where(usable, corrected.corrected_code_m, np.nan)
+    known = config.noise.floor_sigma_m**2 + (corrected.nominal_m**2 if config.dual_frequency_sbas else 0.0)
+    noise = np.sqrt(np.maximum(corrected.sigma_m**2 - known, 1e-4))
+    field_m = _field_of_ionosphere(corrected, np.hypot(config.nominal.ionosphere_sigma_m, ionosphere_sigma_m))
+    pairs = corrected.channels.pair_names, corrected.channels.pair_groups
+
+    def own_codes(_: SearchIndex, rows: slice, state: TwoFrequencyState) -> tuple[Combined, TwoFrequencyState]:
+        given = corrected.time[rows], code[rows], noise[rows]
+        return combine_codes(
+            *given, take_epochs(second, rows), field_m[rows], pairs, state, config.two_frequencies
+        )  # fmt: skip
+
+    found, after = antennas.each_with_state(own_codes, states)
+    local_m, nominal_m = corrected.bound_sigma_m, np.zeros(usable.shape)
     if config.dual_frequency_sbas:
-        gps = np.char.startswith(ranges.satellite, "G")  # corrections refer to clocks without group delays
-        delays = (np.where(gps, each, 0.0) for each in (ranges.satellites.group_delay_m, second.group_delay_m))
-        code = np.where(usable, ranges.corrected_code_m, np.nan)
+        gps = np.char.startswith(corrected.satellite, "G")  # corrections refer to clocks without group delays
+        delays = (np.where(gps, each, 0.0) for each in (corrected.satellites.group_delay_m, second.group_delay_m))
         found = ionosphere_free(code, noise, second, tuple(delays), found)
-        nominal_m = np.where(local_m > 0.0, ranges.nominal_m, 0.0)
+        nominal_m = np.where(local_m > 0.0, corrected.nominal_m, 0.0)
         local_m = np.sqrt(np.maximum(local_m**2 - nominal_m**2, 0.0))
     joint = np.isfinite(found.share)
     magnified = np.where(joint, np.abs(1.0 - found.share) + np.abs(found.share), 1.0)
-    ranges = copy_with(
-        ranges,
-        corrected_code_m=np.where(joint, found.code_m, ranges.corrected_code_m),
-        sigma_m=np.where(joint, np.sqrt(ranges.sigma_m**2 + found.variance_m2), ranges.sigma_m),
+    corrected = copy_with(
+        corrected,
+        corrected_code_m=np.where(joint, found.code_m, corrected.corrected_code_m),
+        sigma_m=np.where(joint, np.sqrt(corrected.sigma_m**2 + found.variance_m2), corrected.sigma_m),
         bound_sigma_m=np.hypot(local_m * magnified, nominal_m),
-        bias_m=ranges.bias_m * magnified,
-        combined=found,
+        bias_m=corrected.bias_m * magnified,
     )
-    screened = Screened(metric=found.difference_m, reject=found.suspected)
+    screened = Screened(metric=found.difference_m, reject=found.suspected)  # each satellite has its own limit
     verdict = Verdict(name=NAME, reason=Reason.USED, screened=screened, error_m=found.difference_m)
-    return ranges.apply([verdict]), state
+    return corrected, found, verdict, after
 
 
 def _field_of_ionosphere(ranges: CorrectedRanges, vertical_m: float) -> Floats:

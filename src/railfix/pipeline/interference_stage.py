@@ -30,9 +30,9 @@ from railfix.integrity.interference import (
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
-from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.normal_equations import ClockTies
+from railfix.positioning.range_arrays import ClockTies
+from railfix.ranges.corrected import CorrectedRanges
 
 #: Reasons given because ranges contradict others: those of a spoofer do.
 _CONTRADICTED: Final = int(

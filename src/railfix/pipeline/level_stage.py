@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -12,24 +12,25 @@ from railfix.core.arrays import Codes, Floats, Indices, Masks, copy_with
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, Status
+from railfix.integrity.fault_exclusion import RaimResult
 from railfix.integrity.protection import (
     Cause,
     LevelStatus,
     ProtectionLevel,
     RiskBudget,
-    along_track_level,
     availability,
+    protection_level,
 )
 from railfix.integrity.protection.araim import AraimGeometry, AraimResult, IntegritySupport, araim_levels
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.protection.open_places import places_beyond_the_level
-from railfix.integrity.raim import LinearModel
+from railfix.integrity.raim import LinearModel, linear_model
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.solve import Place, RaimResult, line_model
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.line_fix import LineFix
 from railfix.positioning.map_offset import MapOffset
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
+from railfix.ranges.corrected import CorrectedRanges
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +42,16 @@ class ProtectionResult:
     status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
     kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
     basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
+
+
+class RaimPositions(NamedTuple):
+    """Positions after the exclusion of faults, T epochs."""
+
+    ranges: Ranges
+    fix: LineFix
+    model: LinearModel  #: Of the positions.
+    raim: RaimResult
+    scale: Floats  #: Noise scale of the receiver, shape (T,).
 
 
 #: Basis of a level: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
@@ -119,14 +130,44 @@ def level_scale(scale: Floats, config: Config) -> Floats:
     return np.maximum(scale, 1.0) if config.error_model is None or config.sbas else scale
 
 
-def protection_levels(
+def level_stage(
     corrected: CorrectedRanges,
+    checked: RaimPositions,
+    antennas: AntennaRows,
+    offset: MapOffset,
+    config: Config,
+) -> tuple[ProtectionResult | None, Masks]:
+    """Return the protection levels, None where they are off, and the epochs with open positions beyond them, (T,)."""
+    ranges, fix, model, raim, scale = checked
+    if config.protection != "on" or config.carrier in ("float", "fixed"):
+        return None, np.zeros(len(ranges), dtype=bool)
+    section = np.maximum(fix.constrained.section, 0)
+    heading = antennas.each(lambda index, rows: index.trajectory.heading_deg[section[rows]])
+    sides = low_sides(corrected.azimuth_deg, corrected.elevation_deg, heading, config.risk.side_elevation_deg)
+    systems = [name[0] for name in corrected.satellite.tolist()]
+    overbound = None if config.error_model is None else RangeBounds(corrected.bound_sigma_m, corrected.bias_m)
+    level = protection_levels(model, systems, offset, raim, scale, sides, config, overbound=overbound)
+    bounding = (model, scale)
+    if config.error_model is not None:
+        sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
+        bounding = bounding_model(sigma, ranges, antennas, fix)
+    beyond = np.where(fix.section.excess > config.section.threshold, level.level.level_m, np.nan)
+    open_elsewhere = places_beyond_the_level(
+        antennas, fix.constrained.arc_m, bounding[0], beyond, bounding[1], systems, get_risk_budget(config), sides
+    )
+    return level, open_elsewhere
+
+
+def protection_levels(
     model: LinearModel,
+    systems: Sequence[str],
     offset: MapOffset,
     raim: RaimResult,
     scale: Floats,
     sides: Masks,
     config: Config,
+    *,
+    overbound: RangeBounds | None = None,
 ) -> ProtectionResult:
     """Return the protection levels of the positions of a chunk, from their model on the line.
 
@@ -135,51 +176,28 @@ def protection_levels(
     least, and with an error model the sigma of no range falls below the model's. `sides`: `low_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
-    level = along_track_level(
-        replace(model, covariance_m2=covariance), [name[0] for name in corrected.satellite.tolist()],
-        risk=get_risk_budget(config), scale=level_scale(scale, config),
-        overbound=None if config.error_model is None else RangeBounds(corrected.bound_sigma_m, corrected.bias_m),
+    level = protection_level(
+        replace(model, covariance_m2=covariance), systems,
+        risk=get_risk_budget(config), scale=level_scale(scale, config), overbound=overbound,
         map_error=MapDeviation(np.array(offset.beyond_m).T, offset.seen), sides=sides,
-        n_excluded=raim.excluded.sum(axis=1),
+        n_excluded=raim.excluded,
     )  # fmt: skip
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     return ProtectionResult(level=level, status=status, kind=choose_kind(config), basis=choose_basis(config))
 
 
-def bounding_model(
-    corrected: CorrectedRanges, ranges: Ranges, antennas: AntennaRows, place: Place, scale: Floats
-) -> tuple[LinearModel, Floats]:
-    """Return the model of positions whose sigmas bound the errors of the ranges by an error model, and its scale."""
-    sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
-    weight = np.where(ranges.weight > 0, 1.0 / sigma**2, 0.0)
-    return line_model(replace(ranges, weight=weight), antennas, place.constrained), np.ones(len(ranges))
+def bounding_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
+    """Return the model of positions whose sigmas (T, K) bound the errors of the ranges, and its scale."""
+    weight = np.where(ranges.weight > 0, 1.0 / sigma_m**2, 0.0)
+    found = fix.constrained
+    model = linear_model(replace(ranges, weight=weight), antennas, found.arc_m, section=found.section)
+    return model, np.ones(len(ranges))
 
 
-def unresolved_alternatives(
-    corrected: CorrectedRanges,
-    antennas: AntennaRows,
-    place: Place,
-    bounding: tuple[LinearModel, Floats],
-    protection: ProtectionResult,
-    sides: Masks,
-    config: Config,
-) -> Masks:
-    """Return the epochs where the ranges leave open, at the risk of a sample, a place beyond the level, shape (T,).
-
-    Epochs that are ambiguous already are not looked at. `bounding`: model of the positions and noise scale, shape (T,);
-    `bounding_model` where there is an error model.
-    """
-    return places_beyond_the_level(
-        antennas, place.constrained.arc_m, bounding[0],
-        np.where(place.section.excess > config.section.threshold, protection.level.level_m, np.nan), bounding[1],
-        [name[0] for name in corrected.satellite.tolist()], get_risk_budget(config), sides,
-    )  # fmt: skip
-
-
-def low_sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: float) -> Masks:
+def low_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, lowest_deg: float) -> Masks:
     """Return the low satellites left and right of the track, shape (T, 2, K); `heading_deg` is its azimuth (T,)."""
-    right = np.sin(np.radians(corrected.azimuth_deg - heading_deg[:, None])) > 0
-    low = corrected.elevation_deg < elevation_deg
+    right = np.sin(np.radians(azimuth_deg - heading_deg[:, None])) > 0
+    low = elevation_deg < lowest_deg
     return np.concatenate([(low & ~right)[:, None], (low & right)[:, None]], axis=1)
 
 

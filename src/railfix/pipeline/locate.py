@@ -15,16 +15,18 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.pipeline.channels import ChannelBook, Channels
+from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import ANCHOR_SIGMA_M, usable_ranges, without
 from railfix.pipeline.received import Received
+from railfix.positioning.approximate import ANCHOR_SIGMA_M
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
-from railfix.positioning.noise_scale import robust_fit
-from railfix.positioning.normal_equations import Ranges, SinglePoint, single_point
+from railfix.positioning.normal_equations import SinglePoint, point_position
+from railfix.positioning.range_arrays import Ranges, usable_ranges, without
+from railfix.positioning.receiver_noise import robust_fit
 from railfix.ranges.atmosphere import SeenFrom, model_delays
-from railfix.ranges.corrected import PLAUSIBLE_CODE_M, code_sigma_m, first_available
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
+from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
@@ -164,14 +166,14 @@ def _approximate_place(raw: Ranges, config: Config) -> tuple[Floats, Masks, Mask
     ranges contradict each other, (T,).
     """
     start = _below(raw)
-    point = single_point(raw, start, limits=config.single_point)
+    point = point_position(raw, start, limits=config.single_point)
     place, gross, rms = point.ecef_m.copy(), np.zeros(raw.weight.shape, dtype=np.bool_), _rms_m(raw, point)
     suspect = np.flatnonzero(~(rms < _QUIET_M) | ~_plausible_height(place))
     if len(suspect):
         part = raw.take(suspect)
         gross[suspect] = gross_in_space(part, start[suspect])
         part = without(part, gross[suspect])
-        again = single_point(part, start[suspect], limits=config.single_point)
+        again = point_position(part, start[suspect], limits=config.single_point)
         place[suspect], rms[suspect] = again.ecef_m, _rms_m(part, again)
     return place, gross, rms > GROSS_M
 
@@ -208,7 +210,7 @@ def locate_ranges(time: Datetimes, seen: UncorrectedRanges, config: Config) -> L
     rest = without(ranges, (ranges.weight > 0) & ~fit.kept)
     checked = rest.n_used - rest.n_clocks > 3  # one range too many at least, or nothing shows which ones are wrong
     ranges = without(ranges, (ranges.weight > 0) & ~fit.kept & checked[:, None])
-    point = single_point(ranges, start, limits=config.single_point)
+    point = point_position(ranges, start, limits=config.single_point)
     freedom = ranges.n_used - ranges.n_clocks - 3
     scale = np.where(freedom >= 1, point.wsse / np.maximum(freedom, 1), 1.0)
     no_position = seen.no_position

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Masks, copy_with
+from railfix.core.arrays import Datetimes, Floats, copy_with
 from railfix.core.epoch_rows import take_epochs
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import along_track, apply_spacing_verdict, with_passings
 from railfix.pipeline.antennas import (
@@ -28,28 +28,26 @@ from railfix.pipeline.antennas import (
     apply_wheel_sign,
     filter_inputs,
     filter_verdicts,
-    judge_pairs,
     position_verdicts,
     with_coordinates,
-    with_screens,
 )
 from railfix.pipeline.base_station import BaseStation, Stations, check_base
-from railfix.pipeline.carrier_stage import CarrierState, smooth_ranges, with_slips
 from railfix.pipeline.channels import ChannelBook, missing_notes
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import SCREEN_NAMES, Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges, Models, collect_conditions, correct_ranges
 from railfix.pipeline.filter_result import AlongTrack, FilterState
-from railfix.pipeline.frequency_stage import combine_frequencies
 from railfix.pipeline.interference_stage import Interference, PositionEpochs, judge_interference, with_statuses
 from railfix.pipeline.level_stage import compute_araim
-from railfix.pipeline.received import Received, known_from_start, receive
+from railfix.pipeline.position_stage import Solution, position_stage
+from railfix.pipeline.range_stage import Models, collect_conditions, correct_ranges
+from railfix.pipeline.received import correction_source, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, Result
+from railfix.pipeline.screen_stage import screen_antennas, screen_pairs
 from railfix.pipeline.sensed_motion import LineFeatures
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
-from railfix.pipeline.solution import Solution, solve
 from railfix.pipeline.state import AntennaState, State
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.error_model import condition_differences
 from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
@@ -59,34 +57,13 @@ from railfix.screens import (
     PairScreen,
     PositionScreen,
     Screen,
+    Screened,
     ScreenSetup,
     in_order,
 )
 from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScreenedChunk:
-    """Corrected ranges of a chunk after the screens, and what later stages take from them."""
-
-    corrected: CorrectedRanges  #: Epochs of all antennas.
-    ranges: Mapping[str, CorrectedRanges]  #: Of each antenna, with the verdicts of its screens.
-    rows: Mapping[str, slice]  #: Epochs of each antenna among those of all.
-    pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
-    sensors: SensorSamples | None  #: Of the sensors on board since the chunk before.
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class SolvedChunk:
-    """Single epochs of a chunk, and what the filter along the track takes from them."""
-
-    screened: ScreenedChunk
-    results: Mapping[str, AntennaResult]
-    ranges: CorrectedRanges  #: After all screens and exclusions, epochs of all antennas.
-    off_map: Masks  #: The train is away from the line, shape (T,).
 
 
 class EpochProcessor:
@@ -250,10 +227,10 @@ class EpochProcessor:
         SettingsError
             As the class.
         """
-        screened, state = self.screen(
+        chunk, state = self.screen(
             observations, state, navigation=navigation, messages=messages, sensors=sensors, base=base
         )
-        return self.along_track(*self.single_epochs(screened, state))
+        return self.along_track(*self.position(chunk, state))
 
     def screen(
         self,
@@ -264,7 +241,7 @@ class EpochProcessor:
         messages: SbasMessages | None = None,
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
-    ) -> tuple[ScreenedChunk, State]:
+    ) -> tuple[Chunk, State]:
         """Return the ranges of one chunk after the screens: the first part of `process`; parameters are the same.
 
         Each part uses and replaces its own members of the state, so that the parts of successive chunks can be computed
@@ -286,32 +263,41 @@ class EpochProcessor:
             base_state = self._base.add_observations(base, received, state.base, began)
             received = base_state.beside(received)
         names, (obs, parts) = tuple(observations), stack_observations(list(observations.values()))
-        antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
-        channels = self._channels.of(obs, received.navigation)
-        corrected = correct_ranges(obs, channels, self.config, received, antennas, error_model=self._error_model)
-        ranges, own_states = self._screen_antennas(names, antennas, corrected, received, state)
-        pair = self._pair(ranges)
-        ranges = judge_pairs(self._of_pairs, pair, ranges)
-        screened = ScreenedChunk(
-            corrected=with_screens(corrected, ranges), ranges=ranges, rows=dict(zip(names, parts, strict=True)),
-            pair=pair, sensors=sensors,
+        antennas, rows = (
+            AntennaRows(tuple(self.indices[name] for name in names), parts),
+            dict(zip(names, parts, strict=True)),
+        )
+        channels, source = self._channels.of(obs, received.navigation), correction_source(received, self.config)
+        corrected, near = correct_ranges(obs, channels, self.config, source, antennas, error_model=self._error_model)
+        own_states = [state.antennas.get(name) or AntennaState() for name in names]
+        screening, own_states = screen_antennas(
+            corrected, antennas, self._of_observations, self.setup, self.config, received.ionosphere_sigma_m, own_states
+        )
+        pair = self._pair(obs.time, near.arc_m, rows)
+        screening = screen_pairs(screening, rows, self._of_pairs, pair)
+        headers = {name: part.header for name, part in observations.items()}
+        chunk = Chunk(
+            corrected=screening.corrected, rows=rows, screens=screening.screens, combined=screening.combined,
+            slips=screening.slips, pair=pair, sensors=sensors,
             notes=(
                 *missing_notes(received, self.config, corrected.second), *received.notes, *self._lacking,
-                *self._curve_notes(observations),
-                *(self._support.notes(corrected.time) if self._support is not None else ()),
+                *self._curve_notes(headers),
+                *(self._support.notes(obs.time) if self._support is not None else ()),
             ),
         )  # fmt: skip
         after = dict(state.antennas)
         for name, part, own in zip(names, observations.values(), own_states, strict=True):
             after[name] = copy_with(own, ended=part.time[-1] if len(part) else own.ended)
-        return screened, copy_with(state, received=received, antennas=after, base=base_state)
+        return chunk, copy_with(state, received=received, antennas=after, base=base_state)
 
-    def single_epochs(self, screened: ScreenedChunk, state: State) -> tuple[SolvedChunk, State]:
-        """Return the single epochs of one chunk: the second part of `process`, before the filter."""
-        names, parts = zip(*screened.rows.items(), strict=True)
+    def position(self, chunk: Chunk, state: State) -> tuple[Chunk, State]:
+        """Return the chunk with the positions of single epochs: the second part of `process`, before the filter."""
+        names, parts = zip(*chunk.rows.items(), strict=True)
         antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         own_states = [state.antennas.get(name) or AntennaState() for name in names]
-        corrected, solution, own_states = solve(screened.corrected, antennas, self.config, own_states)
+        corrected, solution, own_states = position_stage(
+            chunk.corrected, chunk.slips, antennas, self.config, own_states
+        )
         single = PositionEpochs(solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties)
         interference, signs = judge_interference(
             corrected, single, antennas, [own.interference for own in own_states], self.config.interference
@@ -319,15 +305,15 @@ class EpochProcessor:
         status = with_statuses(solution.status, [own.suspicion for own in interference if own is not None])
         own_states = [copy_with(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
         araim = compute_araim(
-            corrected, solution.arc_m, solution.noise_scale, solution.place.constrained.section, antennas,
+            corrected, solution.arc_m, solution.noise_scale, solution.fix.constrained.section, antennas,
             self._support, self.config,
         )  # fmt: skip
-        solution = copy_with(solution, status=status, araim=araim)
-        results = self._results(antennas, corrected, solution, interference, screened)
-        solved = SolvedChunk(screened=screened, results=results, ranges=corrected, off_map=solution.off_map)
-        return solved, copy_with(state, antennas={**state.antennas, **dict(zip(names, own_states, strict=True))})
+        solution, chunk = copy_with(solution, status=status, araim=araim), copy_with(chunk, corrected=corrected)
+        results = self._results(antennas, chunk, solution, interference)
+        after = {**state.antennas, **dict(zip(names, own_states, strict=True))}
+        return copy_with(chunk, results=results, off_map=solution.off_map), copy_with(state, antennas=after)
 
-    def along_track(self, solved: SolvedChunk, state: State) -> tuple[Result, State]:
+    def along_track(self, chunk: Chunk, state: State) -> tuple[Result, State]:
         """Return the results of one chunk with those of the filter, where it is on: the third part of `process`.
 
         Parameters
@@ -335,91 +321,66 @@ class EpochProcessor:
         state : State
             Of it only what the filter left after the chunk before is used, and replaced.
         """
-        fusion, filter_states, sensors = {}, dict(state.fusion), solved.screened.sensors
+        fusion, filter_states, sensors = {}, dict(state.fusion), chunk.sensors
         if sensors:
             for name, own in state.fusion.items():
-                if name not in solved.results:
+                if name not in chunk.results:
                     filter_states[name] = replace(own, sensors=waiting_samples(own.sensors, sensors))
         if self.config.filter == "track":
-            found = self._filter_antennas(solved, state)
+            found = self._filter_antennas(chunk, state)
             motions = {name: tracked.motion for name, (tracked, _) in found.items()}
-            spacing = filter_verdicts(self._of_positions, solved.screened.pair, motions)
+            spacing = filter_verdicts(self._of_positions, chunk.pair, motions)
             held_s, limits = self.config.antenna_spacing.filter_held_s, self.config.sensors.balise
             for name, (tracked, own) in found.items():
                 tracked, own = apply_spacing_verdict(tracked, spacing.get(name), own, held_s)
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
-        result = Result(antennas=apply_wheel_sign(solved.results, fusion), notes=solved.screened.notes, fusion=fusion)
+        result = Result(antennas=apply_wheel_sign(chunk.results, fusion), notes=chunk.notes, fusion=fusion)
         return result, copy_with(state, fusion=filter_states)
 
-    def _screen_antennas(
-        self, names: Sequence[str], antennas: AntennaRows, corrected: CorrectedRanges, received: Received, state: State
-    ) -> tuple[dict[str, CorrectedRanges], list[AntennaState]]:
-        """Return the ranges of each antenna after the screens that judge one antenna alone, and its new state."""
-        ranges, after = {}, []
-        for name, rows in zip(names, antennas.parts, strict=True):
-            before = state.antennas.get(name) or AntennaState()
-            own, states = take_epochs(corrected, rows), dict(before.screens)
-            for screen, limits in self._of_observations:
-                verdicts, screen_state = screen.judge(own, limits, self.setup, states.get(screen.name))
-                own = own.apply(verdicts)
-                if screen_state is not None:
-                    states[screen.name] = screen_state
-            own, two = combine_frequencies(own, self.config, received.ionosphere_sigma_m, before.two_frequencies)
-            carrier = before.carrier
-            if self.config.carrier != "off":
-                own, carrier = with_slips(own, self.config, carrier or CarrierState())
-                if self.config.carrier == "smoothed":
-                    own, carrier = smooth_ranges(own, self.config, carrier)
-            ranges[name] = own
-            after.append(copy_with(before, screens=states, carrier=carrier, two_frequencies=two))
-        return ranges, after
-
     def _results(
-        self,
-        antennas: AntennaRows,
-        corrected: CorrectedRanges,
-        solution: Solution,
-        interference: Sequence[Interference | None],
-        screened: ScreenedChunk,
+        self, antennas: AntennaRows, chunk: Chunk, solution: Solution, interference: Sequence[Interference | None]
     ) -> dict[str, AntennaResult]:
         """Return the results of single epochs by antenna, after the screens of the published positions."""
         chainage = antennas.chainage_at(solution.arc_m)
-        published = {name: chainage[rows] for name, rows in screened.rows.items()}
-        screens = {name: dict(own.screens) for name, own in screened.ranges.items()}
+        published = {name: chainage[rows] for name, rows in chunk.rows.items()}
+        judged: dict[str, dict[str, Screened]] = {name: {} for name in chunk.rows}
         status = solution.status.copy()
-        for name, verdicts in position_verdicts(self._of_positions, screened.pair, published).items():
-            rows = screened.rows[name]
+        for name, verdicts in position_verdicts(self._of_positions, chunk.pair, published).items():
+            rows = chunk.rows[name]
             for verdict in verdicts:
                 doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
                 status[rows] = np.where(doubtful, verdict.status, status[rows])
-                screens[name][verdict.name] = verdict.screened
-        results = antenna_results(corrected, antennas, copy_with(solution, status=status), chainage, self.config)
+                judged[name][verdict.name] = verdict.screened
+        results = antenna_results(chunk, antennas, copy_with(solution, status=status), chainage, self.config)
         return {
-            name: copy_with(take_epochs(results, rows), screens=screens[name], interference=own)
-            for (name, rows), own in zip(screened.rows.items(), interference, strict=True)
-        }
+            name: copy_with(
+                take_epochs(results, rows), interference=own,
+                screens={**{key: take_epochs(each, rows) for key, each in chunk.screens.items()}, **judged[name]},
+            )
+            for (name, rows), own in zip(chunk.rows.items(), interference, strict=True)
+        }  # fmt: skip
 
-    def _filter_antennas(self, solved: SolvedChunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
+    def _filter_antennas(self, chunk: Chunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
         """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
 
         def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
-            rows, sensors = solved.screened.rows[name], solved.screened.sensors
+            rows, sensors = chunk.rows[name], chunk.sensors
             return along_track(
-                take_epochs(solved.ranges, rows),
-                filter_inputs(solved.results[name], solved.off_map[rows], self.config.map_offset),
+                take_epochs(chunk.corrected, rows), None if chunk.slips is None else take_epochs(chunk.slips, rows),
+                filter_inputs(chunk.results[name], chunk.off_map[rows], self.config.map_offset),
                 self.trajectories[name], self.config, state.fusion.get(name) or FilterState(),
                 samples=sensors, references=self._line_references(name, sensors),
             )  # fmt: skip
 
-        over_antennas = self._threads.map if len(solved.results) > 1 else map
-        return dict(zip(solved.results, over_antennas(one_antenna, solved.results), strict=True))
+        over_antennas = self._threads.map if len(chunk.results) > 1 else map
+        return dict(zip(chunk.results, over_antennas(one_antenna, chunk.results), strict=True))
 
-    def _curve_notes(self, observations: Mapping[str, Observations]) -> Iterator[str]:
+    def _curve_notes(self, headers: Mapping[str, ObservationHeader]) -> Iterator[str]:
         """Yield notes on a C/N0 curve of another antenna or receiver."""
         if (curve := self.setup.cn0_curve) is not None and "cn0" in self.config.screens:
-            for name, own in observations.items():
-                yield from (f"{name}: {note}" for note in curve.notes_for(own.header))
+            for name, header in headers.items():
+                yield from (f"{name}: {note}" for note in curve.notes_for(header))
 
     def _line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
         """Return the ground units, balises, and the features of the line: made when there is an inertial unit."""
@@ -428,13 +389,13 @@ class EpochProcessor:
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name])
         return LineReferences(features=self._features.get(name), units=self.units, balises=self.balises)
 
-    def _pair(self, ranges: Mapping[str, CorrectedRanges]) -> PairedEpochs | None:
+    def _pair(self, time: Datetimes, near_arc_m: Floats, rows: Mapping[str, slice]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""
-        if len(ranges) < 2 or not self.setup.spacing_known:
+        if len(rows) < 2 or not self.setup.spacing_known:
             return None
-        front, rear = ranges["front"], ranges["rear"]
+        front, rear = rows["front"], rows["rear"]
         return pair_antennas(
-            front, rear, front.anchor_arc_m, self.trajectories["front"], self.trajectories["rear"],
+            time[front], time[rear], near_arc_m[front], self.trajectories["front"], self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )  # fmt: skip
 

@@ -14,9 +14,16 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.orbits.prepared_records import VALIDITY_S, validity_s
 from railfix.gnss.plausible_records import plausible_navigation
 from railfix.pipeline.config import Config
-from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR
 from railfix.ranges.base_station import BaseErrors
 from railfix.ranges.sbas import DfmcService, SbasCorrections, SbasMessages, SbasState
+from railfix.ranges.sources import (
+    BaseStationSource,
+    BroadcastSource,
+    CorrectionSource,
+    DfmcSource,
+    SbasSource,
+    choose_ionosphere,
+)
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
 
@@ -63,6 +70,24 @@ class Received:
     ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()  #: Data that were asked for, and the data used in their place, one sentence each.
     base: BaseErrors | None = None  #: Range errors that a base station has measured.
+
+
+def correction_source(received: Received, config: Config) -> CorrectionSource:
+    """Return the source of corrections of what has been received."""
+    models = BroadcastSource(
+        navigation=received.navigation, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
+        troposphere=config.troposphere, nominal=config.nominal,
+    )  # fmt: skip
+    source: CorrectionSource = models
+    if isinstance(received.sbas, DfmcService):
+        source = DfmcSource(models=models, service=received.sbas)
+    elif received.sbas is not None:
+        source = SbasSource(navigation=received.navigation, corrections=received.sbas)
+    if received.base is None:
+        return source
+    return BaseStationSource(
+        other=source, errors=received.base, limits=config.base, floor_sigma_m=config.noise.floor_sigma_m
+    )
 
 
 def known_from_start(
@@ -198,15 +223,5 @@ def _with_ionosphere(received: Received, config: Config) -> Received:
         asked = f"ionosphere: {config.ionosphere}, troposphere: {config.troposphere}"
         note = f"{asked} asked for, those of SBAS used in their place"
         return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=(note,))
-    if config.ionosphere == "off":
-        return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=())
-    known = received.navigation.klobuchar
-    if "G" in known or "J" in known:  # those of BeiDou are made for a model of its own
-        notes = () if "G" in known else ("ionosphere: klobuchar asked for, coefficients broadcast by QZSS used",)
-        return replace(received, klobuchar=known.get("G", known.get("J")), ionosphere_sigma_m=0.0, notes=notes)
-    sigma = config.nominal.typical_ionosphere_sigma_m
-    note = (
-        "ionosphere: klobuchar asked for, no coefficients of GPS or QZSS received: typical ones used (GPS, "
-        f"2004-01-01), {sigma:g} m added to the sigma of the vertical delay"
-    )
-    return replace(received, klobuchar=TYPICAL_KLOBUCHAR, ionosphere_sigma_m=sigma, notes=(note,))
+    coefficients, sigma, notes = choose_ionosphere(received.navigation, config.ionosphere, config.nominal)
+    return replace(received, klobuchar=coefficients, ionosphere_sigma_m=sigma, notes=notes)

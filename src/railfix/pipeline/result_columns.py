@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Floats
 from railfix.core.reasons import Status
 from railfix.integrity.interference import Suspicion, cause_text
+from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import innovations
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.solve import PointStatus
-from railfix.positioning.two_frequencies import Combined, SecondCodes
+from railfix.positioning.two_frequencies import Combined
+from railfix.ranges.second_codes import SecondCodes
 from railfix.screens import SCREENS, ScreenColumn
 
 Source = TypeVar("Source")

@@ -12,16 +12,17 @@ from railfix.core.epoch_rows import OnDemand
 from railfix.core.reasons import Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.gnss.orbits import SatelliteStates
+from railfix.integrity.fault_exclusion import RaimResult
 from railfix.integrity.protection.araim import AraimResult
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.level_stage import ProtectionResult
-from railfix.pipeline.solve import RaimResult
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import Constrained, SinglePoint
 from railfix.positioning.section_search import Section
-from railfix.positioning.two_frequencies import Combined, SecondCodes
+from railfix.positioning.two_frequencies import Combined
+from railfix.ranges.second_codes import SecondCodes
 from railfix.screens import Screened
 
 
@@ -61,7 +62,7 @@ class AntennaResult(NotebookTable, OnDemand):
     #: Satellites used; satellites with a code that were not used; shape (T,).
     n_used: Integers
     n_rejected: Integers
-    #: `railfix.pipeline.solve.PointStatus` of the conventional position, which is kept as it is; shape (T,).
+    #: `railfix.integrity.PointStatus` of the conventional position, which is kept as it is; shape (T,).
     conventional_status: Codes
     conventional_ecef_m: Floats  #: 3-D single point from the same ranges; shape (T, 3).
     #: Nearest point of the trajectory to it, and how far that is; shape (T,).

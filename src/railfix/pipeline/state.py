@@ -16,7 +16,7 @@ from railfix.pipeline.interference_stage import InterferenceState
 from railfix.pipeline.off_map import OffMapState
 from railfix.pipeline.received import Received
 from railfix.positioning.map_offset import MapOffsetState
-from railfix.positioning.noise_scale import LastingErrorState, NoiseState, OffsetState
+from railfix.positioning.receiver_noise import LastingErrorState, NoiseState, OffsetState
 from railfix.positioning.two_frequencies import TwoFrequencyState
 
 

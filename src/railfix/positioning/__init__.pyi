@@ -1,19 +1,65 @@
 # The names of `railfix.positioning`, imported at their first use (lazy-loader).
 
-from .normal_equations import Constrained, ConstrainedLimits, SinglePoint, SinglePointLimits
-from .section_search import SearchIndex, Section, SectionLimits
-from .stages import find_section, point_position, position_on_line, weighted_ranges
+from .antenna_rows import AntennaRows
+from .approximate import ApproximatePosition, approximate_position
+from .inter_system import PointPositions, TieLimits, tie_constellations
+from .line_fix import FixLimits, LineFix, fix_on_line
+from .normal_equations import (
+    Constrained,
+    ConstrainedLimits,
+    SinglePoint,
+    SinglePointLimits,
+    point_position,
+    position_on_line,
+)
+from .range_arrays import ClockTies, Ranges, weighted_ranges, without
+from .receiver_noise import (
+    ClockOffsetLimits,
+    NoiseScaleLimits,
+    OffsetState,
+    RobustFit,
+    RobustFitLimits,
+    noise_scale,
+    robust_fit,
+    robust_on_line,
+    tie_clocks,
+)
+from .search_index import SearchIndex
+from .section_search import Section, SectionLimits, find_section
+from .windows import Windows
 
 __all__ = [
+    "AntennaRows",
+    "ApproximatePosition",
+    "ClockOffsetLimits",
+    "ClockTies",
     "Constrained",
     "ConstrainedLimits",
+    "FixLimits",
+    "LineFix",
+    "NoiseScaleLimits",
+    "OffsetState",
+    "PointPositions",
+    "Ranges",
+    "RobustFit",
+    "RobustFitLimits",
     "SearchIndex",
     "Section",
     "SectionLimits",
     "SinglePoint",
     "SinglePointLimits",
+    "TieLimits",
+    "Windows",
+    "approximate_position",
     "find_section",
+    "fix_on_line",
+    "noise_scale",
     "point_position",
     "position_on_line",
+    "robust_fit",
+    "robust_on_line",
+    "tie_clocks",
+    "tie_constellations",
     "weighted_ranges",
+    "without",
 ]

@@ -8,17 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
 from itertools import accumulate, pairwise
-from typing import Any, NamedTuple, TypeVar
-
-import numpy as np
+from typing import Any, TypeVar
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.epoch_rows import EVERY, join_epochs
 from railfix.gnss.observations import Observations, stack_parts
-from railfix.positioning.section_search import SearchIndex
-from railfix.track.trajectory import between_points
+from railfix.positioning.search_index import SearchIndex
+from railfix.track.trajectory import Trajectory
 
 Value = TypeVar("Value")
 State = TypeVar("State")
@@ -32,9 +29,11 @@ class AntennaRows:
     parts: tuple[slice, ...]  #: Rows of each antenna, one after the other; `EVERY` of a single one.
 
     @classmethod
-    def of(cls, index: SearchIndex) -> AntennaRows:
-        """Return the rows of one antenna."""
-        return cls((index,), (EVERY,))
+    def on(cls, line: Trajectory | SearchIndex | AntennaRows) -> AntennaRows:
+        """Return the rows of one antenna on a line; those of several as they are."""
+        if isinstance(line, AntennaRows):
+            return line
+        return cls((line if isinstance(line, SearchIndex) else SearchIndex(line),), (EVERY,))
 
     @property
     def sigma_plan_m(self) -> float:
@@ -45,6 +44,11 @@ class AntennaRows:
     def sigma_height_m(self) -> float:
         """Standard deviation of the heights of the map [m]."""
         return self.indices[0].trajectory.sigma_height_m
+
+    @property
+    def lines(self) -> list[tuple[Trajectory, slice]]:
+        """The trajectory of each antenna, and its rows."""
+        return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
         """Return what a function gives for each antenna: of its search index, rows, and one item of each list."""
@@ -72,65 +76,25 @@ class AntennaRows:
             if len(own):
                 yield index, own
 
-    @cached_property
-    def _first(self) -> Indices | int:
-        """Place of the first point of each epoch's line among those of all lines."""
-        if len(self.parts) == 1:
-            return 0
-        return np.repeat(_lines(self.indices).first, [part.stop - part.start for part in self.parts])
-
     def at_arc(self, arc_m: Floats) -> Floats:
         """Return the points of the lines at arc lengths, shape (T, 3) [m]; NaN for NaN."""
-        return self._interpolate(arc_m, _lines(self.indices).ecef_m)
+        return self.each(lambda index, rows: index.trajectory.at_arc(arc_m[rows]))
 
     def chainage_at(self, arc_m: Floats) -> Floats:
         """Return chainages at arc lengths, shape (T,) [m]; NaN for NaN."""
-        return self._interpolate(arc_m, _lines(self.indices).chainage_m)
+        return self.each(lambda index, rows: index.trajectory.chainage_at(arc_m[rows]))
 
     def segment_at(self, arc_m: Floats) -> Indices:
         """Return the section of each arc length on its line, shape (T,), as `Trajectory.segment_at`."""
-        section = np.empty(len(arc_m), dtype=np.intp)
-        for index, rows in zip(self.indices, self.parts, strict=True):
-            of_line = index.trajectory.arc_m
-            found = of_line.searchsorted(arc_m[rows], side="right") - 1
-            section[rows] = np.minimum(np.maximum(found, 0), len(of_line) - 2)
-        return section
+        return self.each(lambda index, rows: index.trajectory.segment_at(arc_m[rows])[0])
 
     def get_axes(self, section: Indices) -> Floats:
         """Return the unit vectors along, across and up at sections of the lines, shape (T, 3, 3)."""
-        return np.asarray(_lines(self.indices).axes[section + self._first])
-
-    def _interpolate(self, arc_m: Floats, values: Floats) -> Floats:
-        """Interpolate values of the points of all lines at arc lengths."""
-        lines = _lines(self.indices)
-        return between_points(arc_m, lines.arc_m, lines.length_m, values, self.segment_at(arc_m) + self._first)
+        return self.each(lambda index, rows: index.trajectory.get_axes(section[rows]))
 
 
-class _Lines(NamedTuple):
-    """Points of several lines, one line after the other, and the sections that begin there; none does at a last one."""
-
-    first: Indices  #: First point of each line.
-    #: Of V points.
-    arc_m: Floats
-    ecef_m: Floats
-    chainage_m: Floats
-    #: Of the sections, shapes (V,), (V, 3, 3): along, across, up.
-    length_m: Floats
-    axes: Floats
-
-
-@lru_cache(maxsize=4)
-def _lines(indices: tuple[SearchIndex, ...]) -> _Lines:
-    lines = [index.trajectory for index in indices]
-    points = np.cumsum([0, *map(len, lines)])
-    length, axes = np.full(points[-1], np.nan), np.full((points[-1], 3, 3), np.nan)
-    for line, first in zip(lines, points[:-1].tolist(), strict=True):
-        own = slice(first, first + len(line) - 1)
-        length[own], axes[own] = line.length_m, line.get_axes(np.arange(len(line) - 1))
-    arc, ecef, chainage = (
-        np.concatenate([getattr(line, n) for line in lines]) for n in ("arc_m", "ecef_m", "chainage_m")
-    )
-    return _Lines(points[:-1].astype(np.intp), arc, ecef, chainage, length, axes)
+#: What a stage takes as the line: the trajectory of one antenna, its search structures, or epochs of several.
+Line = Trajectory | SearchIndex | AntennaRows
 
 
 def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:

@@ -27,7 +27,7 @@ from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.gnss.orbits import satellite_states
 from railfix.ranges.atmosphere import saastamoinen_delay_m
-from railfix.ranges.corrected import PLAUSIBLE_CODE_M, channel_order, first_available
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_available
 
 _STEP_S: Final = 1.0  #: Step over which clocks and elevations are differenced [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.

@@ -15,8 +15,10 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Integers, Masks, kernel_array
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.geodesy import geodetic_from_ecef
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint, normal_equations
+from railfix.positioning.normal_equations import SinglePoint, normal_equations
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
 #: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].
@@ -240,6 +242,8 @@ class GrossErrors(NamedTuple):
     unsure_arc_m: Floats
 
 
+#: Ellipsoidal heights of trains, and more [m]: a position beyond them says nothing.
+_HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Root of the sum of squared raw residuals up to which an epoch is not examined; distance of its position from the
 #: line from which on it is [m].
 _QUIET_M: Final = 30.0
@@ -255,16 +259,23 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     """
     gross, unsure = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     located = np.isfinite(point.ecef_m[:, 0])
-    suspect = ~located | ~(np.sqrt(np.nansum(point.residual_m**2, axis=1)) < _QUIET_M)
+    residual = np.where(ranges.weight > 0, point.residual_m, 0.0)
+    suspect = ~located | ~(np.sqrt((residual**2).sum(axis=1)) < _QUIET_M)
     for index, rows in antennas.split(np.flatnonzero(located)):
         suspect[rows] |= np.asarray(index.tree.query(point.ecef_m[rows])[0]) > _BESIDE_M
-    suspect &= _freedom(ranges, 1) > 0
+    # ranges that agree in space have no gross error, wherever the map is
+    largest = np.abs(residual).max(axis=1, initial=0.0)
+    agree = located & (_freedom(ranges, 3) >= _LEFT_IN_SPACE) & (largest < 0.5 * GROSS_M)
+    suspect &= ~agree & (_freedom(ranges, 1) > 0)
+    height = geodetic_from_ecef(np.where(located[:, None], point.ecef_m, [6.4e6, 0.0, 0.0]))[2]
+    nowhere = ~located | (height < _HEIGHTS_M[0]) | (height > _HEIGHTS_M[1])
     for index, rows in antennas.split(np.flatnonzero(suspect)):
         part = ranges.take(rows)
         scan = scan_line(part, index.trajectory)
         sure = scan.agreed & scan.clear
         gross[rows[sure]] = scan.gross[sure]
-        unsure[rows[~sure]] = scan.arc_m[~sure]
+        open_arc = ~sure & (scan.agreed | nowhere[rows])
+        unsure[rows[open_arc]] = scan.arc_m[open_arc]
         left = np.flatnonzero(~scan.agreed)
         if len(left):
             found = gross_in_space(part.take(left), np.repeat(index.middle_ecef_m[None], len(left), axis=0))

@@ -11,107 +11,20 @@ The single point is the reference method of P1 section 5.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from railfix import kernels
-from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, Strings, kernel_array
-from railfix.core.constants import CLOCK_GROUP
+from railfix.core.arrays import Floats, Indices, Integers, RowArrays, kernel_array
+from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
-
-UNTIED_M: Final = 1e6  #: Sigma of an offset between clocks of which nothing is known [m].
-
-
-@dataclass(frozen=True, kw_only=True)
-class ClockTies(RowArrays):
-    """Known offsets between the receiver clocks of the constellations."""
-
-    #: Receiver clock of each group less a clock common to all; any finite value where unknown; shape (T, G).
-    offset_m: Floats
-    sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where nothing is known; shape (T, G).
-
-
-class RangeArrays(NamedTuple):
-    """Arrays of `Ranges` as `kernel_array`: T epochs, M channels, G groups."""
-
-    sat_ecef_m: Floats  # (T, M, 3)
-    code_m: Floats  # (T, M)
-    weight: Floats  # (T, M)
-    starts: Indices  # (G,) first channel of each group
-    offset_m: Floats  # (T, G), of `ClockTies`; (0, G) without ties
-    sigma_m: Floats  # likewise
-
-    @property
-    def tied(self) -> bool:
-        """Whether anything is known of the offsets between the clocks."""
-        return len(self.offset_m) == len(self.code_m)
-
-    @property
-    def clock(self) -> Indices:
-        """Group of each channel."""
-        return self.starts.searchsorted(np.arange(self.code_m.shape[1]), side="right") - 1
-
-    def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
-        """Return the arrays of some epochs."""
-        ties = (self.offset_m[epochs], self.sigma_m[epochs]) if self.tied else (self.offset_m, self.sigma_m)
-        arrays = (self.sat_ecef_m[epochs], self.code_m[epochs], self.weight[epochs], *ties)
-        sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
-        return RangeArrays(sat_ecef_m, code_m, weight, self.starts, *known)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Ranges:
-    """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels."""
-
-    sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; any finite value where the weight is 0; shape (T, M, 3).
-    code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
-    weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
-    groups: tuple[slice, ...]  #: Channels that share one receiver clock stand side by side; one slice a clock.
-    ties: ClockTies | None = None  #: Known offsets between these clocks; None: none.
-
-    def __len__(self) -> int:
-        return len(self.code_m)
-
-    def take(self, epochs: Masks | Indices) -> Ranges:
-        """Return the ranges of some epochs, by mask or index."""
-        return Ranges(
-            sat_ecef_m=self.sat_ecef_m[epochs], code_m=self.code_m[epochs], weight=self.weight[epochs],
-            groups=self.groups, ties=None if self.ties is None else self.ties.take(epochs),
-        )  # fmt: skip
-
-    @cached_property
-    def arrays(self) -> RangeArrays:
-        """The same as plain arrays."""
-        ties = np.empty((2, 0, len(self.groups))) if self.ties is None else (self.ties.offset_m, self.ties.sigma_m)
-        arrays = (self.sat_ecef_m, self.code_m, self.weight, *ties)
-        sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
-        return RangeArrays(sat_ecef_m, code_m, weight, self.starts, *known)
-
-    @cached_property
-    def n_used(self) -> Integers:
-        """Channels with weight, shape (T,)."""
-        return np.asarray((self.weight > 0).sum(axis=1), dtype=np.int64)
-
-    @cached_property
-    def starts(self) -> Indices:
-        """First channel of each group."""
-        return np.array([group.start for group in self.groups], dtype=np.intp)
-
-    @cached_property
-    def n_clocks(self) -> Integers:
-        """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
-        seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
-        if self.ties is None:
-            return np.asarray(seen.sum(axis=1), dtype=np.int64)
-        tied = self.ties.sigma_m < UNTIED_M
-        return np.asarray((seen & ~tied).sum(axis=1) + (seen & tied).any(axis=1), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,15 +40,6 @@ class NormalEquations:
     design: Floats  #: Decrease of `residual_m` by a step from the place, per metre of each axis; shape (T, 3, M).
 
 
-def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
-    """Return slices of channels that share a receiver clock; ValueError where they are not side by side."""
-    clocks = [CLOCK_GROUP[str(letter)] for letter in system]
-    starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
-    if len({clocks[i] for i in starts}) != len(starts):
-        raise ValueError(f"channels of one clock must stand side by side, got {clocks}")
-    return tuple(slice(a, b) for a, b in pairwise([*starts, len(clocks)]))
-
-
 def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     """Return the normal equations of `ranges` linearised at one place an epoch, shape (T, 3) [m]."""
     system, means, rows, seen = kernels.ranges.reduced_equations(ranges.arrays, kernel_array(place_ecef_m))
@@ -146,7 +50,7 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     )  # fmt: skip
 
 
-def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
+def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
     """Return the weighted sum of squared residuals at places (n, 3) [m], the clocks eliminated, shape (n,):
     `normal_equations(...).wsse` without the derivatives.
 
@@ -182,22 +86,27 @@ class Constrained:
     iterations: Integers  #: Shape (T,).
 
 
-def constrained_position(
-    ranges: Ranges, trajectory: Trajectory, vertex: Indices, *, limits: ConstrainedLimits | None = None
+def position_on_line(
+    ranges: Ranges, line: Line, vertex: Indices, *, limits: ConstrainedLimits | None = None
 ) -> Constrained:
-    """Compute positions along the line of all epochs at once, each started at a point of the trajectory (-1: none).
+    """Compute the distance along the line by constrained least squares (P1 2.2(3)): ``R = r_i + d e_i``.
 
-    Newton steps inside a section (P1 2.2(3)); a step that leaves it stops at its end and goes on in the neighbouring
-    one. Where both neighbours of a point send the step back, the point is the answer. At an open end the position is
-    clamped and `overshoot_m` is how far beyond it the ranges pull.
+    Newton steps in d with the receiver clocks eliminated, inside a section; a step that leaves it stops at its end and
+    goes on in the neighbouring one. Where both neighbours of a point send the step back, the point is the answer. At an
+    open end the position is clamped and `overshoot_m` is how far beyond it the ranges pull.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Of `weighted_ranges`.
+    line : Trajectory, SearchIndex or AntennaRows
+        Trajectory of the antenna.
+    vertex : ndarray of int, shape (T,)
+        Point to start from (`Section.vertex` of `find_section`); -1 for no position.
+    limits : ConstrainedLimits, optional
     """
-    return constrained_on_lines(ranges, ((trajectory, slice(None)),), vertex, limits=limits or ConstrainedLimits())
-
-
-def constrained_on_lines(
-    ranges: Ranges, lines: Sequence[tuple[Trajectory, slice]], vertex: Indices, *, limits: ConstrainedLimits
-) -> Constrained:
-    """Compute the same of epochs on several lines; each comes with its epochs, one line's after the other's."""
+    limits = limits or ConstrainedLimits()
+    lines = ((line, EVERY),) if isinstance(line, Trajectory) else AntennaRows.on(line).lines
     enough = ranges.n_used - ranges.n_clocks >= 1
     parts = []
     for trajectory, rows in lines:
@@ -282,11 +191,21 @@ class SinglePoint(RowArrays):
     residual_m: Floats  #: Shape (T, M).
 
 
-def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLimits | None = None) -> SinglePoint:
-    """Compute single-point positions of all epochs at once, from starts (T, 3) [m] within a few thousand kilometres."""
+def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePointLimits | None = None) -> SinglePoint:
+    """Compute 3-D positions without the map, a clock per constellation: the conventional method (P1 5).
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Of `weighted_ranges`.
+    near_ecef_m : array_like, shape (3,) or (T, 3) [m]
+        Where the iteration starts, good to some thousand kilometres.
+    limits : SinglePointLimits, optional
+    """
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterate_points(
-        ranges.arrays, kernel_array(start_ecef_m), np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        ranges.arrays, kernel_array(np.broadcast_to(near_ecef_m, (len(ranges), 3))),
+        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
         limits.tolerance_m, limits.max_iterations,
     )  # fmt: skip
     return SinglePoint(

@@ -1,30 +1,30 @@
 """Section search: the point of the trajectory that fits the ranges best.
 
 P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares is that
-of the residuals after each constellation's clock is eliminated. `search` returns the point with the least such ``q`` in
-a time that does not grow with the line. Where a 3-D position exists, ``q`` grows from it as a quadratic form, so
-stretches outside a ball are dropped. Where it does not, coarse to fine: the root of ``q`` changes at most by the root
-of the summed weights times the distance moved. Both are exact.
+of the residuals after each constellation's clock is eliminated. `find_section` returns the point with the least such
+``q`` in a time that does not grow with the line. Where a 3-D position exists, ``q`` grows from it as a quadratic form,
+so stretches outside a ball are dropped. Where it does not, coarse to fine: the root of ``q`` changes at most by the
+root of the summed weights times the distance moved. Both are exact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.constants import FAN_OUT, ROTATION_GRADIENT
 from railfix.core.settings import Settings
-from railfix.positioning.normal_equations import Ranges, SinglePoint, fit, normal_equations
-from railfix.track.trajectory import Trajectory
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equations
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.search_index import SearchIndex
 
 #: Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of one
 #: range can hide that much.
@@ -67,55 +67,6 @@ class Section:
     evaluations: Integers  #: Points whose q was computed, shape (T,).
 
 
-class SearchIndex:
-    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length."""
-
-    def __init__(self, trajectory: Trajectory) -> None:
-        self.trajectory = trajectory
-        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of its points, shape (3,).
-        self._clear_m = np.full(len(trajectory.length_m), np.nan)
-        points = trajectory.ecef_m
-        self.tree = cKDTree(points)  #: Of its points.
-        #: Stretches of each level: middle points, and the radii [m] that cover the rest.
-        self.levels: list[tuple[Indices, Floats]] = []
-        count, size = len(points), 1
-        while True:
-            starts = np.arange(0, count, size)
-            middle = np.minimum(starts + size // 2, count - 1)
-            away = np.linalg.norm(points - points[np.repeat(middle, size)[:count]], axis=1)
-            self.levels.append((middle, np.maximum.reduceat(away, starts)))
-            if len(starts) <= FAN_OUT:
-                break
-            size *= FAN_OUT
-
-    @cached_property
-    def stretches(self) -> tuple[Indices, Floats, Indices]:
-        """Middle points and radii [m] of the stretches of all levels, shape (S,), and the first of each level."""
-        middles, radii = zip(*self.levels, strict=True)
-        return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
-
-    @cached_property
-    def arc_of_points_m(self) -> Floats:
-        """Arc length of each point, the least of those that a line has there, shape (V,) [m]."""
-        return self.trajectory.nearest(self.trajectory.ecef_m)[0]
-
-    def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
-
-        Along and across, without the height. The same for all positions on a section, and computed once for each; at
-        most `CLEAR_M`.
-        """
-        line = self.trajectory
-        section = line.segment_at(arc_m)[0]
-        unknown = np.isnan(self._clear_m[section])
-        if unknown.any():
-            new = np.unique(section[unknown])
-            self._clear_m[new] = kernels.search.clear_of_sections(
-                line.ecef_m, line.tangent, line.across, line.length_m, self.stretches, new
-            )
-        return np.asarray(self._clear_m[section])
-
-
 class SectionCandidates(NamedTuple):
     """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points."""
 
@@ -130,18 +81,30 @@ class SectionCandidates(NamedTuple):
     matrix_of: Indices  #: Which of them belongs to each point, shape (p,).
 
 
-def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
-    """Return the point of the trajectory with the least q at each epoch, and the best other place.
+def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
+    """Return the point of the line that the ranges fit best, by between-satellite single differences (P1 2.2(2)).
 
-    `point`: 3-D position from the same ranges and weights; NaN where there is none.
+    With full covariances the single differences of the residuals ``v_i = P_i - |s_i - r|`` at a point r have the
+    weighted sum of squares ``q = sum_i w_i (v_i - mean)^2``, means over the satellites of a clock.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Of `weighted_ranges`.
+    line : Trajectory, SearchIndex or AntennaRows
+        Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
+    point : SinglePoint
+        3-D positions from the same ranges (`point_position`), NaN where there are none: they save time, and change
+        nothing.
+    limits : SectionLimits, optional
+        Of ambiguous sections (P1 3.2).
+
+    Returns
+    -------
+    Section
+        Vertex -1 where no range is redundant with the clocks.
     """
-    return search_lines(ranges, ((index, slice(None)),), point, limits=limits or SectionLimits())
-
-
-def search_lines(
-    ranges: Ranges, lines: Iterable[tuple[SearchIndex, slice]], point: SinglePoint, *, limits: SectionLimits
-) -> Section:
-    """Return the same of epochs on several lines; each comes with its epochs."""
+    limits, antennas = limits or SectionLimits(), AntennaRows.on(line)
     epochs = len(ranges)
     weight_norm = np.sqrt(ranges.weight.sum(axis=1))
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 1, 1)
@@ -149,7 +112,7 @@ def search_lines(
     q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
     evaluations = np.zeros(epochs, dtype=np.int64)
     every = np.arange(epochs)
-    for index, rows in lines:
+    for index, rows in zip(antennas.indices, antennas.parts, strict=True):
         own, trajectory = every[rows], index.trajectory
         candidates: list[SectionCandidates] = []
         radius = _ball(index, point, weight_norm, freedom, own, limits)
@@ -162,12 +125,12 @@ def search_lines(
             part, tried = _coarse_to_fine(ranges, index, weight_norm, freedom, limits, coarse)
             evaluations[coarse] += tried
             candidates.append(part)
-        line = (trajectory.arc_m, trajectory.tangent, trajectory.length_m)
+        sections = (trajectory.arc_m, trajectory.tangent, trajectory.length_m)
         for part in candidates:
             at = part.at
             evaluations[at] += part.points
             vertex[at], q[at], excess[at], other[at] = kernels.search.best_points(
-                part, freedom[at], line, limits.separation_m, trajectory.turn_m
+                part, freedom[at], sections, limits.separation_m, trajectory.turn_m
             )
     return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)
 
@@ -206,7 +169,7 @@ def _in_ball(
     if not np.all(count):
         raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
     if unsure.any():
-        q[unsure] = fit(ranges, index.trajectory.ecef_m[vertex[unsure]], np.repeat(epochs, count)[unsure])
+        q[unsure] = misfit(ranges, index.trajectory.ecef_m[vertex[unsure]], np.repeat(epochs, count)[unsure])
     matrix = np.ascontiguousarray(point.matrix)
     return SectionCandidates(epochs, count, vertex, q, half_gradient, matrix, epochs.repeat(count))
 
@@ -223,7 +186,7 @@ def _coarse_to_fine(
     q = np.empty(0)
     for level in reversed(range(len(index.levels))):
         middle, radius = index.levels[level]
-        q = fit(ranges, points[middle[node]], epoch)
+        q = misfit(ranges, points[middle[node]], epoch)
         np.minimum.at(upper, epoch, q)
         np.add.at(tried, epoch, 1)
         reach = upper + limits.reach * np.maximum(1.0, upper / freedom)

@@ -23,6 +23,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
 from railfix.positioning.windows import correlated_sums
+from railfix.ranges.second_codes import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.
 _FIRST_SAMPLES: Final = 2.0  #: Samples with the noise that the weights assume, which the noise scale begins with.
@@ -41,21 +42,6 @@ class TwoFrequencyLimits(Settings):
     delay_sigma_m: float = Field(default=0.2, gt=0)
     #: Sigmas beyond which a difference of the two codes weighs the range down.
     suspicion: float = Field(default=4.0, gt=0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SecondCodes:
-    """Second codes of satellites: T epochs by K channels of the first."""
-
-    code_m: Floats  #: Corrected by the models; NaN where there is none; shape (T, K).
-    noise_m: Floats  #: Standard deviation of noise and multipath that the weights assume, shape (T, K).
-    cn0_dbhz: Floats  #: Shape (T, K).
-    group_delay_m: Floats  #: That has been subtracted, shape (T, K).
-    #: Of a group delay that is not broadcast in full, beside `TwoFrequencyLimits.delay_sigma_m`; shape (T, K).
-    delay_sigma_m: Floats
-    ratio: Floats  #: Square of the first frequency over the second, shape (T, K).
-    pair: Integers  #: Number of satellite and signals among the names of pairs, shape (T, K).
-    column: Integers  #: Channel of the observations, shape (T, K).
 
 
 @dataclass(frozen=True, kw_only=True)

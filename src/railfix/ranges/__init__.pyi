@@ -1,11 +1,41 @@
 # The names of `railfix.ranges`, imported at their first use (lazy-loader).
 
-from .corrected import DEFAULT_SIGNALS, CodeNoise, CorrectedCodes, NominalErrors, corrected_ranges
+from .base_station import BaseErrors, BaseLimits
+from .channels import DEFAULT_SIGNALS, SECOND_SIGNALS, Channels, select_channels
+from .corrected import AntennaRanges, CorrectedRanges, SatelliteRanges, corrected_ranges, find_satellites
+from .range_sigma import CodeNoise, NominalErrors, code_sigma_m
+from .second_codes import SecondCodes
+from .sources import (
+    BaseStationSource,
+    BroadcastSource,
+    CorrectionSource,
+    DfmcSource,
+    SbasSource,
+    SourceDelays,
+    SourceSatellites,
+)
 
 __all__ = [
     "DEFAULT_SIGNALS",
+    "SECOND_SIGNALS",
+    "AntennaRanges",
+    "BaseErrors",
+    "BaseLimits",
+    "BaseStationSource",
+    "BroadcastSource",
+    "Channels",
     "CodeNoise",
-    "CorrectedCodes",
+    "CorrectedRanges",
+    "CorrectionSource",
+    "DfmcSource",
     "NominalErrors",
+    "SatelliteRanges",
+    "SbasSource",
+    "SecondCodes",
+    "SourceDelays",
+    "SourceSatellites",
+    "code_sigma_m",
     "corrected_ranges",
+    "find_satellites",
+    "select_channels",
 ]

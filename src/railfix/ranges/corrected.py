@@ -1,323 +1,237 @@
-"""Corrected pseudoranges of a log as plain arrays: the first stage by hand.
-
-The sum of the variances is that of DO-229D (J.2.2), without the airborne receiver's: ``sigma_flt^2 +
-sigma_UIRE^2 + sigma_tropo^2``. Multipath and receiver noise on a railway are added by the caller (P1 2.4).
-"""
+"""Satellite states and corrected pseudoranges (P1 2.2(2)): the first two stages of the positioning."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Literal
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
-from railfix.core.constants import CLOCK_GROUP, FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.epoch_rows import OnDemand
 from railfix.core.reasons import Reason
-from railfix.core.settings import Settings
-from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.observations import Observations, carrier_frequency_hz
-from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.ranges.atmosphere import (
-    Delays,
-    SeenFrom,
-    model_delays,
-    rtca_troposphere_m,
-    rtca_troposphere_sigma_m,
-    thin_shell_obliquity,
-)
-from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections
-from railfix.ranges.sbas.dfmc import DfmcCorrections, DfmcState, residual_ionosphere_m
+from railfix.gnss.observations import Observations
+from railfix.gnss.orbits import SatelliteStates
+from railfix.ranges.atmosphere import SeenFrom
+from railfix.ranges.base_station import BaseDifferences
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
+from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
+from railfix.ranges.second_codes import SecondCodes, second_codes
+from railfix.ranges.sources import CorrectionSource, SourceSatellites
 
-#: A pseudorange lies between these [m]: nearest satellite less a receiver clock 33 ms off, GEO plus the same.
-PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
-
-
-#: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
-DEFAULT_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
-    "G": ("1C", "1W", "1P", "1X", "1L", "1S"),
-    "J": ("1C", "1X", "1L", "1S", "1Z"),
-    "E": ("1C", "1X", "1B", "1Z", "1A"),
-    "C": ("2I", "2X", "2Q"),
-    "R": ("1C", "1P"),
-}
-
-#: Second signals in order of preference. L2 comes before L5 for GPS and QZSS: LNAV lacks the delay of L5
-#: (`railfix.gnss.orbits.prepared_records.group_delay_sigma_m`).
-SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
-    "G": ("2L", "2X", "2S", "2W", "5Q", "5X", "5I"),
-    "J": ("2L", "2X", "2S", "5Q", "5X", "5I"),
-    "E": ("5Q", "5X", "5I", "7Q", "7X", "7I"),
-    "C": ("7I", "7Q", "7X", "6I", "6Q", "6X", "5P", "5X", "5D"),
-}
-
-#: Signals that SBAS on L5 corrects, first and second, by constellation.
-DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
-    "G": (("1C",), ("5Q", "5X", "5I")),
-    "E": (("1C", "1X", "1B"), ("5Q", "5X", "5I")),
-    "C": (("1P", "1X", "1D"), ("5P", "5X", "5D")),
-}
-
-#: A C/N0 above the cap counts as the cap.
-_CN0_REFERENCE_DBHZ: Final = 45.0
-_CN0_CAP_DBHZ: Final = 50.0
-
-
-class CodeNoise(Settings):
-    """Standard deviation of a corrected pseudorange from C/N0 and elevation.
-
-    ``sigma^2 = floor_sigma_m^2 + (zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(el))^2``
-    """
-
-    model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" leaves the C/N0 factor out.
-    #: At the zenith and the reference C/N0. Only ratios matter to the position: its value for a receiver is estimated
-    #: from the residuals (`pipeline.AntennaState`).
-    zenith_sigma_m: float = Field(default=1.0, gt=0)
-    #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
-    floor_sigma_m: float = Field(default=1.0, ge=0)
-
-
-def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
-    """Return the sigma of corrected pseudoranges (T, M) [m]; NaN C/N0 is the reference; NaN at or below the horizon."""
-    noise = noise or CodeNoise()
-    sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
-    sigma = noise.zenith_sigma_m / sine
-    if noise.model == "cn0_elevation":
-        cn0 = np.where(np.isnan(cn0_dbhz), _CN0_REFERENCE_DBHZ, np.minimum(cn0_dbhz, _CN0_CAP_DBHZ))
-        sigma = sigma * np.exp((_CN0_REFERENCE_DBHZ - cn0) * (np.log(10.0) / 20.0))
-    return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
-
-
-#: Accuracies of records (URA, SISA) up to this stand for `satellite_sigma_m`: 2 to 4.85 m are usual. A worse one is
-#: believed: it is added to the sigma of the satellite's ranges.
-_USUAL_ACCURACY_M: Final = 5.0
-
-
-class NominalErrors(Settings):
-    """Assumed standard deviations of the errors that a local error model does not cover, where SBAS gives none.
-
-    ``sigma^2 = satellite^2 + (ionosphere F(el))^2 + (troposphere m(el))^2`` with the mappings of DO-229D
-    (A.4.4.10.4 and A.4.2.4).
-    """
-
-    #: Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions promise 2 m and
-    #: 95 % of the time less.
-    satellite_sigma_m: float = Field(default=0.8, ge=0)
-    #: Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
-    ionosphere_sigma_m: float = Field(default=1.0, ge=0)
-    #: Added to it, and to the ranges, with typical coefficients: what the two models differ by.
-    typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
-    #: Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4).
-    troposphere_sigma_m: float = Field(default=0.12, ge=0)
-
-    def sigma_m(self, elevation_deg: Floats) -> Floats:
-        """Return the standard deviation at elevations, any shape [m]; NaN below the horizon."""
-        sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
-        wet = 1.001 / np.sqrt(0.002001 + sine**2)
-        parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
-        return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
-
-    def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:
-        """Accuracies of records, any shape, where they are worse than usual; 0 for the others and for unknown ones."""
-        return np.where(accuracy_m > _USUAL_ACCURACY_M, accuracy_m, 0.0)
-
-
-def channel_order(
-    satellite: Strings, signal: Strings, *, systems: Sequence[str], signals: Mapping[str, Sequence[str]]
-) -> Indices:
-    """Return channels that may be used, those of one clock side by side, by preference of `signals`, shape (K,)."""
-    keys = []
-    for i, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
-        letter = name[0]
-        preference = signals.get(letter, ())
-        if letter in systems and code in preference:
-            keys.append((CLOCK_GROUP[letter], name, preference.index(code), i))
-    return np.array([key[-1] for key in sorted(keys)], dtype=np.intp)
-
-
-def first_available(satellite: Strings, available: Masks) -> Masks:
-    """Choose one channel a satellite and epoch: the first available one, in `channel_order`, shape (T, K)."""
-    starts = np.flatnonzero(np.append(True, satellite[1:] != satellite[:-1])) if len(satellite) else np.empty(0, int)
-    if len(starts) == len(satellite):
-        return available.copy()
-    count = np.cumsum(available, axis=1)
-    before = np.where(starts > 0, count[:, starts - 1], 0)
-    offset = np.repeat(before, np.diff(np.append(starts, len(satellite))), axis=1)
-    return np.asarray(available & (count - offset == 1))
+#: Distances from the centre of the Earth at which navigation satellites are [m].
+ORBITS_M: Final = (2e7, 6e7)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectedCodes:
-    """Corrected pseudoranges of T epochs by K channels, those of one receiver clock side by side."""
+class AntennaRanges:
+    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels."""
 
     time: Datetimes  #: Shape (T,).
-    #: Clock: letter of the receiver clock that a channel is measured with; shape (K,).
+    break_before: Masks  #: Epochs that must not be differenced with the one before, shape (T,).
+    #: Of each channel, shape (K,).
     satellite: Strings
     signal: Strings
-    clock: Strings
-    column: np.ndarray[tuple[int, ...], np.dtype[np.intp]]  #: Channels of the observations, shape (K,).
-    sat_ecef_m: Floats  #: Satellites at the time of transmission, shape (T, K, 3).
-    #: Pseudorange with satellite clock, group delay and atmosphere applied; NaN where there is none, where another
-    #: signal of the satellite is used, or where no healthy record is valid; shape (T, K).
+    frequency_hz: Floats
+    #: As observed, shape (T, K).
     code_m: Floats
-    sigma_m: Floats  #: Its standard deviation by C/N0, elevation and stated accuracy; shape (T, K).
+    doppler_hz: Floats
+    cn0_dbhz: Floats
+    #: Approximate position of the antenna, from which the directions to the satellites are computed; shape (T, 3).
+    near_ecef_m: Floats
     #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
-    frequency_hz: Floats  #: Shape (K,).
+    #: With satellite clock, group delay and atmosphere applied, and standard deviations; shape (T, K).
+    corrected_code_m: Floats
+    sigma_m: Floats
+    reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
 
 
-def corrected_ranges(
-    observations: Observations,
-    navigation: Navigation,
-    near_ecef_m: Floats,
-    *,
-    systems: Sequence[str] = ("G", "J", "E"),
-    signals: Mapping[str, Sequence[str]] = DEFAULT_SIGNALS,
-    troposphere: Literal["saastamoinen", "off"] = "saastamoinen",
-    noise: CodeNoise | None = None,
-    nominal: NominalErrors | None = None,
-) -> CorrectedCodes:
-    """Correct the pseudoranges of a log by broadcast records, Klobuchar's model and the standard atmosphere.
+@dataclass(frozen=True, kw_only=True)
+class CorrectedRanges(AntennaRanges, OnDemand):
+    """Corrected pseudoranges before positioning: T epochs by the K channels of `select_channels`."""
+
+    observations: Observations
+    channels: Channels
+    satellites: SatelliteStates
+    #: Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none; shape (T, K).
+    ionosphere_m: Floats
+    troposphere_m: Floats
+    #: Standard deviation of satellites and atmosphere: by SBAS, otherwise by `NominalErrors`; shape (T, K).
+    nominal_m: Floats
+    #: What `NominalErrors` assumes at the elevation alone; 0 with SBAS; shape (T, K).
+    unmodelled_m: Floats
+    #: Overbounding sigma and largest nominal bias of each range by an error model; 0 without one; shape (T, K).
+    bound_sigma_m: Floats
+    bias_m: Floats
+    #: A code is grossly wrong, but not clearly which one: such epochs are no evidence on noise and map; shape (T,).
+    unsure: Masks
+    second: SecondCodes | None = None  #: Second codes of the satellites, where two frequencies are used.
+    base: BaseDifferences | None = None  #: What a base station has subtracted.
+
+    @property
+    def columns(self) -> Indices:
+        """Columns of the channels in the observations, shape (K,)."""
+        return self.channels.columns
+
+    @property
+    def used_code_m(self) -> Floats:
+        """Corrected codes without a reason against them, NaN for the others, shape (T, K)."""
+        return np.where(self.reason == 0, self.corrected_code_m, np.nan)
+
+
+class SatelliteRanges(NamedTuple):
+    """Satellites of the codes of a log, T epochs by K channels."""
+
+    source: SourceSatellites
+    correction_m: Floats  #: Satellite clock less group delay, to be added to the codes; shape (T, K).
+    reason: Bits  #: `reasons.Reason` bits of codes, records and corrections; 0 = usable; shape (T, K).
+
+    @property
+    def states(self) -> SatelliteStates:
+        """Positions and clocks at the times of transmission."""
+        return self.source.states
+
+
+def find_satellites(
+    observations: Observations, channels: Channels, source: CorrectionSource, *, max_age_s: float | None = None
+) -> SatelliteRanges:
+    """Return satellite positions and clocks at the times of transmission ``t - code / c - dt_sv`` (P1 2.2(2)).
+
+    The first healthy signal of each satellite, in the order of `channels`, is used; every other code has its reason.
 
     Parameters
     ----------
     observations : Observations
-    navigation : Navigation
-        The ionosphere is left uncorrected without coefficients of GPS or QZSS.
-    near_ecef_m : ndarray, shape (3,) or (T, 3) [m]
-        Place of the antenna to some hundred metres, for directions and atmosphere.
-    systems : sequence of str
-        Letters of the constellations used.
-    signals : mapping of str to sequence of str
-        Signals of each constellation in order of preference, as RINEX 3 codes without the type letter.
-    troposphere : {"saastamoinen", "off"}
+        T epochs; codes outside 10,000 to 100,000 km are implausible.
+    channels : Channels
+        Of `select_channels`.
+    source : CorrectionSource
+        `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
+    max_age_s : float, optional
+        Largest distance of an epoch from the reference time of its record, where it is less than the record's validity.
+    """
+    code = observations.code_m[:, channels.columns]
+    reason = _reasons_of_codes(channels.satellite, code)
+    observed = (reason & int(Reason.NOT_OBSERVED)) == 0
+    found = source.satellites(observations.time, channels, code, max_age_s=max_age_s)
+    states = found.states
+    for mask, bits in (
+        (observed, found.reason),
+        (observed & states.no_record, int(Reason.NO_EPHEMERIS)),
+        (observed & states.too_old, int(Reason.EPHEMERIS_TOO_OLD)),
+        (observed & states.unhealthy, int(Reason.UNHEALTHY)),
+    ):
+        reason = np.where(mask, reason | bits, reason)
+    correction = states.clock_m - states.group_delay_m
+    if found.fast_m is not None:
+        correction = correction + found.fast_m
+    impossible = (reason == 0) & ~(is_orbit(states.position_ecef_m) & is_pseudorange(code + correction))
+    return SatelliteRanges(found, correction, np.where(impossible, int(Reason.NO_EPHEMERIS), reason))
+
+
+def corrected_ranges(
+    observations: Observations,
+    channels: Channels,
+    satellites: SatelliteRanges,
+    near_ecef_m: ArrayLike,
+    source: CorrectionSource,
+    *,
+    gross: Masks | None = None,
+    noise: CodeNoise | None = None,
+) -> CorrectedRanges:
+    """Return corrected pseudoranges and their standard deviations (P1 2.2(2), 2.4).
+
+    ``P = code + c (dt_sv - T_GD) - I - T``, with the corrections of the source; ``sigma^2 = sigma_code^2 +
+    sigma_source^2`` (`CodeNoise`, `NominalErrors`).
+
+    Parameters
+    ----------
+    observations, channels, source
+        As for `find_satellites`.
+    satellites : SatelliteRanges
+        Of `find_satellites`.
+    near_ecef_m : array_like, shape (3,) or (T, 3) [m]
+        Approximate positions of the antenna, good to some hundred metres (`positioning.approximate_position`).
+    gross : ndarray of bool, shape (T, K), optional
+        Codes that are grossly wrong (`ApproximatePosition.gross`): rejected.
     noise : CodeNoise, optional
-    nominal : NominalErrors, optional
-        Says which accuracies of records are usual; worse ones are in the sigmas.
+        Receiver noise and multipath by C/N0 and elevation.
+
+    Returns
+    -------
+    CorrectedRanges
+        Codes that cannot be used keep their numbers and have a reason; NaN where a correction is missing.
+
+    Raises
+    ------
+    ValueError
+        A position is not on the Earth.
     """
-    column = channel_order(observations.satellite, observations.signal, systems=systems, signals=signals)
-    satellite, signal = observations.satellite[column], observations.signal[column]
-    glonass = {**glonass_channels(navigation), **observations.header.glonass_channel}
-    frequency = carrier_frequency_hz(satellite, signal, glonass)
-    code = observations.code_m[:, column]
-    plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
-    states = satellite_states(observations.time, satellite, signal, code, navigation)
-    near = np.broadcast_to(np.asarray(near_ecef_m, dtype=np.float64), (len(observations), 3))
+    noise, time = noise or CodeNoise(), observations.time
+    near = _check_near(near_ecef_m, len(time))
+    code, cn0 = observations.code_m[:, channels.columns], observations.cn0_dbhz[:, channels.columns]
+    states, reason = satellites.states, satellites.reason
+    if gross is not None:
+        reason = np.where(gross, reason | int(Reason.GROSS_ERROR), reason)
+    observed = (reason & int(Reason.NOT_OBSERVED)) == 0
     seen = SeenFrom.of(near, states.position_ecef_m)
-    delays = model_delays(
-        observations.time,
-        seen,
-        frequency,
-        klobuchar=navigation.klobuchar.get("G", navigation.klobuchar.get("J")),
-        troposphere=troposphere,
-    )
-    clean = code + states.clock_m - states.group_delay_m - delays.ionosphere_m - delays.troposphere_m
-    stated = (nominal or NominalErrors()).unusual_sigma_m(states.accuracy_m)
-    sigma = np.hypot(code_sigma_m(observations.cn0_dbhz[:, column], seen.elevation_deg, noise=noise), stated)
-    used = first_available(satellite, plausible) & ~states.unhealthy & np.isfinite(sigma)
-    return CorrectedCodes(
-        time=observations.time,
-        satellite=satellite,
-        signal=signal,
-        clock=np.array([CLOCK_GROUP[name[0]] for name in satellite.tolist()], dtype="<U1"),
-        column=column,
-        sat_ecef_m=states.position_ecef_m,
-        code_m=np.where(used, clean, np.nan),
-        sigma_m=np.where(used, sigma, np.nan),
-        elevation_deg=seen.elevation_deg,
-        azimuth_deg=seen.azimuth_deg,
-        frequency_hz=frequency,
-    )
+    given = source.delays(time, channels, satellites.source, seen)
+    delays, second = given.delays, None
+    reason = np.where(observed, reason | delays.reason, reason)
+    if channels.second.size and source.second != "none":
+        second = second_codes(observations, channels, states, source.navigation, seen.elevation_deg, delays, noise)
+    if source.second == "required":
+        alone = np.isnan(second.code_m) if second is not None else np.ones(code.shape, dtype=bool)
+        reason = np.where((reason == 0) & alone, reason | int(Reason.SBAS_NO_IONOSPHERE), reason)
+    clean = code + states.clock_m - states.group_delay_m
+    if satellites.source.fast_m is not None:
+        clean = clean + satellites.source.fast_m
+    clean = clean - delays.ionosphere_m - delays.troposphere_m
+    if given.base is not None:
+        clean = np.where(np.isfinite(given.base.code_m), clean - given.base.code_m, clean)
+    own = noise if given.floor == "added" else noise.replaced(floor_sigma_m=0.0)
+    sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=own), given.sigma_m)
+    lacking = (reason == 0) & ~(is_pseudorange(clean) & np.isfinite(sigma))
+    none = np.zeros(code.shape)
+    return CorrectedRanges(
+        observations=observations, channels=channels, time=time, break_before=observations.break_before,
+        satellite=channels.satellite, signal=channels.signal, frequency_hz=channels.frequency_hz, code_m=code,
+        doppler_hz=observations.doppler_hz[:, channels.columns], cn0_dbhz=cn0, satellites=states, near_ecef_m=near,
+        elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg, ionosphere_m=delays.ionosphere_m,
+        troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma, nominal_m=given.nominal_m,
+        unmodelled_m=given.unmodelled_m, bound_sigma_m=none, bias_m=none,
+        unsure=np.zeros(len(time), dtype=np.bool_), second=second, base=given.base,
+        reason=np.where(lacking, int(Reason.NO_CORRECTION), reason),
+    )  # fmt: skip
 
 
-SBAS_SIGNAL: Final = "1C"  #: The signal that corrections are made for: GPS L1 C/A, as RINEX 3 calls it.
-
-_REASON_OF: Final = {
-    **dict.fromkeys(SatelliteState, Reason.SBAS_NO_CORRECTION),
-    SatelliteState.OK: Reason.USED,
-    SatelliteState.NOT_IN_MASK: Reason.SBAS_NOT_COVERED,
-    SatelliteState.TIMED_OUT: Reason.SBAS_TIMED_OUT,
-    SatelliteState.GEO_STOPPED: Reason.SBAS_DO_NOT_USE,
-    SatelliteState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
-    SatelliteState.NOT_MONITORED: Reason.SBAS_DO_NOT_USE,
-    SatelliteState.UDREI_TOO_LARGE: Reason.SBAS_DO_NOT_USE,
-}
-#: Reason of each state of a satellite, by its number.
-REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteState)], dtype=np.int64)
+def is_pseudorange(code_m: Floats) -> Masks:
+    """Return which numbers a pseudorange can have, any shape; false for NaN."""
+    return np.asarray((code_m > PLAUSIBLE_CODE_M[0]) & (code_m < PLAUSIBLE_CODE_M[1]))
 
 
-_DFMC_REASON_OF: Final = {
-    **dict.fromkeys(DfmcState, Reason.SBAS_NO_CORRECTION),
-    DfmcState.OK: Reason.USED,
-    DfmcState.NOT_IN_MASK: Reason.SBAS_NOT_COVERED,
-    DfmcState.TIMED_OUT: Reason.SBAS_TIMED_OUT,
-    DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
-    DfmcState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
-}
-#: The same of SBAS on L5.
-DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(DfmcState)], dtype=np.int64)
+def is_orbit(sat_ecef_m: Floats) -> Masks:
+    """Return which positions (..., 3) a navigation satellite can have; false for NaN."""
+    radius = np.sqrt(np.einsum("...i,...i->...", sat_ecef_m, sat_ecef_m))
+    return np.asarray((radius > ORBITS_M[0]) & (radius < ORBITS_M[1]))
 
 
-def apply_dfmc(
-    states: SatelliteStates, fixes: DfmcCorrections, satellite: Strings, signal: Strings
-) -> tuple[SatelliteStates, Bits]:
-    """Return satellites with the corrections of SBAS on L5 applied, and the reasons of those without, shape (T, K)."""
-    covered = [code in DFMC_SIGNALS.get(name[0], ((),))[0] for name, code in zip(satellite, signal, strict=True)]
-    moved, clock = states.position_ecef_m + fixes.position_m, states.clock_m + fixes.clock_m
-    reason = np.where(covered, DFMC_REASONS[fixes.state], int(Reason.SBAS_NOT_COVERED))
-    return replace(states, position_ecef_m=moved, clock_m=clock), reason
+def _check_near(near_ecef_m: ArrayLike, epochs: int) -> Floats:
+    """Return approximate positions, shape (T, 3); ValueError where they are not on the Earth."""
+    near = np.asarray(near_ecef_m, dtype=np.float64)
+    if near.shape not in ((3,), (epochs, 3)):
+        raise ValueError(f"near_ecef_m has shape {near.shape}, expected (3,) or ({epochs}, 3)")
+    return np.broadcast_to(near, (epochs, 3))
 
 
-def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelled: Delays) -> Delays:
-    """Troposphere of DO-229D, with the sigma of corrected ionosphere-free codes; the modelled ionosphere cancels there.
-
-    ``sigma^2 = sigma_corrections^2 + sigma_ionosphere^2 + sigma_troposphere^2`` (ED-259A), without the receiver's.
-    """
-    sight = seen.satellite_ecef_m - seen.receiver_ecef_m[:, None, :]
-    along = fixes.sigma_along_m(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
-    elevation = seen.elevation_deg
-    variance = along**2 + residual_ionosphere_m(elevation) ** 2 + rtca_troposphere_sigma_m(elevation) ** 2
-    return Delays(
-        ionosphere_m=modelled.ionosphere_m,
-        troposphere_m=rtca_troposphere_m(time, seen.latitude_deg, seen.height_m, elevation),
-        sigma_m=np.where(fixes.state == DfmcState.OK, np.sqrt(variance), np.nan),
-        reason=np.zeros(fixes.state.shape, dtype=np.int64),
-    )
-
-
-def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
-    """Satellites with long-term corrections applied to the records they are for, and reasons of the others (T, K)."""
-    moved = states.position_ecef_m + np.nan_to_num(fixes.position_m)
-    clock = states.clock_m + SPEED_OF_LIGHT * np.nan_to_num(fixes.clock_s)
-    return replace(states, position_ecef_m=moved, clock_m=clock), REASONS[fixes.state]
-
-
-def sbas_delays(
-    sbas: SbasCorrections, fixes: SatelliteCorrections, time: Datetimes, seen: SeenFrom, frequency_hz: Floats
-) -> Delays:
-    """Delays from the SBAS grid and DO-229D's troposphere, with the sigma of the corrected codes; others rejected."""
-    shape = fixes.state.shape
-    ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)
-    reason = np.zeros(shape, dtype=np.int64)
-    some = np.flatnonzero((fixes.state == SatelliteState.OK).any(axis=0))
-    if len(some):
-        part = fixes.take_satellites(some)
-        latitude, longitude, height = seen.latitude_deg, seen.longitude_deg, seen.height_m
-        elevation, azimuth = seen.elevation_deg[:, some], seen.azimuth_deg[:, some]
-        grid = sbas.ionosphere(time, latitude, longitude, elevation, azimuth)
-        sight = seen.satellite_ecef_m[:, some] - seen.receiver_ecef_m[:, None, :]
-        sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
-        flt = part.sigma_flt_m(sbas.delta_udre(time, part, sight, latitude, longitude))
-        scale = (FREQUENCY_L1 / frequency_hz[some]) ** 2
-        known = (grid.state == IonosphereState.OK) & np.isfinite(grid.sigma_uire_m)
-        variance = flt**2 + (scale * grid.sigma_uire_m) ** 2 + rtca_troposphere_sigma_m(elevation) ** 2
-        unknown = np.where(known, 0, int(Reason.SBAS_NO_IONOSPHERE))
-        corrected = part.state == SatelliteState.OK
-        ionosphere[:, some] = scale * np.where(known & corrected, grid.delay_m, np.nan)
-        troposphere[:, some] = np.where(corrected, rtca_troposphere_m(time, latitude, height, elevation), np.nan)
-        sigma[:, some] = np.where(corrected, np.sqrt(variance), np.nan)
-        reason[:, some] = np.where(corrected, unknown, 0)
-    return Delays(ionosphere_m=ionosphere, troposphere_m=troposphere, sigma_m=sigma, reason=reason)
+def _reasons_of_codes(satellite: Strings, code: Floats) -> Bits:
+    """Return the reasons that follow from the codes alone, shape (T, K)."""
+    observed = np.isfinite(code)
+    plausible = is_pseudorange(code)
+    taken = first_available(satellite, plausible)
+    reason = np.where(taken, int(Reason.USED), int(Reason.OTHER_SIGNAL_TAKEN))
+    reason = np.where(plausible, reason, int(Reason.IMPLAUSIBLE_CODE))
+    return np.where(observed, reason, int(Reason.NOT_OBSERVED))

@@ -24,7 +24,7 @@ from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
 from railfix.io.reference_log import read_acceleration, read_pulses, reference_table
 from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
-from railfix.ranges.corrected import DEFAULT_SIGNALS
+from railfix.ranges.channels import DEFAULT_SIGNALS
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.fixes import FixRejection, ReferenceSettings
 from railfix.reference.smoother import Built

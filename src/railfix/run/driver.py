@@ -20,9 +20,10 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import SENSORS, GroundUnits, SensorSamples
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
-from railfix.pipeline.processor import EpochProcessor, ScreenedChunk, SolvedChunk
+from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.state import State
 from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
@@ -229,7 +230,7 @@ def _screen_chunks(
     chunks: Iterator[dict[str, Observations]],
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
-) -> Iterator[ScreenedChunk]:
+) -> Iterator[Chunk]:
     """Yield the screened ranges of chunks, each with what sensors and base station measured up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
@@ -241,11 +242,11 @@ def _screen_chunks(
         yield screened
 
 
-def _single_epochs(screened: Iterator[ScreenedChunk], processor: EpochProcessor) -> Iterator[SolvedChunk]:
+def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iterator[Chunk]:
     """Yield the single epochs of chunks."""
     state = State()
     for chunk in screened:
-        solved, state = processor.single_epochs(chunk, state)
+        solved, state = processor.position(chunk, state)
         yield solved
 
 

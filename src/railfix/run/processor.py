@@ -17,8 +17,8 @@ from railfix.integrity.protection.araim import read_integrity_support
 from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.base_station import Stations
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import Models
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.range_stage import Models
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.ranges.error_model import read_error_model
 from railfix.run.inputs import RunOptions

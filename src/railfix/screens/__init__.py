@@ -6,9 +6,12 @@ observation back that another one rejected, and it only judges: the pipeline act
 
 from __future__ import annotations
 
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.antenna_pair import (
     AntennaPairLimits,
     AntennaPairScreened,
+    Spacing,
+    TagDifference,
     ambiguity_m,
     antenna_pair_screen,
     expected_difference_m,
@@ -16,7 +19,6 @@ from railfix.screens.antenna_pair import (
 )
 from railfix.screens.antenna_spacing import AntennaSpacingLimits, antenna_spacing_screen
 from railfix.screens.base import (
-    AntennaRanges,
     FilteredMotion,
     ObservationScreen,
     PairedEpochs,
@@ -34,7 +36,14 @@ from railfix.screens.base import (
     suspicion_sigma_m,
 )
 from railfix.screens.cn0 import Cn0Limits, Cn0Screened, cn0_screen
-from railfix.screens.doppler import DopplerLimits, DopplerScreened, DopplerState, doppler_limit_m, doppler_screen
+from railfix.screens.doppler import (
+    DopplerChannels,
+    DopplerLimits,
+    DopplerScreened,
+    DopplerState,
+    doppler_limit_m,
+    doppler_screen,
+)
 from railfix.screens.elevation import ElevationLimits, elevation_screen
 from railfix.screens.registry import SCREENS, in_order
 
@@ -46,6 +55,7 @@ __all__ = [
     "AntennaSpacingLimits",
     "Cn0Limits",
     "Cn0Screened",
+    "DopplerChannels",
     "DopplerLimits",
     "DopplerScreened",
     "DopplerState",
@@ -61,6 +71,8 @@ __all__ = [
     "ScreenPicture",
     "ScreenSetup",
     "Screened",
+    "Spacing",
+    "TagDifference",
     "Verdict",
     "ambiguity_m",
     "antenna_pair_screen",

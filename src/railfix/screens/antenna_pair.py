@@ -30,8 +30,8 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
-    AntennaRanges,
     ObservationPicture,
     PairedEpochs,
     PairScreen,
@@ -198,7 +198,7 @@ def antenna_pair_screen(
     tags: TagDifference | None = None,
     limits: AntennaPairLimits | None = None,
 ) -> AntennaPairScreened:
-    """Reject satellites whose two pseudoranges do not differ as the places of the antennas require.
+    """Reject satellites whose two pseudoranges do not differ as the spacing requires (P1 2.3(3); table 6: 5 m).
 
     Parameters
     ----------
@@ -242,8 +242,8 @@ def antenna_pair_screen(
         )  # fmt: skip
 
     screened = AntennaPairScreened(
-        metric=metric, reject=np.abs(metric) > limits.limit_m, expected_m=expected, clock_m=clock,
-        clocks=CLOCKS[limits.clocks], zone=zone,
+        metric=metric, reject=np.abs(metric) > limits.limit_m, limit=limits.limit_m, expected_m=expected,
+        clock_m=clock, clocks=CLOCKS[limits.clocks], zone=zone,
     )  # fmt: skip
     if screened.reject.any():
         screened = copy_with(screened, reject=screened.reject & (np.abs(metric) > screened.ambiguity_m))

@@ -46,7 +46,7 @@ def antenna_spacing_screen(
     facing: ArrayLike = 1,
     limits: AntennaSpacingLimits | None = None,
 ) -> Screened:
-    """Reject pairs of positions that are not as far apart along the track as the antennas.
+    """Reject pairs of positions that are not as far apart along the track as the antennas (P1 2.3(5); table 6: 5 m).
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def antenna_spacing_screen(
     if (spacing < 0.0).any():
         raise ValueError("spacing_m must not be negative; facing gives the order of the two")
     metric = np.where(sign == 0, np.abs(apart), sign * apart) - spacing
-    return Screened(metric=metric, reject=np.abs(metric) > limits.limit_m)
+    return Screened(metric=metric, reject=np.abs(metric) > limits.limit_m, limit=limits.limit_m)
 
 
 class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
@@ -109,7 +109,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
         difference = np.abs(front.speed_mps - rear.speed_mps)
         beyond_noise = difference > limits.filter_sigmas * np.hypot(front.speed_sigma_mps, rear.speed_sigma_mps)
         reject = (found.reject & apart) | ((difference > limits.filter_speed_mps) & beyond_noise)
-        return Screened(metric=found.metric, reject=reject)
+        return Screened(metric=found.metric, reject=reject, limit=limits.limit_m)
 
     def pictures(self, tables: RunTables, limits: AntennaSpacingLimits) -> Iterator[tuple[str, ScreenPicture]]:
         """Yield the differences from the spacing against the limit."""

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix import kernels
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, kernel_array
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
 from railfix.core.timescale import nearest_rows
 from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.corrected import AntennaRanges
 from railfix.track.trajectory import Trajectory
 
 Limits = TypeVar("Limits", bound=Settings)
@@ -32,36 +33,13 @@ LEAST_SUSPICION: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class AntennaRanges:
-    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels."""
-
-    time: Datetimes  #: Shape (T,).
-    break_before: Masks  #: Epochs that must not be differenced with the one before, shape (T,).
-    #: Of each channel, shape (K,).
-    satellite: Strings
-    signal: Strings
-    frequency_hz: Floats
-    #: As observed, shape (T, K).
-    code_m: Floats
-    doppler_hz: Floats
-    cn0_dbhz: Floats
-    #: Approximate place of the antenna, from which the directions to the satellites are computed; shape (T, 3).
-    anchor_ecef_m: Floats
-    #: Shape (T, K).
-    elevation_deg: Floats
-    azimuth_deg: Floats
-    #: With satellite clock, group delay and atmosphere applied, and standard deviations; shape (T, K).
-    corrected_code_m: Floats
-    sigma_m: Floats
-    reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
-
-
-@dataclass(frozen=True, kw_only=True)
 class Screened:
     """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions."""
 
     metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot judge.
     reject: Masks  #: True = rejected. Where the metric is NaN the screen does not reject.
+    #: What the metric is compared with, in its unit; broadcasts to it; NaN where nothing is compared.
+    limit: Floats | float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,21 +262,28 @@ def on_pairs(screened: Screened, shape: tuple[int, ...], epochs: Indices, channe
     metric, reject = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     where = (epochs[:, None], channels) if len(shape) > 1 else epochs
     metric[where], reject[where] = screened.metric, screened.reject
-    return Screened(metric=metric, reject=reject)
+    limit = screened.limit
+    if isinstance(limit, np.ndarray):
+        limit = np.full(shape, np.nan)
+        limit[where] = screened.limit
+    return Screened(metric=metric, reject=reject, limit=limit)
 
 
 def pair_antennas(
-    front: AntennaRanges,
-    rear: AntennaRanges,
-    front_anchor_arc_m: Floats,
+    front_time: Datetimes,
+    rear_time: Datetimes,
+    front_arc_m: Floats,
     front_path: Trajectory,
     rear_path: Trajectory,
     *,
     tolerance_s: float,
 ) -> PairedEpochs:
-    """Return the epochs of two antennas matched by their time tags, with the places of both on the line."""
-    at_front, at_rear = pair_epochs(front.time, rear.time, tolerance_s=tolerance_s)
-    front_arc = front_anchor_arc_m[at_front]
+    """Return the epochs of two antennas matched by their time tags, with the places of both on the line.
+
+    `front_arc_m`: approximate arc lengths of the front antenna, shape (T,).
+    """
+    at_front, at_rear = pair_epochs(front_time, rear_time, tolerance_s=tolerance_s)
+    front_arc = front_arc_m[at_front]
     rear_arc = rear_path.arc_of_body(front_path.body_at(front_arc))
     return PairedEpochs(
         front_epoch=at_front, rear_epoch=at_rear, front_ecef_m=front_path.at_arc(front_arc),

@@ -17,8 +17,8 @@ from railfix.core.arrays import Strings
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
-    AntennaRanges,
     ObservationPicture,
     ObservationScreen,
     ScreenColumn,
@@ -40,8 +40,8 @@ class Cn0Limits(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cn0Screened:
-    """Verdicts on signal strength, two screens with a reason each."""
+class Cn0Screened(Screened):
+    """Verdict on signal strength: the metric is C/N0, the limit the higher of floor and curve [dB-Hz]."""
 
     floor: Screened  #: The metric is C/N0 [dB-Hz].
     curve: Screened  #: The metric is the mean at the elevation less C/N0 [dB]; NaN where there is no curve.
@@ -56,7 +56,7 @@ def cn0_screen(
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
 ) -> Cn0Screened:
-    """Reject signals that are too weak.
+    """Reject signals that are weaker than an open sky gives (P1 2.3(1); table 6: mean - 10 dB-Hz, 30 dB-Hz).
 
     Parameters
     ----------
@@ -78,10 +78,17 @@ def cn0_screen(
     deficit = np.full(cn0.shape, np.nan)
     if curve is not None and limits.deficit_dbhz is not None:
         deficit = curve.mean_dbhz(elevation, satellite=satellite, signal=signal) - cn0
-    none = np.zeros(cn0.shape, dtype=bool)
+    nothing, lowest = np.zeros(cn0.shape, dtype=bool), np.full(cn0.shape, np.nan)
+    floor, curved = (np.nan if limit is None else limit for limit in (limits.floor_dbhz, limits.deficit_dbhz))
+    weak, deep = (nothing if limits.floor_dbhz is None else cn0 < floor), nothing
+    if limits.deficit_dbhz is not None:
+        deep, lowest = deficit > curved, cn0 + deficit - curved
     return Cn0Screened(
-        floor=Screened(metric=cn0, reject=none if limits.floor_dbhz is None else cn0 < limits.floor_dbhz),
-        curve=Screened(metric=deficit, reject=none if limits.deficit_dbhz is None else deficit > limits.deficit_dbhz),
+        metric=cn0,
+        reject=weak | deep,
+        limit=np.fmax(lowest, floor),
+        floor=Screened(metric=cn0, reject=weak, limit=floor),
+        curve=Screened(metric=deficit, reject=deep, limit=curved),
     )
 
 

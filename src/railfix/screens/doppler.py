@@ -26,8 +26,8 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
-    AntennaRanges,
     ObservationPicture,
     ObservationScreen,
     ScreenColumn,
@@ -130,9 +130,8 @@ _NS: Final = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerScreened(Screened):
-    """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m]."""
+    """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m]; limits have shape (T, M)."""
 
-    limit_m: Floats  #: NaN where the metric is, shape (T, M).
     #: Distance of a suspected satellite from its level before the jump, else 0, NaN as the metric; shape (T, M).
     level_m: Floats
 
@@ -179,7 +178,7 @@ def doppler_screen(
     limits: DopplerLimits | None = None,
     state: DopplerState | None = None,
 ) -> tuple[DopplerScreened, DopplerState]:
-    """Reject pseudoranges whose change differs from that of their Doppler.
+    """Reject pseudoranges whose change differs from that of their Doppler (P1 2.3(2); table 6: 1.5 m).
 
     The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` less its median over the
     channels of one receiver clock (GPS and QZSS share one).
@@ -225,7 +224,7 @@ def doppler_screen(
     before = _align(state or DopplerState(), satellite, signal)
     if not len(when):
         nothing = np.empty(code.shape)
-        empty = DopplerScreened(metric=nothing, reject=nothing.astype(bool), limit_m=nothing, level_m=nothing)
+        empty = DopplerScreened(metric=nothing, reject=nothing.astype(bool), limit=nothing, level_m=nothing)
         return empty, state or DopplerState()
     codes, dopplers, sigmas = (
         np.concatenate([first[None], rest])
@@ -246,7 +245,7 @@ def doppler_screen(
         level_m=read_only(level[-1].copy()), since=read_only(since.astype("datetime64[ns]")),
         scale_sum=sum_log, scale_epochs=weight,
     )  # fmt: skip
-    return DopplerScreened(metric=metric, reject=reject, limit_m=limit, level_m=level), after
+    return DopplerScreened(metric=metric, reject=reject, limit=limit, level_m=level), after
 
 
 def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
@@ -310,7 +309,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
             name="limit_doppler_m",
             meaning="screen `doppler`: limit on the size of that",
             verdict="doppler",
-            field="limit_m",
+            field="limit",
         ),
     )
     observation_pictures = (
@@ -329,7 +328,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
             antenna.doppler_hz, channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),
             break_before=antenna.break_before, code_sigma_m=antenna.sigma_m, limits=limits, state=state,
         )  # fmt: skip
-        error = np.fmax(np.abs(screened.level_m), screened.limit_m) if limits.verdict == "weigh" else None
+        error = np.fmax(np.abs(screened.level_m), screened.limit) if limits.verdict == "weigh" else None
         return (Verdict(name="doppler", reason=Reason.DOPPLER, screened=screened, error_m=error),), after
 
 

@@ -10,8 +10,8 @@ from pydantic import Field
 
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
+from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import (
-    AntennaRanges,
     ObservationPicture,
     ObservationScreen,
     Screened,
@@ -28,10 +28,13 @@ class ElevationLimits(Settings):
 
 
 def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None = None) -> Screened:
-    """Reject satellites below the mask; the metric is the elevation [deg], which is NaN where unknown: not judged."""
+    """Reject satellites below the mask, 20 degrees in P1 table 6.
+
+    The metric is the elevation [deg], NaN where unknown: not judged.
+    """
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)
-    return Screened(metric=metric, reject=metric < limits.mask_deg)
+    return Screened(metric=metric, reject=metric < limits.mask_deg, limit=limits.mask_deg)
 
 
 class ElevationScreen(ObservationScreen[ElevationLimits]):

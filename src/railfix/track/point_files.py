@@ -201,14 +201,9 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 def _without_geometry(document: dict[str, Any]) -> list[int]:
     """Return the numbers of features whose geometry is null (RFC 7946, 3.2) and that are no connections."""
-    features = document.get("features")
-    return [
-        number
-        for number, feature in enumerate(features if isinstance(features, list) else [], start=1)
-        if isinstance(feature, dict)
-        and feature.get("geometry", ...) is None
-        and RELATION not in (feature.get("properties") or {})
-    ]
+    features = [f if isinstance(f, dict) else {} for f in document.get("features") or ()]
+    empty = [f.get("geometry", ...) is None and RELATION not in (f.get("properties") or {}) for f in features]
+    return [number for number, without in enumerate(empty, start=1) if without]
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:

@@ -27,8 +27,9 @@ Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 #: Distance between the contact points of the wheels minus the gauge [m]: about the width of a rail head.
 RAIL_HEAD_M: Final = 0.070
 PATH_TOLERANCE_M: Final = 0.004  #: Largest deviation of the antenna's path from the chord between two points [m].
+_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Shares of a segment at which its chord is compared with the path.
 #: Shortest segment of the path [m].
-_SHORTEST_M: Final = 1.0
+_SHORTEST_M: Final = 0.25
 _MAX_ITERATIONS: Final = 200
 _CONVERGED_M: Final = 1e-7
 
@@ -264,12 +265,13 @@ def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaO
         if not at.size:
             return middle
         centre = (middle[at] + middle[at + 1]) / 2.0
-        true = _place(_pose(line, track, vehicle, centre), vehicle, offset)
+        inner = (middle[at, None] + (middle[at + 1] - middle[at])[:, None] * _INNER).ravel()
+        true = _place(_pose(line, track, vehicle, inner), vehicle, offset).reshape(len(at), len(_INNER), 3)
         chord = places[at + 1] - places[at]
         chord /= np.linalg.norm(chord, axis=1, keepdims=True)
-        off = true - places[at]
-        off -= np.einsum("vi,vi->v", off, chord)[:, None] * chord
-        bent = np.linalg.norm(off, axis=1) > PATH_TOLERANCE_M
+        off = true - places[at, None]
+        off -= np.einsum("vki,vi->vk", off, chord)[..., None] * chord[:, None]
+        bent = np.linalg.norm(off, axis=2).max(axis=1) > PATH_TOLERANCE_M
         fine[at[~bent]] = True
         fine = np.insert(fine, at[bent], False)
         middle = np.insert(middle, at[bent] + 1, centre[bent])

@@ -1,6 +1,6 @@
 """Sources of faults that the level of the filtered position has a sub-filter for, and its budget of risk.
 
-`railfix.kernels.tracking.level` has the sub-filters and the level.
+`railfix.kernels.tracking.subfilters` has the sub-filters, `railfix.kernels.tracking.level` the level.
 """
 
 from __future__ import annotations

@@ -9,10 +9,11 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.timescale import seconds
+from railfix.kernels.tracking.layout import CHANNEL, EPOCH, Records
 from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import CLOCKS, TrackState
-from railfix.tracking.velocity import compute_velocity
+from railfix.tracking.velocity import Velocity, compute_velocity, singer
 
 #: Shortest interval between epochs [s].
 _SHORTEST_S: Final = 1e-3
@@ -28,35 +29,16 @@ FORGOTTEN: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """T epochs of K channels and S errors of satellites; `has` and `variance` of codes are settled epoch by epoch."""
+    """T epochs of K channels and S errors of satellites, as the recursion takes them."""
 
     time: Datetimes  #: Shape (T,).
-    interval_s: Floats  #: Since the epoch before; 1 for the first; shape (T,).
+    satellite: Strings  #: Of each channel; shape (K,).
+    epoch: Records  #: `railfix.kernels.tracking.layout.EPOCH`; shape (T,).
+    channel: Records  #: `railfix.kernels.tracking.layout.CHANNEL`; shape (T, K).
     apart: Masks  #: Epochs so long after the one before that they restart; shape (T,).
-    satellite: Strings  #: Shape (K,).
-    #: Place of the channel's error among those of the state; -1 for one that is never measured; shape (K,).
-    slot: Indices
-    offset: Indices  #: Place of its code clock in `CLOCKS`; shape (K,).
-    #: Satellites at transmission, and those of the epoch before; shape (T, K, 3).
-    sat_ecef_m: Floats
-    sat_velocity_mps: Floats
-    before_ecef_m: Floats
-    #: Code [m], change of the phase since the epoch before [m] and range rate [m/s]; NaN where there is none;
-    #: shape (3, T, K).
-    measured: Floats
-    has: Masks  #: Where `measured` is finite; shape (3, T, K).
-    #: Of white errors, before the scales learnt from residuals; of codes the mean over a second; shape (3, T, K).
-    variance: Floats
-    #: Epochs with phases or Dopplers of at least four satellites: they carry the place on without codes; shape (T,).
-    motion_measured: Masks
-    code_sigma_m: Floats  #: Of the satellite's correlated code error; shape (T, K).
-    fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
     off_map: Masks  #: The train is away from the line; shape (T,).
-    remembered: Masks  #: Satellites whose error lasts from before an epoch; shape (T, S).
-    #: `velocity.Velocity`; shape (T, 3), (T, 3, 3), (T,).
-    velocity_mps: Floats
-    velocity_covariance: Floats
-    velocity_age_s: Floats
+    fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
+    within_memory: Masks  #: Satellites whose error lasts from before an epoch; shape (T, S).
 
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
@@ -94,28 +76,49 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     fresh[:, slot[used]] = any_kind[:, used]
     state.seen = seen[-1]
 
+    variance = _compute_variance(epochs, limits)
+    near = np.full((len(epochs), 3), np.nan) if epochs.near_ecef_m is None else epochs.near_ecef_m
+    velocity = compute_velocity(
+        near, epochs.sat_ecef_m, epochs.sat_velocity_mps, before, measured, has, variance, interval
+    )
+    epoch = _pack_epochs(epochs, interval, velocity, limits)
+    epoch["begins"] = apart | epochs.off_map
+    epoch["motion_measured"] = has[1:].sum(axis=2).max(axis=0) >= _MOTION
+    channel = np.zeros(epochs.code_m.shape, dtype=CHANNEL)
+    channel["satellite"], channel["clock"] = slot, [_OFFSETS[letter] for letter in epochs.clock.tolist()]
+    channel["sat_ecef_m"], channel["sat_velocity_mps"] = epochs.sat_ecef_m, epochs.sat_velocity_mps
+    channel["before_ecef_m"], channel["code_sigma_m"] = before, epochs.code_sigma_m
+    for name, values in (("measured", measured), ("has", has), ("variance", variance)):
+        channel[name] = np.moveaxis(values, 0, -1)
+    return Chunk(
+        time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, apart=apart, off_map=epochs.off_map,
+        fresh=fresh & ~kept, within_memory=kept,
+    )  # fmt: skip
+
+
+def _compute_variance(epochs: GnssEpochs, limits: TrackingLimits) -> Floats:
+    """Return the variances of the white errors of codes, phases and Dopplers, the last two by C/N0; shape (3, T, K)."""
     cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
-    variance = np.array(
+    return np.array(
         [
             (limits.code_white_share * epochs.code_sigma_m) ** 2,
             limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
             limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
         ]
     )
-    near = np.full((len(epochs), 3), np.nan) if epochs.near_ecef_m is None else epochs.near_ecef_m
-    velocity = compute_velocity(
-        near, epochs.sat_ecef_m, epochs.sat_velocity_mps, before, measured, has, variance, interval
-    )
-    return Chunk(
-        time=epochs.time, interval_s=interval, apart=apart, satellite=epochs.satellite, slot=slot,
-        offset=np.array([_OFFSETS[letter] for letter in epochs.clock.tolist()], dtype=np.intp),
-        sat_ecef_m=epochs.sat_ecef_m, sat_velocity_mps=epochs.sat_velocity_mps, before_ecef_m=before,
-        measured=measured, has=has, variance=variance,
-        motion_measured=np.asarray(has[1:].sum(axis=2).max(axis=0) >= _MOTION), code_sigma_m=epochs.code_sigma_m,
-        fresh=fresh & ~kept, off_map=epochs.off_map, remembered=kept, velocity_mps=velocity.velocity_mps,
-        velocity_covariance=velocity.covariance, velocity_age_s=velocity.age_s,
-    )  # fmt: skip
+
+
+def _pack_epochs(epochs: GnssEpochs, interval: Floats, velocity: Velocity, limits: TrackingLimits) -> Records:
+    """Return the records of epochs with their intervals, Singer's steps and velocities without the line."""
+    epoch = np.zeros(len(epochs), dtype=EPOCH)
+    epoch["time_s"], epoch["interval_s"] = seconds(epochs.time - epochs.time[0]), interval
+    epoch["velocity_mps"], epoch["velocity_age_s"] = velocity.velocity_mps, velocity.age_s
+    epoch["velocity_covariance"] = velocity.covariance
+    for dt in np.unique(interval).tolist():
+        step, noise = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
+        epoch["step"][interval == dt], epoch["noise"][interval == dt] = step, noise
+    return epoch
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:

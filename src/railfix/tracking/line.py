@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from railfix.core.arrays import Floats
+from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.track.trajectory import Trajectory, joins_m
 
 
@@ -127,20 +127,18 @@ class Line:
         return 0.5 * (self.arc_m[1:] + self.arc_m[:-1])
 
     @cached_property
-    def written(self) -> dict[str, Any]:
-        """Everything by its name, arrays as writable copies, row by row."""
-        names = ("arc_m", "ecef_m", "axes", "segment", "middle_m", "gradient")
-        arrays = {name: np.array(getattr(self, name), order="C") for name in names}
-        start, end = self.bounds_m
-        return {
-            **arrays,
-            "sigma_plan_m": float(self.sigma_plan_m),
-            "sigma_height_m": float(self.sigma_height_m),
-            "start_m": start,
-            "end_m": end,
-            "start_turn_m": float(np.nan_to_num(self.joins_m[0] - self.arc_m[0])),
-            "end_turn_m": float(np.nan_to_num(self.arc_m[-1] - self.joins_m[1])),
-        }
+    def records(self) -> tuple[Records, Records]:
+        """Vertices, and the line as a whole, as the recursion takes them; shapes (V,), (1,)."""
+        vertex, line = np.zeros(len(self.arc_m), dtype=VERTEX), np.zeros(1, dtype=LINE)
+        for name in ("arc_m", "ecef_m", "axes"):
+            vertex[name] = getattr(self, name)
+        for name in ("segment", "middle_m", "gradient"):
+            vertex[name][:-1] = getattr(self, name)
+        line["sigma_plan_m"], line["sigma_height_m"] = self.sigma_plan_m, self.sigma_height_m
+        line["start_m"], line["end_m"] = self.bounds_m
+        line["start_turn_m"] = np.nan_to_num(self.joins_m[0] - self.arc_m[0])
+        line["end_turn_m"] = np.nan_to_num(self.arc_m[-1] - self.joins_m[1])
+        return vertex, line
 
     def gradient_at(self, arc_m: Floats) -> Floats:
         """Climb over horizontal length, between the middles of segments, shape (H,)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Final
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
 from railfix.kernels.tracking import constants
+from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind
 
 
@@ -99,28 +100,45 @@ class Tracked:
     #: The same of the sensors, in the order of `Kind`; of several ranges the last; shape (T, len(Kind) - 3).
     sensed: Floats
     weight: Floats  #: 0 for codes that are left out; shape (T, 3, K).
-    faulty: Masks  #: Codes that are left out (`railfix.kernels.tracking.learning`); shape (T, K).
+    faulty: Masks  #: Codes that are left out (`railfix.kernels.tracking.adaptation`); shape (T, K).
 
     def __len__(self) -> int:
         return len(self.time)
 
     @classmethod
     def empty(cls, time: Datetimes, channels: int) -> Tracked:
-        """Nothing known at T epochs, to be filled in."""
-        size = len(time)
-        names = (
-            "arc_m", "sigma_m", "speed_mps", "speed_sigma_mps", "acceleration_mps2", "probability", "code_weight",
-            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "map_scale", "level_m",
-            "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
-        )  # fmt: skip
-        return cls(
-            time=time,
-            status=np.full(size, TrackStatus.NOT_STARTED, dtype=np.int8),
-            hypotheses=np.zeros(size, dtype=np.int64),
-            used=np.zeros((size, len(Kind)), dtype=np.int64),
-            innovation=np.full((size, 3, channels), np.nan),
-            sensed=np.full((size, len(Kind) - 3), np.nan),
-            weight=np.full((size, 3, channels), np.nan),
-            faulty=np.zeros((size, channels), dtype=np.bool_),
-            **dict(zip(names, np.full((len(names), size), np.nan), strict=True)),
-        )
+        """Nothing known at T epochs of K channels."""
+        return cls.from_records(time, new_results(len(time), channels))
+
+    @classmethod
+    def from_records(cls, time: Datetimes, results: Results) -> Tracked:
+        """Return the columns of the recursion's records."""
+        columns = {name: np.ascontiguousarray(results.epoch[name]) for name in EPOCH_RESULT.names or ()}
+        columns |= {
+            name: np.ascontiguousarray(np.moveaxis(results.channel[name], -1, 1)) for name in ("innovation", "weight")
+        }
+        return cls(time=time, **columns, faulty=np.ascontiguousarray(results.channel["faulty"]))
+
+
+#: Types of the columns, and the shapes of those that have more than one number an epoch.
+_TYPES: Final = {"Codes": np.int8, "Integers": np.int64, "Floats": np.float64}
+_SHAPES: Final = {"used": (len(Kind),), "sensed": (len(Kind) - 3,)}
+_OF_CHANNELS: Final = ("innovation", "weight", "faulty")
+#: One epoch of `Tracked` as the recursion writes it, and one channel of it.
+EPOCH_RESULT: Final = record_of({
+    f.name: (_TYPES[str(f.type)], _SHAPES.get(f.name, ()))
+    for f in fields(Tracked)
+    if f.name not in ("time", *_OF_CHANNELS)
+})  # fmt: skip
+CHANNEL_RESULT: Final = record_of({"innovation": (float, (3,)), "weight": (float, (3,)), "faulty": bool})
+
+
+def new_results(epochs: int, channels: int) -> Results:
+    """Return records of epochs at which nothing is known."""
+    results = Results(np.zeros(epochs, dtype=EPOCH_RESULT), np.zeros((epochs, channels), dtype=CHANNEL_RESULT))
+    for name, (kind, *_) in (EPOCH_RESULT.fields or {}).items():
+        if kind.base == np.float64:
+            results.epoch[name] = np.nan
+    results.epoch["status"] = TrackStatus.NOT_STARTED
+    results.channel["innovation"] = results.channel["weight"] = np.nan
+    return results

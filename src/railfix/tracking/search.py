@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import (
@@ -17,8 +17,9 @@ from railfix.kernels.tracking.constants import (
     BESIDE_AFTER_S,
     CODE_CLOCK_SIGMA_M,
     MOTION_FIT,
-    STEP_HELD_S,
+    STEP_HOLD_S,
 )
+from railfix.kernels.tracking.layout import CODE
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
@@ -59,8 +60,9 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     sigma_m : ndarray, shape (C,) [m]
         Half of the stretch that is about as likely, at least `start_sigma_m`.
     """
-    has = chunk.has[0, epoch]
-    groups = [has & (chunk.offset == g) for g in range(len(CLOCKS))]
+    channel = chunk.channel[epoch]
+    has = channel["has"][:, CODE] != 0
+    groups = [has & (channel["clock"] == g) for g in range(len(CLOCKS))]
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
         return np.empty(0), np.empty(0)
@@ -69,9 +71,9 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     likelihood = np.zeros(len(arc))
     tails = limits.tails
     for group in groups:
-        distance, _ = range_with_rotation(chunk.sat_ecef_m[epoch, group], points[:, None, :])
-        residual = chunk.measured[0, epoch, group] - distance
-        variance = (1.0 + limits.code_white_share**2) * chunk.code_sigma_m[epoch, group] ** 2 + _SPACING_M**2 / 12.0
+        distance, _ = range_with_rotation(channel["sat_ecef_m"][group], points[:, None, :])
+        residual = channel["measured"][group, CODE] - distance
+        variance = (1.0 + limits.code_white_share**2) * channel["code_sigma_m"][group] ** 2 + _SPACING_M**2 / 12.0
         clock = np.median(residual, axis=1, keepdims=True)
         for _ in range(limits.passes):
             away = residual - clock
@@ -129,7 +131,7 @@ def begin(
     variance[:, StateIndex.DRIFT] = _ANY_DRIFT_MPS**2
     variance[:, StateIndex.MAP_RIGHT] = line.sigma_plan_m**2
     variance[:, StateIndex.MAP_UP] = line.sigma_height_m**2
-    variance[:, StateIndex.CODE_PLACE] = limits.slow_code_m**2
+    variance[:, StateIndex.SLOW_CODE] = limits.slow_code_m**2
     variance[:, StateIndex.DOPPLER_SPEED] = limits.doppler_error_mps**2
     variance[:, StateIndex.WHEEL] = WHEEL_PRIOR**2
     variance[:, StateIndex.FORCE_OFFSET] = FORCE_PRIOR_MPS2**2
@@ -216,77 +218,109 @@ class Sought(NamedTuple):
     splits: list[SplitHypothesis | None] | None  #: Hypotheses that began at this epoch within wider ones.
 
 
+#: Mean, covariance, logarithm of the probability, arc length at the start and part by codes of some hypotheses.
+_Part: TypeAlias = tuple[Floats, Floats, Floats, Floats, Floats]
+
+
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Sought:
     """Seek places at the start, after a gap and when lost; the state is that predicted to the epoch."""
-    satellites = len(state.satellite)
     if not state.hypotheses:
         arc, sigma = places(chunk, epoch, line, limits)
-        state.mean, state.covariance = begin(arc, sigma, satellites, line, limits)
+        state.mean, state.covariance = begin(arc, sigma, len(state.satellite), line, limits)
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
-        state.log_code, state.branch_s, state.branch_m = np.zeros(len(arc)), 0.0, 0.0
-        state.log_least, state.log_recent = state.log_probability, np.zeros(len(arc))
+        state.log_code = np.zeros(len(arc))
+        _start_branches(state)
         return Sought(lost=False, parent=np.full(len(arc), -1), splits=None)
-    mean, covariance = state.mean, state.covariance
-    parent: Indices = np.arange(len(mean))
-    weak = state.weak_motion_s >= limits.lost_motion_s or state.weak_code_s >= limits.lost_code_s
-    lost = weak or state.across >= ACROSS_LOST
+    monitors, parent = state.monitors, np.arange(state.hypotheses)
+    weak = monitors.weak_motion_s >= limits.lost_motion_s or monitors.weak_code_s >= limits.lost_code_s
+    lost = weak or monitors.across >= ACROSS_LOST
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
-    wide = covariance[:, StateIndex.ARC, StateIndex.ARC] > limits.start_sigma_m**2
+    wide = state.covariance[:, StateIndex.ARC, StateIndex.ARC] > limits.start_sigma_m**2
     if not (lost or (gap and wide.any())):
-        contradicted = state.weak_motion_s >= BESIDE_AFTER_S or state.across >= ACROSS_DOUBT
-        contradicted = contradicted or state.motion_misfit > 1.0 - MOTION_FIT
+        contradicted = monitors.weak_motion_s >= BESIDE_AFTER_S or monitors.across >= ACROSS_DOUBT
+        contradicted = contradicted or monitors.motion_misfit > 1.0 - MOTION_FIT
         if contradicted and state.measured >= state.time:
             parent = np.append(parent, np.full(_try_beside(state, line, limits), -1))
         return Sought(lost=False, parent=parent, splits=None)
     arc, sigma = places(chunk, epoch, line, limits)
     if not len(arc):
         return Sought(lost=lost, parent=parent, splits=None)
-    parts = [(mean, covariance, state.log_probability, state.origin_m, state.log_code)]
-    splits: list[SplitHypothesis | None] = [None] * len(mean)
-    for one in np.flatnonzero(wide) if not lost else []:
-        reach = 5.0 * np.sqrt(covariance[one, StateIndex.ARC, StateIndex.ARC])
-        there = line.nearest_m(arc, mean[one, StateIndex.ARC])
-        near = np.abs(there - mean[one, StateIndex.ARC]) < reach
+    of_now = state.mean, state.covariance, state.log_probability, state.origin_m, state.log_code
+    if lost:
+        parts, splits = ([] if weak else [of_now]) + [_begin_elsewhere(state, arc, line, limits, weak=weak)], None
+    else:
+        inside, splits = _split_wide(state, arc, sigma, wide, line)
+        parts = [of_now, *inside]
+    state.mean, state.covariance, log_probability, state.origin_m, state.log_code = (
+        np.concatenate(items) for items in zip(*parts, strict=True)
+    )
+    state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
+    parent = np.full(state.hypotheses, -1)
+    if splits is not None:
+        parent = np.array([k if item is None else item.parent for k, item in enumerate(splits)])
+    _reset_monitors(state, limits, lost=lost, weak=weak)
+    return Sought(lost=lost, parent=parent, splits=splits)
+
+
+def _start_branches(state: TrackState) -> None:
+    """Start the count of time and distance on the branches."""
+    state.log_least, state.log_recent = state.log_probability, np.zeros(state.hypotheses)
+    state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
+
+
+def _reset_monitors(state: TrackState, limits: TrackingLimits, *, lost: bool, weak: bool) -> None:
+    """Reset what contradicted the earlier places, and hold the level back where the track was lost."""
+    _start_branches(state)
+    hold = state.monitors.level_hold_s
+    if lost and state.monitors.weak_code_s >= limits.lost_code_s:
+        # Codes have contradicted the place that motion carried: the next place is theirs alone.
+        hold = max(hold, STEP_HOLD_S)
+    if weak:
+        hold = max(hold, limits.level_start_s)
+    state.monitors = replace(
+        state.monitors, level_hold_s=hold, weak_motion_s=0.0, weak_code_s=0.0, across=0.0, code_shift=0.0,
+        code_shift_variance=0.0, least_speed_mps=ANY_SPEED[0], most_speed_mps=ANY_SPEED[1],
+    )  # fmt: skip
+    state.coded = np.datetime64("NaT", "ns")
+
+
+def _split_wide(
+    state: TrackState, arc: Floats, sigma: Floats, wide: Masks, line: Line
+) -> tuple[list[_Part], list[SplitHypothesis | None]]:
+    """Return narrower hypotheses at places within wide ones, and what each hypothesis was split from."""
+    parts: list[_Part] = []
+    splits: list[SplitHypothesis | None] = [None] * state.hypotheses
+    for one in np.flatnonzero(wide):
+        mean, covariance = state.mean[one], state.covariance[one]
+        reach = 5.0 * np.sqrt(covariance[StateIndex.ARC, StateIndex.ARC])
+        there = line.nearest_m(arc, mean[StateIndex.ARC])
+        near = np.abs(there - mean[StateIndex.ARC]) < reach
         if near.any():
-            new = split(mean[one], covariance[one], float(state.log_probability[one]), there[near], sigma[near])
+            new = split(mean, covariance, float(state.log_probability[one]), there[near], sigma[near])
             parts.append((*new, there[near], np.full(int(near.sum()), state.log_code[one])))
             splits += [
-                SplitHypothesis(parent=int(one), mean=mean[one], covariance=covariance[one], place_m=at, sigma_m=wide_m)
+                SplitHypothesis(parent=int(one), mean=mean, covariance=covariance, place_m=at, sigma_m=wide_m)
                 for at, wide_m in zip(there[near].tolist(), sigma[near].tolist(), strict=True)
             ]
-    if lost:
-        best = int(np.argmax(state.log_probability))
-        elsewhere = 1.0 if weak or state.across >= ACROSS_TAKEN else _ELSEWHERE
-        # One that is less probable than a new place has drifted from where codes would begin it.
-        alive = state.log_probability >= np.log(elsewhere / len(arc))
-        going = mean[best : best + 1, StateIndex.ARC] if weak else mean[alive, StateIndex.ARC]
-        there = line.nearest_m(arc[:, None], going)
-        arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
-        # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
-        # the hypotheses go on as they are.
-        arc = np.concatenate([going, arc]) if weak else arc
-        sigma = np.full(len(arc), limits.start_sigma_m)
-        fresh = begin(arc, sigma, satellites, line, limits, known=(mean[best], covariance[best]))
-        share = np.full(len(arc), np.log(elsewhere / max(len(arc), 1)))
-        parts = [] if weak else parts
-        parts.append((*fresh, share, arc, np.zeros(len(arc))))
-    together = [np.concatenate(items) for items in zip(*parts, strict=True)]
-    state.mean, state.covariance, state.origin_m = together[0], together[1], together[3]
-    state.log_probability = together[2] - np.logaddexp.reduce(together[2])
-    state.log_code, state.branch_s, state.branch_m = together[4], 0.0, 0.0
-    state.log_least, state.log_recent = state.log_probability, np.zeros(len(state.log_probability))
-    parent = np.full(state.hypotheses, -1)
-    if not lost:
-        parent = np.array([k if item is None else item.parent for k, item in enumerate(splits)])
-    state.coded = np.datetime64("NaT", "ns")
-    if lost and state.weak_code_s >= limits.lost_code_s:
-        # Codes have contradicted the place that motion carried: the next place is theirs alone.
-        state.withheld_s = max(state.withheld_s, STEP_HELD_S)
-    if weak:
-        state.withheld_s = max(state.withheld_s, limits.level_start_s)
-    state.weak_motion_s = state.weak_code_s = state.across = 0.0
-    state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
-    return Sought(lost=lost, parent=parent, splits=None if lost else splits)
+    return parts, splits
+
+
+def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
+    """Return hypotheses at places away from those of a lost track; `weak`: its weights were low for long."""
+    best = int(np.argmax(state.log_probability))
+    elsewhere = 1.0 if weak or state.monitors.across >= ACROSS_TAKEN else _ELSEWHERE
+    # One that is less probable than a new place has drifted from where codes would begin it.
+    alive = state.log_probability >= np.log(elsewhere / len(arc))
+    going = state.mean[best : best + 1, StateIndex.ARC] if weak else state.mean[alive, StateIndex.ARC]
+    there = line.nearest_m(arc[:, None], going)
+    arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
+    # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
+    # the hypotheses go on as they are.
+    arc = np.concatenate([going, arc]) if weak else arc
+    sigma = np.full(len(arc), limits.start_sigma_m)
+    known = state.mean[best], state.covariance[best]
+    fresh = begin(arc, sigma, len(state.satellite), line, limits, known=known)
+    return (*fresh, np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc, np.zeros(len(arc)))
 
 
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:

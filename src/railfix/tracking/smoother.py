@@ -17,26 +17,26 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.kernels.tracking.layout import EPOCH
 from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.packing import pack_parameters
 from railfix.tracking.search import SplitHypothesis
 from railfix.tracking.state import SATELLITES, StateIndex, TrackState
-from railfix.tracking.velocity import transition
+from railfix.tracking.velocity import singer
 
 
 @dataclass(frozen=True, kw_only=True)
 class Updated:
-    """Update of H hypotheses by D combinations of the unknowns, in their standard deviations."""
+    """Update of H hypotheses of N unknowns by M measurements, as `railfix.kernels.tracking.layout.Trace`."""
 
     prior: Floats  #: Covariance of the unknowns before the measurements; shape (H, N, N).
-    combine: Floats  #: Shape (H, D, N).
-    #: Inverse covariance of the combinations before, and covariance after the measurements; shape (H, D, D).
-    information: Floats
-    covariance: Floats
-    change: Floats  #: Of their means; shape (H, D).
+    row: Floats  #: Measurement matrix; shape (H, M, N).
+    value: Floats  #: Innovations; shape (H, M).
+    variance: Floats  #: Variances over the weights, infinite for what was not used; shape (H, M).
 
     def take(self, chosen: Indices) -> Updated:
         """Return the update of some hypotheses."""
-        return Updated(**{name: getattr(self, name)[chosen] for name in self.__dataclass_fields__})
+        return Updated(**{name: value[chosen] for name, value in vars(self).items()})
 
 
 @dataclass(kw_only=True)
@@ -70,7 +70,12 @@ class Step:
     def before(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
         """Carry the information of later epochs on hypothesis h backward through its measurements."""
         if self.updated is not None:
-            vector, matrix = _before_measurements(self.updated, h, vector, matrix)
+            from railfix.kernels.tracking.backward import before_measurements
+
+            made = self.updated
+            vector, matrix = before_measurements(
+                made.prior[h], made.row[h], made.value[h], made.variance[h], vector, matrix
+            )
         part = None if self.splits is None else self.splits[h]
         if part is not None:
             # The density of the narrower one over the wide one, as if its place had been measured.
@@ -85,12 +90,13 @@ class Step:
         return vector, matrix
 
 
-def _before_measurements(updated: Updated, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Carry the information of later epochs on hypothesis h backward through an update."""
-    gain = updated.combine[h].T @ updated.information[h]
-    gained = gain @ updated.combine[h] - gain @ updated.covariance[h] @ gain.T
-    back = np.eye(len(vector)) - gained @ updated.prior[h]
-    return gain @ updated.change[h] + back @ vector, gained + back @ matrix @ back.T
+def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
+    """Return the transition of all unknowns over an interval from a state, shape (N, N); `mean` has shape (N,)."""
+    from railfix.kernels.tracking.backward import transition_matrix
+
+    epoch = np.zeros(1, dtype=EPOCH)
+    epoch["interval_s"], epoch["step"] = dt, singer(dt, limits.acceleration_mps2, limits.acceleration_s)[0]
+    return transition_matrix(float(mean[StateIndex.SPEED]), epoch[0], pack_parameters(limits, 0.0)[0], len(mean))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,78 +3,75 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.kernels.tracking.layout import CLOCKS, OFFSETS, SATELLITES, StateIndex, record_of
 from railfix.tracking.epochs import Previous
 
-#: Letters of the receiver clocks of codes, in the order of their offsets in the state.
-CLOCKS: Final = ("G", "E", "C", "R", "I")
+__all__ = [
+    "ANY_SPEED",
+    "CLOCKS",
+    "HYPOTHESIS",
+    "MONITORS",
+    "OFFSETS",
+    "SATELLITES",
+    "Bank",
+    "Monitors",
+    "StateIndex",
+    "TrackState",
+]
 
-
-class StateIndex(IntEnum):
-    """Place of each unknown in the state; offsets of the clocks and satellites' errors come after."""
-
-    #: Arc length, speed, acceleration along the trajectory [m, m/s, m/s2].
-    ARC = 0
-    SPEED = 1
-    ACCELERATION = 2
-    #: Arc length at the epoch before [m].
-    PREVIOUS_ARC = 3
-    #: Change of the clock of the carrier phases since the epoch before [m].
-    PHASE_CLOCK = 4
-    #: Drift of that clock [m/s].
-    DRIFT = 5
-    #: Error of the map to the right and up [m].
-    MAP_RIGHT = 6
-    MAP_UP = 7
-    #: Clock of the codes at this epoch [m].
-    CODE_CLOCK = 8
-    #: Error of the map's displacement since the epoch before: right, up, along [m].
-    STEP_RIGHT = 9
-    STEP_UP = 10
-    MAP_LENGTH_ERROR = 11
-    #: Share that the wheel's way is too short by.
-    WHEEL = 12
-    #: Offset of the accelerometer [m/s2].
-    FORCE_OFFSET = 13
-    #: Share that the radar's speed is too low by.
-    RADAR = 14
-    #: Time-correlated error of the speed by Dopplers [m/s].
-    DOPPLER_SPEED = 15
-    #: Displacement along the line by errors of the codes that last minutes (orbits, ionosphere) [m].
-    CODE_PLACE = 16
-    #: Speed at the epoch before [m/s].
-    PREVIOUS_SPEED = 17
-
-
-#: First offset of the clocks.
-OFFSETS: Final = len(StateIndex)
-#: First error of a satellite.
-SATELLITES: Final = OFFSETS + len(CLOCKS)
 #: Bounds of the speed where nothing is known of it [m/s].
 ANY_SPEED: Final = (-np.inf, np.inf)
-#: Unknowns that start again at every epoch: clock of the codes, displacements of the map.
-FRESH: Final = slice(StateIndex.CODE_CLOCK, StateIndex.MAP_LENGTH_ERROR + 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Monitors:
+    """Scalars of the state: what it has adapted to, and what contradicts it."""
+
+    #: How long the mean weights of motion and of codes have been low [s].
+    weak_motion_s: float = 0.0
+    weak_code_s: float = 0.0
+    #: Logarithms of the variances of Dopplers and of phases against those of the limits.
+    log_doppler_scale: float = 0.0
+    log_phase_scale: float = 0.0
+    #: Mean of the shifts that codes imply over the last epochs, in standard deviations, and its variance.
+    code_shift: float = 0.0
+    code_shift_variance: float = 0.0
+    #: Logarithm of the variance of lengths along the map against that of the limits, at least 0.
+    map_log_variance: float = 0.0
+    #: Sum of the contradictions of the velocity (`railfix.kernels.tracking.monitors`).
+    across: float = 0.0
+    #: One less the mean weight of Dopplers and phases lately; 0 where a sensor measures the speed.
+    motion_misfit: float = 0.0
+    step_s: float = 0.0  #: How long all codes have implied another place [s].
+    #: For how long the level is held back still, and that along the line, as other places were more probable than the
+    #: risk [s].
+    level_hold_s: float = 0.0
+    ambiguity_hold_s: float = 0.0
+    #: Time and distance since the hypotheses began [s, m].
+    branch_s: float = 0.0
+    branch_m: float = 0.0
+    distance_since_code_m: float = 0.0  #: Distance since codes were used [m].
+    direction: float = 0.0  #: Sign of the last speed with a direction.
+    #: Speeds that are possible after those measured so far (`railfix.kernels.tracking.model.narrow_speed_range`); no
+    #: bounds while there are several hypotheses [m/s].
+    least_speed_mps: float = ANY_SPEED[0]
+    most_speed_mps: float = ANY_SPEED[1]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bank:
-    """Sub-filters beside the most probable hypothesis, each without one source: B Gaussians over the same unknowns."""
+    """Sub-filters of the most probable hypothesis, each without one source: B Gaussians over the same unknowns."""
 
     #: A satellite ("G05"), a constellation by the letter of its clock ("G"), or a sensor ("wheel").
     without: tuple[str, ...]
     mean: Floats  #: Shape (B, N).
     covariance: Floats  #: Shape (B, N, N).
-    weak_s: Floats  #: How long the measurements of each have contradicted it; shape (B,).
-
-    @classmethod
-    def empty(cls, width: int) -> Bank:
-        """No sub-filter, for so many unknowns."""
-        return cls(without=(), mean=np.empty((0, width)), covariance=np.empty((0, width, width)), weak_s=np.empty(0))
+    contradicted_s: Floats  #: How long the measurements of each have contradicted it [s]; shape (B,).
 
 
 @dataclass(kw_only=True)
@@ -82,10 +79,10 @@ class TrackState:
     """State after an epoch: H hypotheses of N unknowns. Its arrays are never written to."""
 
     time: np.datetime64  #: Of the last epoch; NaT before the first.
-    mean: Floats  #: Shape (H, N).
+    mean: Floats  #: Units of `StateIndex`; shape (H, N).
     covariance: Floats  #: Shape (H, N, N).
     log_probability: Floats  #: Shape (H,).
-    origin_m: Floats  #: Arc length at which each hypothesis began; shape (H,).
+    origin_m: Floats  #: Arc length at which each hypothesis began [m]; shape (H,).
     satellite: Strings  #: Satellites whose errors are in the state; shape (N - SATELLITES,).
     seen: np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]  #: When each was last measured; shape (N - SATELLITES,).
     offset_known: Masks  #: Clocks that have had an observation; shape (len(CLOCKS),).
@@ -93,41 +90,19 @@ class TrackState:
     measured: np.datetime64  #: Last epoch with measurements that the filter used.
     #: Last epoch whose codes counted (`TrackingLimits.code_period_s`); NaT where the next ones do.
     coded: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    #: How long the mean weights of motion and codes have been low [s].
-    weak_motion_s: float = 0.0
-    weak_code_s: float = 0.0
-    #: Logarithm of the variance of Dopplers and of phases against that of the limits.
-    log_scale: tuple[float, float] = (0.0, 0.0)
-    #: Mean of the shifts that codes imply over the last epochs, and its variance.
-    code_shift: tuple[float, float] = (0.0, 0.0)
-    #: Logarithm of the variance of lengths along the map against that of the limits, at least 0.
-    map_log_variance: float = 0.0
-    #: Part of `log_probability` that the codes gave (`railfix.kernels.tracking.branches`); shape (H,).
+    #: Part of `log_probability` that the codes gave (`railfix.kernels.tracking.hypotheses`); shape (H,).
     log_code: Floats = field(default_factory=lambda: np.empty(0))
-    #: Mean innovation of each satellite's codes (`railfix.kernels.tracking.learning`); shape (N - SATELLITES,).
-    code_bias: Floats = field(default_factory=lambda: np.empty(0))
     #: Least logarithm of the probability lately: it rises with time (`railfix.kernels.tracking.constants.LEAST_RISE`);
     #: shape (H,).
     log_least: Floats = field(default_factory=lambda: np.empty(0))
     #: Evidence of the codes lately against laps within the error of the map (`RECENT_S` there); no probability;
     #: shape (H,).
     log_recent: Floats = field(default_factory=lambda: np.empty(0))
-    across: float = 0.0  #: Sum of the contradictions of the velocity (`railfix.kernels.tracking.monitors`).
-    #: How long all codes have implied another place, how long the level is withheld still, and how long that along
-    #: the line, as other places of it were more probable than the risk.
-    step_s: float = 0.0
-    withheld_s: float = 0.0
-    open_s: float = 0.0
-    motion_misfit: float = 0.0  #: One less the mean weight of Dopplers and phases lately; 0 with a speed by a sensor.
-    #: Time and distance since the hypotheses began.
-    branch_s: float = 0.0
-    branch_m: float = 0.0
+    #: Mean innovation of each satellite's codes over their standard deviation
+    #: (`railfix.kernels.tracking.adaptation`); shape (N - SATELLITES,).
+    code_bias: Floats = field(default_factory=lambda: np.empty(0))
+    monitors: Monitors = field(default_factory=Monitors)
     bank: Bank | None = None  #: None without levels.
-    distance_since_code_m: float = 0.0
-    direction: float = 0.0  #: Sign of the last speed with a direction.
-    #: Speeds that are possible after those measured so far (`railfix.kernels.tracking.prediction`); no bounds while
-    #: there are several hypotheses.
-    speed_range_mps: tuple[float, float] = ANY_SPEED
 
     @property
     def hypotheses(self) -> int:
@@ -151,17 +126,14 @@ class TrackState:
         )
 
     def reset(self) -> None:
-        """Restart: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
+        """Restart: no hypothesis, no sub-filter, no clock known, nothing adapted; the level stays held back."""
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.log_probability = self.log_code = self.log_least = self.log_recent = self.origin_m = np.empty(0)
-        self.branch_s = self.branch_m = self.across = self.step_s = self.motion_misfit = 0.0
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.code_bias = np.zeros(len(self.satellite))
-        self.weak_motion_s = self.weak_code_s = self.distance_since_code_m = self.direction = 0.0
-        self.code_shift = self.log_scale = (0.0, 0.0)
-        self.map_log_variance = 0.0
-        self.speed_range_mps = ANY_SPEED
+        held = self.monitors
+        self.monitors = Monitors(level_hold_s=held.level_hold_s, ambiguity_hold_s=held.ambiguity_hold_s)
         self.coded = np.datetime64("NaT", "ns")
         self.bank = None
 
@@ -183,6 +155,16 @@ class TrackState:
         self.code_bias = np.concatenate([self.code_bias[kept], np.zeros(len(new))])
         unseen = np.full(len(new), np.datetime64("NaT", "ns"), dtype="datetime64[ns]")
         self.seen = np.concatenate([self.seen[kept], unseen])
+
+
+#: What each hypothesis has beside its Gaussian, and the scalars of the state, as the recursion takes them: fields of
+#: these names. Times are seconds since the first epoch of a chunk.
+HYPOTHESIS: Final = record_of(
+    dict.fromkeys(("log_probability", "log_code", "log_least", "log_recent", "origin_m"), float)
+)
+MONITORS: Final = record_of(
+    dict.fromkeys((*Monitors.__dataclass_fields__, "measured_s", "coded_s"), float) | {"hypotheses": np.intp}
+)
 
 
 def _rearrange(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:

@@ -207,9 +207,10 @@ def power_signs(
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ
     joined = join_channels(channel, [state.channel], [young])
-    before = tuple(
-        joined.arrange(values, fill)
-        for values, fill in ((state.peak_db, -np.inf), (state.first_s, np.nan), (state.last_s, np.nan))
+    before = (
+        joined.arrange(state.peak_db, -np.inf),
+        joined.arrange(state.first_s, np.nan),
+        joined.arrange(state.last_s, np.nan),
     )
     fall, spread, difference, (peak, first, last) = kernels.screens.falls_of_cn0(
         now, kernel_array(joined.widen(cn0_dbhz, np.nan)), before, decay, _LONGEST_SILENCE_S, limits.known_after_s,

@@ -3,8 +3,8 @@
 From the model of `railfix.integrity.raim`::
 
     risk = RiskBudget()
-    model = constrained_model(ranges, trajectory, arc_m)
-    got = along_track_level(model, systems, risk=risk, n_excluded=n_excluded)
+    model = linear_model(ranges, trajectory, arc_m)
+    got = protection_level(model, systems, risk=risk, n_excluded=n_excluded)
     status = availability(got.level_m, 20.0, consistent=got.consistent)
 """
 

@@ -1,6 +1,6 @@
 # The names of `railfix.integrity.protection`, imported at their first use (lazy-loader).
 
-from .level import Cause, LevelStatus, ProtectionLevel, along_track_level, availability
+from .level import Cause, LevelStatus, ProtectionLevel, availability, protection_level
 from .risk import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
 
 __all__ = [
@@ -13,7 +13,7 @@ __all__ = [
     "LevelStatus",
     "ProtectionLevel",
     "RiskBudget",
-    "along_track_level",
     "availability",
     "k_factor",
+    "protection_level",
 ]

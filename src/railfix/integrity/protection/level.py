@@ -26,9 +26,6 @@ from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
-from railfix.integrity.raim.model import constrained_model
-from railfix.positioning.normal_equations import Ranges
-from railfix.track.trajectory import Trajectory
 
 _BLOCK_SIZE: Final = 200_000  #: Numbers of a pair array that a block of epochs holds.
 _OF_MORE: Final = 3  #: Number of the tails of three faults and more among those of all kinds.
@@ -109,7 +106,7 @@ class MapDeviation(NamedTuple):
     seen: tuple[Floats, Floats] | None = None
 
 
-def along_track_level(
+def protection_level(
     model: LinearModel,
     systems: Sequence[str],
     *,
@@ -125,7 +122,7 @@ def along_track_level(
     Parameters
     ----------
     model : LinearModel
-        T epochs on the line (`constrained_model`), after exclusions; 1/weight is the variance of the range.
+        T epochs on the line (`linear_model`), after exclusions; 1/weight is the variance of the range.
     systems : sequence of str, length M
         Constellation letter of each channel.
     scale : array_like, shape (T,) or ()
@@ -134,11 +131,18 @@ def along_track_level(
         By default the sigma of each range is that of its weight times the scale, without bias.
     sides : ndarray of bool, shape (T, S, M), optional
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
-    n_excluded : array_like of int, shape (T,) or ()
-        Satellites that fault detection left out at this epoch (not: what the screens rejected before).
+    n_excluded : array_like of int, shape (T,) or (), or ndarray of bool, shape (T, M)
+        Satellites that fault detection left out at this epoch (not: what the screens rejected before), as their number
+        or as `RaimResult.excluded`.
+
+    Raises
+    ------
+    ValueError
+        A noise scale that is not positive, systems that do not name each channel, or a satellite in the model that was
+        excluded: the positions are to be found again without it, as `exclude_faults` does.
     """
     if model.interest != 1:
-        raise ValueError("a level along the track needs a model on the line (constrained_model)")
+        raise ValueError("a level along the track needs a model on the line (linear_model)")
     risk, overbound, map_error = risk or RiskBudget(), overbound or RangeBounds(), map_error or MapDeviation()
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:
@@ -146,7 +150,15 @@ def along_track_level(
     scale = _broadcast(np.asarray(scale, dtype=np.float64), (epochs,))
     if (scale <= 0).any():
         raise ValueError("the noise scale must be positive")
-    out = _broadcast(np.asarray(n_excluded, dtype=np.int64), (epochs,))
+    excluded = np.asarray(n_excluded)
+    if excluded.ndim == 2:
+        if (excluded & model.used).any():
+            raise ValueError(
+                "the model uses satellites that were excluded; make it from the ranges and positions that "
+                "exclude_faults returns, which are without them"
+            )
+        excluded = excluded.sum(axis=1)
+    out = _broadcast(np.asarray(excluded, dtype=np.int64), (epochs,))
     groups = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
     plan = allocate(model, systems, risk, out, groups, wrong_map=map_error.seen is not None)
     given = Errors(
@@ -204,7 +216,7 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
 
 
 class Errors(NamedTuple):
-    """Errors of ranges and map that `along_track_level` is given; of shape (T, 0) for none."""
+    """Errors of ranges and map that `protection_level` is given; of shape (T, 0) for none."""
 
     scale: Floats
     least_sigma_m: Floats
@@ -357,29 +369,3 @@ def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayL
     status[level <= alarm_limit_m] = LevelStatus.AVAILABLE
     status[~np.isnan(level) & ~np.asarray(consistent)] = LevelStatus.ALARM
     return status
-
-
-def protection_level(
-    ranges: Ranges,
-    trajectory: Trajectory,
-    arc_m: Floats,
-    *,
-    satellite: Strings,
-    risk: RiskBudget | None = None,
-    scale: ArrayLike = 1.0,
-    n_excluded: ArrayLike = 0,
-) -> ProtectionLevel:
-    """Compute the protection level along the line: faults of satellites and constellations, without those of the map.
-
-    `ranges`, `trajectory`, `arc_m` and `scale` are as for `railfix.integrity.exclude_faults`, after the exclusions.
-
-    Parameters
-    ----------
-    satellite : ndarray of str, shape (M,)
-        Names, for the priors of their constellations.
-    n_excluded : array_like of int, shape (T,) or ()
-        Satellites that `exclude_faults` took out.
-    """
-    model = constrained_model(ranges, trajectory, arc_m)
-    systems = [name[0] for name in np.asarray(satellite).tolist()]
-    return along_track_level(model, systems, risk=risk, scale=scale, n_excluded=n_excluded)

@@ -19,7 +19,7 @@ from railfix.core.constants import ALONG
 from railfix.integrity.protection.risk import RiskBudget, one_sided_k
 from railfix.integrity.raim import LinearModel
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.search_index import SearchIndex
 
 _FURTHEST_M: Final = 5000.0  #: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
 _NEGLIGIBLE: Final = 0.01  #: Share of the risk of a sample below which places are not looked for.

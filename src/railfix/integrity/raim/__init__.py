@@ -4,10 +4,10 @@ One `LinearModel` serves the position on the line and the one in space::
 
     detection = detect(constrained.wsse, constrained.residual_m, ranges.n_used - ranges.n_clocks - 1, scale=scale)
     failing = np.flatnonzero(detection.detected)
-    model = constrained_model(ranges.take(failing), trajectory, constrained.arc_m[failing])
+    model = linear_model(ranges.take(failing), trajectory, constrained.arc_m[failing])
     exclusion = exclude(model, scale=scale[failing])
     # solve again without what `exclusion.excluded` marks, then
-    level = reliability(constrained_model(ranges, trajectory, constrained.arc_m), scale=scale).protection_level_m
+    level = reliability(linear_model(ranges, trajectory, constrained.arc_m), scale=scale).protection_level_m
 
 The noise scale multiplies the sigmas of the ranges after the fit: the fit itself, and with it the
 balance between ranges and map error, stays that of the weights.

@@ -20,9 +20,7 @@ from scipy.special import chdtri
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.core.settings import Settings
-from railfix.integrity.raim.model import Compact, LinearModel, compact, constrained_model
-from railfix.positioning.normal_equations import Ranges
-from railfix.track.trajectory import Trajectory
+from railfix.integrity.raim.model import Compact, LinearModel, compact
 
 _TABLE_STEP: Final = 64  #: Degrees of freedom are tabulated in steps of this many.
 
@@ -363,22 +361,3 @@ def worst_channel(model: LinearModel) -> Indices:
     checked = model.used & (share > LEAST_REDUNDANCY)
     drop = np.where(checked, model.residual**2 / np.where(checked, share, 1.0), 0.0)
     return np.asarray(np.argmax(drop, axis=1), dtype=np.intp)
-
-
-def exclude_faults(
-    ranges: Ranges, trajectory: Trajectory, arc_m: Floats, *, scale: ArrayLike = 1.0, limits: RaimLimits | None = None
-) -> Exclusion:
-    """Test the ranges of each epoch against each other and name up to two faulty satellites.
-
-    Positions without the excluded satellites are those of `position_on_line` with NaN in their codes.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        Of `railfix.positioning.weighted_ranges`.
-    arc_m : ndarray, shape (T,) [m]
-        Positions (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
-    scale : array_like, shape (T,) or ()
-        Noise of the receiver over that of the sigmas.
-    """
-    return exclude(constrained_model(ranges, trajectory, arc_m), limits=limits, scale=scale)

@@ -17,8 +17,9 @@ import numpy as np
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, Masks, RowArrays, kernel_array
-from railfix.positioning.normal_equations import Ranges
-from railfix.track.trajectory import Trajectory
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.normal_equations import Constrained
+from railfix.positioning.range_arrays import Ranges
 
 
 class ModelArrays(NamedTuple):
@@ -170,26 +171,37 @@ def compact(model: LinearModel) -> Compact:
     )  # fmt: skip
 
 
-def constrained_model(
-    ranges: Ranges, trajectory: Trajectory, arc_m: Floats, *, section: Indices | None = None
-) -> LinearModel:
-    """Model of positions along the line: distance d unknown, the map error a prior across and up (P1 2.2(3), P4).
+def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices | None = None) -> LinearModel:
+    """Return the model of positions on the line: distance d unknown, map error a prior across and up (P1 2.2(3), P4).
 
-    The prior is `sigma_plan_m` and `sigma_height_m` of the trajectory. `arc_m`, shape (T,), are positions as
-    `constrained_position` gives them, with `section` where they are points that two sections share. The model is NaN in
-    the epochs without a position.
+    The prior is `sigma_plan_m` and `sigma_height_m` of the trajectory. The model is NaN in the epochs without a
+    position.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Of `railfix.positioning.weighted_ranges`.
+    line : Trajectory, SearchIndex or AntennaRows
+    arc_m : ndarray, shape (T,) [m]
+        Positions from these ranges (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
+    section : ndarray of int, shape (T,), optional
+        Their sections (`Constrained.section`), needed for positions at points that two sections share.
     """
-    at = trajectory.segment_at(arc_m)[0] if section is None else section
-    place, axes = trajectory.at_arc(arc_m), trajectory.get_axes(at)
-    return model_on_line(ranges, place, axes, trajectory.sigma_plan_m, trajectory.sigma_height_m)
+    antennas = AntennaRows.on(line)
+    at = antennas.segment_at(arc_m) if section is None else np.maximum(section, 0)
+    prior = np.diag([0.0, 1.0 / antennas.sigma_plan_m**2, 1.0 / antennas.sigma_height_m**2])
+    return _model(ranges, antennas.at_arc(arc_m), antennas.get_axes(at), prior, unknowns=1)
 
 
-def model_on_line(
-    ranges: Ranges, place_ecef_m: Floats, axes: Floats, sigma_plan_m: float, sigma_height_m: float
+def update_model(
+    model: LinearModel, ranges: Ranges, antennas: AntennaRows, position: Constrained, epochs: Indices
 ) -> LinearModel:
-    """Return the model from places (T, 3) [m] and axes along, across and up there, shape (T, 3, 3)."""
-    prior = np.diag([0.0, 1.0 / sigma_plan_m**2, 1.0 / sigma_height_m**2])
-    return _model(ranges, place_ecef_m, axes, prior, unknowns=1)
+    """Return the model with that of some rising epochs made again, from other ranges and positions."""
+    for index, own in antennas.split(epochs):
+        model = model.patch(
+            own, linear_model(ranges.take(own), index, position.arc_m[own], section=position.section[own])
+        )
+    return model
 
 
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:

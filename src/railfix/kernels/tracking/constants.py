@@ -95,9 +95,9 @@ BIAS_SATELLITES: Final = 2
 #: Factor on the variance of codes that are left out: their innovations go on telling when the fault ends.
 BIAS_INFLATED: Final = 1e6
 #: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
-FREED_M: Final = 15.0
+INFLATED_M: Final = 15.0
 #: Not where all codes imply another place by more standard deviations: they may have stepped together.
-FREED_SIGMAS: Final = 3.0
+INFLATED_SIGMAS: Final = 3.0
 
 # Lengths of the map.
 #: Fewer codes of an epoch do not tell a shift from clocks.
@@ -168,12 +168,12 @@ BESIDE_SIGMAS: Final = 4.5
 BESIDE_M: Final = 8.0
 #: Young hypotheses bound nothing before one of them is this probable: the right place may not be among them yet.
 YOUNG: Final = 0.99
-YOUNG_HELD_S: Final = 1.0
+YOUNG_HOLD_S: Final = 1.0
 #: Codes that imply another place by more than so many standard deviations for so long [s] have stepped together.
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
 #: The level is withheld for so long after a step of all codes [s]: the place after it is the codes' own.
-STEP_HELD_S: Final = 300.0
+STEP_HOLD_S: Final = 300.0
 
 # Levels.
 #: Share of a distance that a source without codes may be wrong by: a worn or wrongly entered wheel.

@@ -1,321 +1,217 @@
-"""Arrays of the recursion: unknowns in use and their order, epochs, settings, state, work space, outputs."""
+"""Arrays of the recursion: the state's unknowns, records with their shapes and units, and what is handed on together.
+
+Records of numpy name the fields of an epoch, a channel, a sensor and a vertex. Those of the settings, of the state's
+scalars and of the results have the fields of `railfix.tracking.limits.TrackingLimits`,
+`railfix.tracking.state.Monitors` and `railfix.tracking.result.Tracked`, which define them.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from enum import IntEnum
+from typing import Any, Final, NamedTuple, TypeAlias
 
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
+import numpy as np
 
-#: Compact unknowns that are always there: place, speed, acceleration, drift, error of the map to the right and up,
-#: error of the speed by Dopplers, displacement of the codes.
-ARC, SPEED, ACCELERATION, DRIFT, RIGHT, UP, DOPPLER_SPEED, CODE_PLACE = 0, 1, 2, 3, 4, 5, 6, 7
-#: Unknowns of one epoch, after the compact ones: place and speed before, clock of the phases, displacement of the map
-#: to the right, up and along, clock of the codes.
-PREVIOUS_ARC, PREVIOUS_SPEED, PHASE_CLOCK, STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR, CODE_CLOCK = 0, 1, 2, 3, 4, 5, 6
-OF_EPOCH = 7
-#: Combinations of phases and Dopplers after the clock of the codes.
-C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
-COMBINED = 7
-#: Those of phases and Dopplers, and their order with clock and drift first, from `C_WAY` on.
-MOTION = 6
-CLOCKS_FIRST = 1, 5, 0, 4, 2, 3
-#: Numbers in a vector of the processor: rows of the matrices in the work space are whole vectors.
-LANES = 8
-#: Kinds of sensors, and their columns: wheel, radar, force, place, balises in turn, and one for each range to a unit.
-SENSORS = 7
+from railfix.core.arrays import Floats, Indices, Masks
+
+#: Array of records; the fields are in the definitions below.
+Records: TypeAlias = Any
+Record: TypeAlias = Any
+
+
+class StateIndex(IntEnum):
+    """Index of each unknown in the state; offsets of the clocks and satellites' code errors come after."""
+
+    #: Arc length, speed, acceleration along the trajectory [m, m/s, m/s2].
+    ARC = 0
+    SPEED = 1
+    ACCELERATION = 2
+    #: Arc length at the epoch before [m].
+    PREVIOUS_ARC = 3
+    #: Change of the clock of the carrier phases since the epoch before [m].
+    PHASE_CLOCK = 4
+    #: Drift of that clock [m/s].
+    DRIFT = 5
+    #: Error of the map to the right and up [m].
+    MAP_RIGHT = 6
+    MAP_UP = 7
+    #: Clock of the codes at this epoch [m].
+    CODE_CLOCK = 8
+    #: Error of the map's displacement since the epoch before: right, up, along [m].
+    STEP_RIGHT = 9
+    STEP_UP = 10
+    MAP_LENGTH_ERROR = 11
+    #: Wheel scale-factor error; + where the wheel's distance is too short; no unit.
+    WHEEL = 12
+    #: Offset of the accelerometer [m/s2].
+    FORCE_OFFSET = 13
+    #: Radar scale-factor error; + where its speed is too low; no unit.
+    RADAR = 14
+    #: Time-correlated error of the speed by Dopplers [m/s].
+    DOPPLER_SPEED = 15
+    #: Displacement along the line by code errors that last for minutes (orbits, ionosphere) [m].
+    SLOW_CODE = 16
+    #: Speed at the epoch before [m/s].
+    PREVIOUS_SPEED = 17
+
+
+(
+    ARC, SPEED, ACCELERATION, PREVIOUS_ARC, PHASE_CLOCK, DRIFT, MAP_RIGHT, MAP_UP, CODE_CLOCK, STEP_RIGHT, STEP_UP,
+    MAP_LENGTH_ERROR, WHEEL, FORCE_OFFSET, RADAR, DOPPLER_SPEED, SLOW_CODE, PREVIOUS_SPEED,
+) = map(int, StateIndex)  # fmt: skip
+#: Letters of the receiver clocks of codes, in the order of their offsets in the state.
+CLOCKS: Final = ("G", "E", "C", "R", "I")
+CLOCK_COUNT: Final = len(CLOCKS)
+#: Index of the first offset of the clocks, and of the first error of a satellite's codes, in its standard deviations.
+OFFSETS: Final = len(StateIndex)
+SATELLITES: Final = OFFSETS + CLOCK_COUNT
+#: Unknowns that start again at every epoch: clock of the codes, displacements of the map.
+PER_EPOCH: Final = (CODE_CLOCK, STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR)
+
+#: Quantities that phases and Dopplers are sums of: distance, change of the phases' clock, displacement of the map to
+#: the right and up, speed, drift.
+M_DISTANCE, M_CLOCK, M_RIGHT, M_UP, M_SPEED, M_DRIFT = 0, 1, 2, 3, 4, 5
+MOTION: Final = 6
+#: Unknowns in a quantity at most; the last is its clock.
+TERMS: Final = 7
+CLOCK_TERM: Final = TERMS - 1
+
+#: Kinds of GNSS measurements in a channel.
+CODE, PHASE, DOPPLER = 0, 1, 2
+#: Columns of sensors: wheel, radar, force, place, balises in turn, and one for each range to a ground unit.
+WHEEL_COLUMN, RADAR_COLUMN, FORCE_COLUMN, PLACE_COLUMN, RANGE_COLUMN = 0, 1, 2, 3, 6
+#: Kinds of sensors: the columns, all ranges together.
+SENSORS: Final = 7
 #: Sources of sub-filters after the sensors: all Dopplers, all phases, codes of satellites ahead, behind, the map; and
 #: none, for all satellites in view.
-OTHERS = 6
+OTHERS: Final = 6
 ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0, 1, 2, 3, 4, 5
-WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW, RANGE_ROW = 0, 1, 2, 3, 6
-#: Parts of an epoch: all of it; the prediction alone; what follows a prediction that is in the work space already,
-#: places sought in between; the same where the track was lost.
+#: Parts of an epoch: all of it; the prediction alone; what follows a prediction, places having been sought in between;
+#: the same where the track was lost.
 WHOLE, PREDICTION, REST, REST_LOST = 0, 1, 2, 3
 
 
-class Epochs(NamedTuple):
-    """T prepared epochs of K channels (`railfix.tracking.chunk.Chunk`) and sensors.
-
-    `begins` marks epochs before which the state restarts; `singer` is the row of `step` and `noise` of each
-    interval; columns of `sensor` and `sensor_sigma`: wheel, radar, force, place, two of balises, and R ranges to ground
-    units by a unit at `lever_m` along the line, to the right and up; NaN without a measurement. Those from the place on
-    were measured `sensor_age_s` before, shape (T, 3 + R).
-    """
-
-    time_s: Floats
-    interval_s: Floats
-    begins: Masks
-    singer: Indices
-    step: Floats
-    noise: Floats
-    slot: Indices
-    offset: Indices
-    sat_ecef_m: Floats
-    sat_velocity_mps: Floats
-    before_ecef_m: Floats
-    measured: Floats
-    has: Masks
-    variance: Floats
-    motion_measured: Masks
-    code_sigma_m: Floats
-    fresh: Masks
-    remembered: Masks
-    velocity_mps: Floats
-    velocity_covariance: Floats
-    velocity_age_s: Floats
-    sensor: Floats
-    sensor_sigma: Floats
-    range_unit_ecef_m: Floats
-    sensor_age_s: Floats
-    lever_m: Floats
-    unsigned: bool
+def record_of(fields: dict[str, Any]) -> np.dtype[Any]:
+    """Return the type of records with named fields: a type, or a type and the shape of an array."""
+    listed = [(name, *kind) if isinstance(kind, tuple) else (name, kind) for name, kind in fields.items()]
+    return np.dtype((np.record, np.dtype(listed, align=True)))
 
 
-class LineArrays(NamedTuple):
-    """`railfix.tracking.line.Line`, with the arc lengths of the middles of segments."""
-
-    arc_m: Floats
-    ecef_m: Floats
-    axes: Floats
-    segment: Floats
-    middle_m: Floats
-    gradient: Floats
-    sigma_plan_m: float
-    sigma_height_m: float
-    start_m: float
-    end_m: float
-    start_turn_m: float
-    end_turn_m: float
-
-
-class Parameters(NamedTuple):
-    """Settings (`railfix.tracking.limits.TrackingLimits`), degrees of freedom, and the budget of the level."""
-
-    degrees: tuple[float, float]
-    passes: int
-    code_correlation_s: float
-    code_correlation_m: float
-    slow_code_m: float
-    slow_code_s: float
-    doppler_error_mps: float
-    doppler_error_share: float
-    doppler_correlation_s: float
-    phase_walk_m: float
-    clock_walk_mps: float
-    offset_walk_m: float
-    map_roughness_m: float
-    map_correlation_m: float
-    map_scale_m: float
-    code_period_s: float
-    map_misfit_sigmas: float
-    map_misfit_s: float
-    map_misfit_kept_s: float
-    map_absolute_m: float
-    map_branch_m: float
-    code_common_m: float
-    code_common_s: float
-    code_common_travel_m: float
-    branch_floor: float
-    branch_floor_m: float
-    decided_travel_m: float
-    least_probability: float
-    most_hypotheses: int
-    start_sigma_m: float
-    service_acceleration_mps2: float
-    level_acceleration_mps2: float
-    trusted_satellites: int
-    gap_s: float
-    lost_motion_weight: float
-    lost_motion_s: float
-    lost_code_weight: float
-    lost_code_s: float
-    level_doubt_s: float
-    expired_sigma_m: float
-    level_passes: int
-    level_map_m: float
-    level_risk: float
-    level_k: float
-    level_k_speed: float
-    code_white_share: float
-    level_doubt_code_s: float
-    level_hold_s: float
-    end_doubt_s: float
-    start_separation_m: float
-    level_start_s: float
+#: One epoch.
+EPOCH: Final = record_of({
+    "time_s": float,  # since the first epoch of the chunk [s]
+    "interval_s": float,  # since the epoch before [s]
+    "begins": bool,  # the state restarts before it
+    "motion_measured": bool,  # phases or Dopplers of at least four satellites: they carry the place on without codes
+    "velocity_mps": (float, (3,)),  # ECEF, by phases or Dopplers without the line [m/s]; NaN without
+    "velocity_covariance": (float, (3, 3)),  # [m2/s2]
+    "velocity_age_s": float,  # how long before the epoch it holds [s]
+    "step": (float, (3, 3)),  # transition of arc length, speed and acceleration (R. A. Singer, 1970)
+    "noise": (float, (3, 3)),  # their process noise [m, m/s, m/s2 squared]
+})  # fmt: skip
+#: One channel at one epoch: measurements of one satellite.
+CHANNEL: Final = record_of({
+    "satellite": np.intp,  # of its code error among those of the state; -1 for one that is never measured
+    "clock": np.intp,  # of its codes in `CLOCKS`
+    "sat_ecef_m": (float, (3,)),  # at transmission [m]
+    "sat_velocity_mps": (float, (3,)),  # [m/s]
+    "before_ecef_m": (float, (3,)),  # at the epoch before [m]
+    "measured": (float, (3,)),  # code [m], change of the phase since the epoch before [m], range rate [m/s]
+    "has": (np.int8, (3,)),  # 1 where `measured` is a number that may be used
+    "variance": (float, (3,)),  # of white errors, before the scales learnt from residuals; of codes over a second
+    "code_sigma_m": float,  # of the satellite's correlated code error [m]
+})  # fmt: skip
+#: One sensor at one epoch.
+SENSOR: Final = record_of({
+    "value": float,  # distance [m], force [m/s2], place [m] or range [m]; NaN without
+    "sigma": float,  # its standard deviation
+    "age_s": float,  # how long before the epoch it was measured [s]; places, balises, ranges
+    "unsigned": bool,  # a distance without a sign, which takes that of the speed
+    "unit_ecef_m": (float, (3,)),  # ground unit of a range [m]
+    "lever_m": (float, (3,)),  # from the trajectory's point to the vehicle's unit: along, right, up [m]
+})  # fmt: skip
+#: One vertex of the line, and the segment after it.
+VERTEX: Final = record_of({
+    "arc_m": float,  # [m]
+    "ecef_m": (float, (3,)),  # [m]
+    "axes": (float, (3, 3)),  # tangent, right, up
+    "segment": (float, (3,)),  # unit vector of the segment
+    "middle_m": float,  # arc length of the segment's middle [m]
+    "gradient": float,  # climb over horizontal length of the segment
+})  # fmt: skip
+#: The line as a whole.
+LINE: Final = record_of({
+    "sigma_plan_m": float,  # of the map across [m]
+    "sigma_height_m": float,  # of the map's heights [m]
+    "start_m": float,  # open ends; infinite where closed [m]
+    "end_m": float,
+    "start_turn_m": float,  # length of the turn that goes on before the start or after the end, 0 where open [m]
+    "end_turn_m": float,
+})  # fmt: skip
+#: One source of faults, with the sub-filter without it.
+SOURCE: Final = record_of({
+    "running": bool,  # whether there is a sub-filter
+    "contradicted_s": float,  # how long its measurements have contradicted it [s]
+    "prior": float,  # probability of a fault; 0 needs no sub-filter
+    "k": float,  # sigmas that noise exceeds with the risk over that probability
+    "k_speed": float,  # the same for the speed
+    "clock": np.intp,  # of a satellite's codes in `CLOCKS`; 0 for other sources
+})  # fmt: skip
 
 
-class Active(NamedTuple):
-    """Compact unknowns that are in use: `full` is the place of each in the state, the others where to find them.
+class Given(NamedTuple):
+    """What the recursion reads: T epochs, K channels, C sensors, S satellites, V vertices, N unknowns."""
 
-    -1 where there is none; `satellite` and `offset` are by slot and by clock.
-    """
-
-    full: Indices
-    wheel: int
-    force: int
-    radar: int
-    offset: Indices
-    satellite: Indices
-
-
-class Inputs(NamedTuple):
-    """What the recursion is given and leaves as it is."""
-
-    epochs: Epochs
-    line: LineArrays
-    parameters: Parameters
-    active: Active
+    epoch: Records  #: `EPOCH`; shape (T,).
+    channel: Records  #: `CHANNEL`; shape (T, K).
+    sensor: Records  #: `SENSOR`; shape (T, C).
+    fresh: Masks  #: Satellites whose code error begins at an epoch; shape (T, S).
+    within_memory: Masks  #: Satellites whose code error lasts from before an epoch; shape (T, S).
+    vertex: Records  #: `VERTEX`; shape (V,).
+    line: Records  #: `LINE`; shape (1,).
+    parameters: Records  #: `TrackingLimits` and the budget of the level; shape (1,).
+    start_variance: Floats  #: Of each unknown where nothing is known of it; shape (N,).
 
 
-class KernelState(NamedTuple):
-    """State that is read and written: compact means and covariances, and `scalars` (`HYPOTHESES` and following)."""
+class State(NamedTuple):
+    """What the recursion reads and writes: H hypotheses and B sub-filters, Gaussians side by side."""
 
-    mean: Floats
-    covariance: Floats
-    log_probability: Floats
-    log_code: Floats
-    log_least: Floats
-    log_recent: Floats
-    code_bias: Floats
-    origin_m: Floats
-    offset_known: Masks
-    scalars: Floats
+    x: Floats  #: Means, hypotheses first; shape (H + B, N).
+    P: Floats  #: Covariances; shape (H + B, N, N).
+    hypothesis: Records  #: `railfix.tracking.state.HYPOTHESIS`; shape (H,).
+    monitors: Records  #: `railfix.tracking.state.Monitors`; shape (1,).
+    code_bias: Floats  #: Mean innovation of each satellite's codes over their sigma; shape (S,).
+    offset_known: Masks  #: Clocks that have had an observation; shape (CLOCK_COUNT,).
+    source: Records  #: `SOURCE`: satellites, clocks, sensors, others; shape (B,), 0 where levels are off.
 
 
-class Subfilters(NamedTuple):
-    """Sub-filters of the level by their source (`railfix.tracking.bank`): satellites by slot, clocks, sensors, others.
+class Results(NamedTuple):
+    """What the recursion writes of each epoch."""
 
-    None of them where levels are off. `running` marks those that there are; `prior` is the probability of a fault of
-    each source, 0 where it needs no sub-filter, `k` and `k_speed` the sigmas that follow from it; `begun` has the
-    variances of the compact unknowns and those of an epoch that one begins with; `clock` is that of each satellite.
-    """
+    epoch: Records  #: `railfix.tracking.result.EPOCH_RESULT`; shape (T,).
+    channel: Records  #: `railfix.tracking.result.CHANNEL_RESULT`; shape (T, K).
 
-    running: Masks
-    mean: Floats
-    covariance: Floats
-    weak_s: Floats
-    prior: Floats
-    k: Floats
-    k_speed: Floats
-    begun: Floats
-    clock: Indices
+
+class Trace(NamedTuple):
+    """What the smoother needs of one epoch: H hypotheses, N unknowns, M measurements at most; H is 0 without."""
+
+    prior: Floats  #: Covariances before the measurements; shape (H, N, N).
+    row: Floats  #: Measurement matrix, 0 for what was not used; shape (H, M, N).
+    value: Floats  #: Innovations; shape (H, M).
+    variance: Floats  #: Over the weights; infinite for what was not used; shape (H, M).
+    restarted: Masks  #: Unknowns that have restarted; shape (H, N).
+    kept: Indices  #: Earlier index of each hypothesis after the epoch; shape (H,).
 
 
 class Rows(NamedTuple):
-    """Channels of the codes, phases and Dopplers of an epoch and columns of its sensors, and how many of each."""
+    """Measurements of one epoch in their order: M rows of four kinds."""
 
-    codes: Indices
-    phases: Indices
-    dopplers: Indices
-    sensors: Indices
-    counts: Indices
-
-
-class Work(NamedTuple):
-    """Work space of an epoch of K channels, H hypotheses, N compact unknowns (`railfix.tracking.compiled`).
-
-    The first axis of most arrays is the hypothesis; its last row belongs to sub-filters and second starts.
-    """
-
-    mean: Floats
-    spread: Floats
-    now: Floats
-    before: Floats
-    design: Floats
-    value: Floats
-    innovation: Floats
-    sensed: Floats
-    cross: Floats
-    root: Floats
-    own: Floats
-    information: Floats
-    after: Floats
-    change: Floats
-    weight: Floats
-    residual: Floats
-    fitted: Floats
-    new_mean: Floats
-    new_covariance: Floats
-    log_before: Floats
-    log_after: Floats
-    evidence: Floats
-    code_evidence: Floats
-    branch: Floats
-    beyond: Floats
-    restarted: Masks
-    ranked: Indices
-    kept: Indices
-    joined: Floats
-    variance: Floats
-    masked: Floats
-    system: Floats
-    factor: Floats
-    lower: Floats
-    pivots: Floats
-    right: Floats
-    diagonal: Floats
-    with_clock: Floats
-    ordered: Floats
-    part: Floats
-    source: Masks
-    met: Masks
-    scaled: Floats
-    normal: Floats
-    motion: Floats
-    joint: Floats
-    found: Floats
-    stepped: Floats
-    faded: Floats
-    unknown: Indices
-    share: Floats
-    sight: Floats
-    bend: Floats
-    point: Floats
-    axes: Floats
-    places: Floats
-    place_axes: Floats
-
-
-#: Places of `KernelState.scalars`.
-HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, DISTANCE_SINCE_CODE, DIRECTION, MEASURED = range(8)
-SHIFT, SHIFT_VARIANCE, MAP_LOG_VARIANCE, LEAST_SPEED, MOST_SPEED, CODED, BRANCH_S, BRANCH_M = (
-    8,
-    9,
-    10,
-    11,
-    12,
-    13,
-    14,
-    15,
-)
-ACROSS, STEP_TIME, WITHHELD, OPEN, MOTION_MISFIT = 16, 17, 18, 19, 20
-
-
-class Outputs(NamedTuple):
-    """Arrays of `railfix.tracking.result.Tracked` that are written."""
-
-    status: Codes
-    arc_m: Floats
-    sigma_m: Floats
-    speed_mps: Floats
-    speed_sigma_mps: Floats
-    acceleration_mps2: Floats
-    probability: Floats
-    hypotheses: Integers
-    code_weight: Floats
-    motion_weight: Floats
-    wheel_scale: Floats
-    force_offset_mps2: Floats
-    radar_scale: Floats
-    map_scale: Floats
-    level_m: Floats
-    ground_level_m: Floats
-    level_noise_m: Floats
-    level_speed_mps: Floats
-    separation_m: Floats
-    amount_m: Floats
-    used: Integers
-    innovation: Floats
-    sensed: Floats
-    weight: Floats
-    faulty: Masks
+    #: Rows of each kind.
+    code: slice
+    phase: slice
+    doppler: slice
+    sensor: slice
+    channel: Indices  #: Channel of each row, of a sensor its column; shape (M,).
+    variance: Floats  #: Of white errors; shape (M,).
+    left_out: Masks  #: Codes of a satellite that is left out as faulty; shape (M,).
+    code_s: float  #: Time that the codes stand for [s]; 0 where they are not used.

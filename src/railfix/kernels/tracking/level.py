@@ -1,10 +1,8 @@
-"""Level of the filtered position by solution separation over a bank of sub-filters.
+"""Level of the filtered position by solution separation over the sub-filters, other branches and pairs of satellites.
 
-Each sub-filter runs the same recursion without one source (a satellite, a constellation, a sensor, all Dopplers, all
-phases, the codes of all satellites ahead or behind) or with a map that may be wrong, from its own beginning: a fault,
-however long it has lasted and whatever it has left in the state, is not in it. With the place s and its standard
-deviation sigma, those of the sub-filters, Q the upper tail of the normal distribution and p_b the probability that
-source b is faulty or was so recently that the filter still remembers it, the level L solves::
+With the place s and its standard deviation sigma, those of the sub-filters, Q the upper tail of the normal
+distribution and p_b the probability that source b is faulty or was so recently that the filter still remembers it, the
+level L solves::
 
     2 Q(L / sigma) + sum over b of p_b [Q((L - |s - s_b|) / sigma_b) + Q((L + |s - s_b|) / sigma_b)] = risk
 
@@ -17,326 +15,117 @@ epoch). The separation bounds the error, it is no test: robust filters can settl
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-from railfix.kernels.compiling import borrowing
-from railfix.kernels.tracking.algebra import invert, restart
-from railfix.kernels.tracking.constants import (
-    AHEAD,
-    JOINED,
-    PAIR_LEFT,
-    PAIR_SHARE,
-    PRECISION_M,
-    ROUNDS,
-)
-from railfix.kernels.tracking.course import find_ends, point_at
-from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.constants import PAIR_LEFT, PAIR_SHARE, PRECISION_M, ROUNDS
 from railfix.kernels.tracking.layout import (
-    ALL_DOPPLERS,
     ALL_IN_VIEW,
-    ALL_PHASES,
     ARC,
-    CODE_CLOCK,
     CODES_AHEAD,
     CODES_BEHIND,
-    COMBINED,
-    DRIFT,
-    MAP_LENGTH_ERROR,
-    OF_EPOCH,
-    OTHERS,
-    PHASE_CLOCK,
-    PREVIOUS_ARC,
-    RANGE_ROW,
-    RIGHT,
-    SENSORS,
+    MAP_RIGHT,
     SPEED,
-    UP,
     WRONG_MAP,
-    Epochs,
-    Inputs,
-    KernelState,
-    LineArrays,
-    Outputs,
-    Parameters,
-    Rows,
-    Subfilters,
-    Work,
+    Given,
+    Record,
+    State,
 )
-from railfix.kernels.tracking.prediction import add_bend, predict
-from railfix.kernels.tracking.update import apply_update, first_weights, fit, mean_weights, weigh_residuals
+from railfix.kernels.tracking.line import write_point
+from railfix.kernels.tracking.subfilters import find_others
 
 
-@borrowing
-def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, before: bool, work: Work) -> None:
-    """Mark the sources that an epoch needs a sub-filter for, and as `met` the clocks of all satellites in view.
+class Alternatives(NamedTuple):
+    """Other places that the train may be at, with their probabilities; shapes (A,)."""
 
-    Where there was none before, what the hypothesis has met before is still in it.
-    """
-    clocks = len(bank.running) - OTHERS - SENSORS - slots
-    source, met = work.source, work.met
-    for b in range(len(bank.running)):
-        source[b] = met[b] = False
-    several = 0
-    for i in range(rows.counts[0]):
-        clock = slots + epochs.offset[rows.codes[i]]
-        several += not source[clock]
-        source[clock] = True
-    for k in range(clocks):
-        source[slots + k] = source[slots + k] and several > 1
-    for k in range(epochs.has.shape[2]):
-        if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
-            source[epochs.slot[k]] = True
-    for j in range(rows.counts[3]):
-        source[slots + clocks + min(rows.sensors[j], RANGE_ROW)] = True
-    first = slots + clocks + SENSORS
-    source[first + ALL_DOPPLERS], source[first + ALL_PHASES] = rows.counts[2] > 0, rows.counts[1] > 0
-    for b in range(first + CODES_AHEAD, first + ALL_IN_VIEW):
-        source[b] = rows.counts[0] > 0
-    source[first + ALL_IN_VIEW] = not before
-    for k in range(slots):
-        if epochs.remembered[t, k]:
-            met[slots + bank.clock[k]] = True
-            source[k] = source[k] or not before
+    along_m: Floats  #: Distance along the line; 0 for a branch that is no bound along the line.
+    straight_m: Floats  #: Straight distance.
+    sigma_m: Floats
+    probability: Floats
 
 
-@borrowing
-def _begin(bank: Subfilters, b: int, copied: bool, best: int, parameters: Parameters, work: Work, h: int) -> None:
-    """Begin a sub-filter with the state of the filter, or with what is known of nothing but the place."""
-    mean, spread = work.mean, work.spread
-    width = mean.shape[1]
-    bank.running[b], bank.weak_s[b] = True, 0.0
-    for c in range(width):
-        mean[h, c] = mean[best, c] if copied else 0.0
-        for e in range(width):
-            spread[h, c, e] = spread[best, c, e] if copied else 0.0
-        if not copied:
-            spread[h, c, c] = bank.begun[c]
-    if not copied:
-        mean[h, ARC] = mean[h, width - OF_EPOCH + PREVIOUS_ARC] = mean[best, ARC]
-    if b == len(bank.running) - OTHERS + WRONG_MAP:
-        spread[h, RIGHT, RIGHT] += parameters.level_map_m**2
-        spread[h, UP, UP] += parameters.level_map_m**2
-
-
-@borrowing
-def _turn_map(wrong_m: float, work: Work, h: int) -> None:
-    """Turn the displacement of a map that may be wrong with the line: what was across in a bend is along after it.
-
-    It is in the distance on the map, not in that of the phases. What was along before is not known.
-    """
-    mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
-    length = n + MAP_LENGTH_ERROR
-    along = right = 0.0
-    for c in range(3):
-        along += work.axes[1, 1, c] * work.axes[0, 0, c]
-        right += work.axes[1, 1, c] * work.axes[0, 1, c]
-    mean[h, ARC] += along * mean[h, RIGHT]
-    mean[h, length] -= along * mean[h, RIGHT]
-    mean[h, RIGHT] *= right
-    for c in range(mean.shape[1]):
-        spread[h, ARC, c] += along * spread[h, RIGHT, c]
-        spread[h, length, c] -= along * spread[h, RIGHT, c]
-        spread[h, RIGHT, c] *= right
-    for c in range(mean.shape[1]):
-        spread[h, c, ARC] += along * spread[h, c, RIGHT]
-        spread[h, c, length] -= along * spread[h, c, RIGHT]
-        spread[h, c, RIGHT] *= right
-    spread[h, RIGHT, RIGHT] += (along * wrong_m) ** 2
-
-
-@borrowing
-def _update(inputs: Inputs, t: int, rows: Rows, best: int, work: Work, h: int) -> None:
-    """Update row `h` of the work space without the measurements whose `masked` variance is infinite."""
-    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
-    mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
-    for kind in range(3):
-        if work.restarted[best, kind]:
-            unknown = n + PHASE_CLOCK if kind == 0 else DRIFT
-            if kind == 2:
-                unknown = active.offset[epochs.offset[rows.codes[0]]]
-            mean[h, unknown] = mean[best, unknown]
-            restart(spread, unknown, spread[best, unknown, unknown], h)
-    mean[h, n + CODE_CLOCK] = mean[best, n + CODE_CLOCK]
-    work.now[h], work.before[h] = mean[h, ARC], mean[h, n + PREVIOUS_ARC]
-    write_equations(epochs, t, line, active, rows, 1.0, work, h)
-    move_sensor_equations(active, rows, best, work, h)
-    combine(epochs, t, active, rows, work, h)
-    size = rows.counts[0] + COMBINED + rows.counts[3]
-    invert(work.own, h, size, work.factor, work.pivots, work.lower, work.information, h)
-    first_weights(rows, work.masked, parameters.degrees, 0.0, 0.0, work, h, h)
-    for _ in range(parameters.level_passes - 1):
-        fit(rows, work.masked, work, h, h, h)
-        weigh_residuals(rows, work.masked, parameters.degrees, work, h)
-    apply_update(rows, work.masked, work, h)
-
-
-@borrowing
-def _is_contradicted(rows: Rows, parameters: Parameters, work: Work, h: int) -> bool:
-    """Return whether the measurements that a sub-filter uses, codes or phases and Dopplers, have lost their weight."""
-    code, motion = mean_weights(rows, work.masked, work, h)
-    return code < parameters.lost_code_weight or motion < parameters.lost_motion_weight
-
-
-@borrowing
-def advance_subfilters(
-    inputs: Inputs,
-    t: int,
-    bank: Subfilters,
-    rows: Rows,
-    best: int,
-    map_log_variance: float,
-    work: Work,
-    h: int,
-) -> None:
-    """Do an epoch of all sub-filters; `best` has the equations, `h` is free.
-
-    Each has equations of its own about its place: where the line bends between the two, those of the filter are none
-    of it. One that its own measurements contradict has settled somewhere else and restarts. The filter itself is
-    one without a source that it has not met. Where all restart, so does one with all satellites in view, until it
-    has become the filter: pairs are compared with it.
-    """
-    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
-    mean, spread = work.mean, work.spread
-    n, dt = mean.shape[1] - OF_EPOCH, epochs.interval_s[t]
-    nc, nph = rows.counts[0], rows.counts[1]
-    gnss = nc + nph + rows.counts[2]
-    slots = len(active.satellite)
-    clocks = len(bank.running) - OTHERS - SENSORS - slots
-    others = slots + clocks + SENSORS
-    all_in_view, before = others + ALL_IN_VIEW, False
-    for b in range(len(bank.running)):
-        before = before or bank.running[b]
-    before = before and not best
-    _sources(epochs, t, rows, bank, slots, before, work)
-    source, met = work.source, work.met
-    for b in range(len(bank.running)):
-        satellite = b < slots
-        if best or (satellite and not epochs.remembered[t, b]):
-            bank.running[b] = False
-        if bank.running[b] and bank.weak_s[b] >= parameters.lost_motion_s:
-            bank.running[b], met[b] = False, True
-        rises = satellite and before and source[b] and not bank.running[b] and not met[b] and bank.prior[b] > 0.0
-        begun_from = all_in_view if rises else b
-        if bank.running[begun_from]:
-            wrong_m = parameters.level_map_m if b == others + WRONG_MAP else 0.0
-            begun_mean, begun_covariance = bank.mean[begun_from], bank.covariance[begun_from]
-            predict(inputs, t, begun_mean, begun_covariance, map_log_variance, wrong_m, work, h)
-            find_ends(line, mean[h, ARC], mean[h, n + PREVIOUS_ARC], work)
-            if wrong_m > 0.0:
-                _turn_map(wrong_m, work, h)
-            add_bend(parameters, work, h)
-            sigma = math.sqrt(spread[h, ARC, ARC])
-            near = abs(mean[h, ARC] - mean[best, ARC]) < JOINED * sigma
-            near = near and sigma < (1.0 + JOINED) * math.sqrt(spread[best, ARC, ARC])
-            if near and (satellite or b == all_in_view) and not source[b]:
-                bank.running[b] = False
-                continue
-            if rises:
-                bank.running[b], bank.weak_s[b] = True, 0.0
-        elif source[b] and (bank.prior[b] > 0.0 or b == all_in_view):
-            _begin(bank, b, before and not met[b], best, parameters, work, h)
-        else:
-            continue
-        side = (1.0 if b == others + CODES_AHEAD else 0.0) - (1.0 if b == others + CODES_BEHIND else 0.0)
-        for i in range(gnss):
-            k = rows.codes[i] if i < nc else (rows.phases[i - nc] if i < nc + nph else rows.dopplers[i - nc - nph])
-            own = epochs.slot[k] if satellite else slots + epochs.offset[k]
-            out = own == b or (b == others + ALL_DOPPLERS and i >= nc + nph)
-            out = out or (b == others + ALL_PHASES and nc <= i < nc + nph)
-            out = out or (i < nc and side * work.design[best, i, 0] < -AHEAD)  # moving ahead shortens its range
-            work.masked[i] = math.inf if out else work.variance[i]
-        for j in range(rows.counts[3]):
-            own = slots + clocks + min(rows.sensors[j], RANGE_ROW)
-            work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
-        _update(inputs, t, rows, best, work, h)
-        if _is_contradicted(rows, parameters, work, h):
-            bank.weak_s[b] += dt
-        elif nc > 0:
-            bank.weak_s[b] = 0.0
-        if not math.isfinite(work.new_mean[h, ARC]):  # it restarts, and bounds nothing before
-            bank.weak_s[b] = parameters.lost_motion_s + parameters.level_doubt_s
-        for c in range(n):
-            bank.mean[b, c] = work.new_mean[h, c]
-            for e in range(n):
-                bank.covariance[b, c, e] = work.new_covariance[h, c, e]
-
-
-@borrowing
-def write_branches(state: KernelState, line: LineArrays, parameters: Parameters, work: Work, count: int) -> float:
-    """Write distance along the line, straight distance and sigma of other hypotheses than the first.
-
-    Returns the probability of those that are further along the line than a bound may reach.
-    """
-    far = 0.0
-    if count > 1:
-        point_at(line, state.mean[0, ARC], work.places, work.place_axes, 0)
+@inner
+def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
+    """Return the hypotheses but the first, and the probability of those further along the line than a bound reaches."""
+    count, far = state.monitors[0].hypotheses, 0.0
+    along, straight = np.empty(count - 1), np.empty(count - 1)
+    sigma, probability = np.empty(count - 1), np.empty(count - 1)
+    here, there, axes = np.empty(3), np.empty(3), np.empty((3, 3))
+    write_point(given.vertex, given.line[0], state.x[0, ARC], here, axes)
     for h in range(1, count):
-        point_at(line, state.mean[h, ARC], work.places, work.place_axes, h)
-        square = 0.0
-        for c in range(3):
-            square += (work.places[h, c] - work.places[0, c]) ** 2
-        apart = abs(state.mean[h, ARC] - state.mean[0, ARC])
-        work.branch[h, 0], work.branch[h, 1] = apart, math.sqrt(square)
-        work.branch[h, 2] = math.sqrt(state.covariance[h, ARC, ARC])
-        work.branch[h, 3] = math.exp(state.log_probability[h])
-        if apart > parameters.start_separation_m:
-            far += work.branch[h, 3]
-            work.branch[h, 0] = 0.0
-    return far
+        write_point(given.vertex, given.line[0], state.x[h, ARC], there, axes)
+        along[h - 1] = abs(state.x[h, ARC] - state.x[0, ARC])
+        straight[h - 1] = math.sqrt(((there - here) ** 2).sum())
+        sigma[h - 1] = math.sqrt(state.P[h, ARC, ARC])
+        probability[h - 1] = math.exp(state.hypothesis[h].log_probability)
+        if along[h - 1] > given.parameters[0].start_separation_m:
+            far += probability[h - 1]
+            along[h - 1] = 0.0
+    return Alternatives(along, straight, sigma, probability), far
 
 
-@borrowing
-def _add_pairs(
-    state: KernelState, bank: Subfilters, parameters: Parameters, work: Work, count: int, start: float
-) -> tuple[int, float]:
-    """Add pairs of faulty satellites to the branches, from row `count` on.
+@inner
+def _find_subfilters(state: State) -> Alternatives:
+    """Return the running sub-filters."""
+    first, size = len(state.hypothesis), 0
+    most = find_others(state) + ALL_IN_VIEW
+    away, sigma, probability = np.empty(most), np.empty(most), np.empty(most)
+    for b in range(most):
+        if state.source[b].running:
+            away[size] = abs(state.x[first + b, ARC] - state.x[0, ARC])
+            sigma[size], probability[size] = math.sqrt(state.P[first + b, ARC, ARC]), state.source[b].prior
+            size += 1
+    return Alternatives(away[:size], away[:size], sigma[:size], probability[:size])
+
+
+@inner
+def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, float]:
+    """Return the places without both satellites of a pair, and the risk spent on pairs that need no term.
 
     Information adds up: what is known of the place without both is the sum of what is known without each, less what
     is known with all in view. The standard deviation is mostly within a tenth of that of a filter without both; with
     few satellites it can be half of it.
 
-    Returns the number of rows, and the risk that is spent on pairs that have none: those that require less than the
-    level `start`, and those without whose satellites nothing is known, which nothing bounds.
+    Pairs without a term: those that require less than the level so far, and those without whose satellites nothing is
+    known, which nothing bounds.
     """
-    place, in_view, spent = state.mean[0, ARC], len(bank.running) - OTHERS + ALL_IN_VIEW, 0.0
-    whole, whole_shift = 1.0 / state.covariance[0, ARC, ARC], 0.0
-    if bank.running[in_view]:
-        whole = 1.0 / bank.covariance[in_view, ARC, ARC]
-        whole_shift = whole * (bank.mean[in_view, ARC] - place)
-    for first in range(len(bank.clock)):
-        if not (bank.running[first] and bank.prior[first] > 0.0):
+    source, first, satellites, spent, size = state.source, len(state.hypothesis), len(state.code_bias), 0.0, 0
+    most = satellites * (satellites - 1) // 2
+    away, sigma, probability = np.empty(most), np.empty(most), np.empty(most)
+    information, shift = np.zeros(satellites), np.zeros(satellites)
+    for k in range(satellites):
+        if source[k].running:
+            information[k] = 1.0 / state.P[first + k, ARC, ARC]
+            shift[k] = information[k] * (state.x[first + k, ARC] - state.x[0, ARC])
+    whole, whole_shift, in_view = 1.0 / state.P[0, ARC, ARC], 0.0, find_others(state) + ALL_IN_VIEW
+    if source[in_view].running:
+        whole = 1.0 / state.P[first + in_view, ARC, ARC]
+        whole_shift = whole * (state.x[first + in_view, ARC] - state.x[0, ARC])
+    for one in range(satellites):
+        if not (source[one].running and source[one].prior > 0.0):
             continue
-        information = 1.0 / bank.covariance[first, ARC, ARC] - whole
-        shift = (bank.mean[first, ARC] - place) / bank.covariance[first, ARC, ARC] - whole_shift
-        for second in range(first):
-            if not bank.running[second]:
+        for other in range(one):
+            if not source[other].running:
                 continue
-            remaining = information + 1.0 / bank.covariance[second, ARC, ARC]
-            prior = bank.prior[first] * bank.prior[second]
+            remaining, prior = information[one] - whole + information[other], source[one].prior * source[other].prior
             if remaining <= PAIR_LEFT * whole:
                 spent += prior
                 continue
-            away = abs(shift + (bank.mean[second, ARC] - place) / bank.covariance[second, ARC, ARC]) / remaining
-            tail = prior * math.erfc((start - away) * math.sqrt(0.5 * remaining))  # on the far side it is less
-            if tail < PAIR_SHARE * parameters.level_risk:
+            distance = abs(shift[one] - whole_shift + shift[other]) / remaining
+            tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))  # on the far side it is less
+            if tail < PAIR_SHARE * risk:
                 spent += tail
                 continue
-            work.branch[count, 0] = work.branch[count, 1] = away
-            work.branch[count, 2], work.branch[count, 3] = 1.0 / math.sqrt(remaining), prior
-            count += 1
-    return count, spent
+            away[size], sigma[size], probability[size] = distance, 1.0 / math.sqrt(remaining), prior
+            size += 1
+    return Alternatives(away[:size], away[:size], sigma[:size], probability[:size]), spent
 
 
-@borrowing
-def write_level(
-    state: KernelState,
-    count: int,
-    far: float,
-    bank: Subfilters,
-    parameters: Parameters,
-    work: Work,
-    outputs: Outputs,
-    t: int,
-) -> None:
+@inner
+def write_level(given: Given, state: State, branches: Alternatives, far: float, result: Record) -> None:
     """Write the level of the first hypothesis and its parts.
 
     Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
@@ -345,72 +134,71 @@ def write_level(
     the line it is infinite where another place of it, further away than a bound may
     reach, is more probable than the risk; the straight distance is bounded with all branches and a map that lies aside.
     """
-    place, sigma = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC])
-    noise, apart, branches = parameters.level_k * sigma, math.nan, count
-    start, contradicted, others = noise, False, len(bank.running) - OTHERS
+    parameters, source, first, others = given.parameters[0], state.source, len(state.hypothesis), find_others(state)
+    sigma = math.sqrt(state.P[0, ARC, ARC])
+    noise, apart = parameters.level_k * sigma, math.nan
+    start, contradicted = noise, False
     for b in range(others + ALL_IN_VIEW):
-        if bank.running[b]:
-            contradicted = contradicted or bank.weak_s[b] > parameters.level_doubt_s
-            away = abs(bank.mean[b, ARC] - place)
+        if source[b].running:
+            contradicted = contradicted or source[b].contradicted_s > parameters.level_doubt_s
+            away = abs(state.x[first + b, ARC] - state.x[0, ARC])
             if b < others + CODES_AHEAD or b > others + CODES_BEHIND:  # without half of the codes: apart by noise
                 apart = away if math.isnan(apart) else max(apart, away)
-            start = max(start, away + bank.k[b] * math.sqrt(bank.covariance[b, ARC, ARC]))
-    outputs.level_noise_m[t], outputs.separation_m[t] = noise, apart
-    outputs.level_m[t] = outputs.ground_level_m[t] = math.inf
+            start = max(start, away + source[b].k * math.sqrt(state.P[first + b, ARC, ARC]))
+    result.level_noise_m, result.separation_m = noise, apart
+    result.level_m = result.ground_level_m = math.inf
     if math.isnan(apart) or contradicted:
         return
-    count, spent = _add_pairs(state, bank, parameters, work, count, start)
+    pairs, spent = _find_pairs(state, parameters.level_risk, start)
     risk = parameters.level_risk - spent
     if risk <= 0.0:
         return
-    outputs.ground_level_m[t] = _solve(state, count, bank, risk, work, 1, start)
-    if branches == 1:
-        outputs.level_m[t] = outputs.ground_level_m[t]
+    alternatives = join(join(_find_subfilters(state), branches), pairs)
+    result.ground_level_m = solve_level(sigma, alternatives.straight_m, alternatives, risk, start)
+    if len(branches.sigma_m) == 0:
+        result.level_m = result.ground_level_m
     elif far <= risk:
-        outputs.level_m[t] = _solve(state, count, bank, risk, work, 0, start)
-    wrong = others + WRONG_MAP
-    if bank.running[wrong]:
-        aside = abs(bank.mean[wrong, RIGHT]) + 2.0 * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
-        outputs.ground_level_m[t] = math.hypot(outputs.ground_level_m[t], aside)
+        result.level_m = solve_level(sigma, alternatives.along_m, alternatives, risk, start)
+    if source[others + WRONG_MAP].running:
+        row = first + others + WRONG_MAP
+        aside = abs(state.x[row, MAP_RIGHT]) + 2.0 * math.sqrt(state.P[row, MAP_RIGHT, MAP_RIGHT])
+        result.ground_level_m = math.hypot(result.ground_level_m, aside)
 
 
-@borrowing
-def _solve(
-    state: KernelState,
-    count: int,
-    bank: Subfilters,
-    risk: float,
-    work: Work,
-    which: int,
-    start: float,
-) -> float:
-    """Find the level with the risk of all hypotheses together; `which`: column of distances of branches and pairs.
+@inner
+def join(one: Alternatives, other: Alternatives) -> Alternatives:
+    """Return the alternatives of both."""
+    first, size = len(one.sigma_m), len(one.sigma_m) + len(other.sigma_m)
+    both = Alternatives(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
+    for part, start in ((one, 0), (other, first)):
+        for a in range(len(part.sigma_m)):
+            both.along_m[start + a], both.straight_m[start + a] = part.along_m[a], part.straight_m[a]
+            both.sigma_m[start + a], both.probability[start + a] = part.sigma_m[a], part.probability[a]
+    return both
+
+
+@inner
+def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk: float, start: float) -> float:
+    """Return the level whose risk is spent by the place and all alternatives, some distances away, together.
 
     Newton's steps of its logarithm within a bracket, from the largest that one hypothesis alone requires: they must
     not begin where a branch makes it flat.
     """
-    place, sigma, level = state.mean[0, ARC], math.sqrt(state.covariance[0, ARC, ARC]), start
-    for h in range(1, count):
-        excess = work.branch[h, 3] / (2.0 * risk)
+    level, own, probability = start, alternatives.sigma_m, alternatives.probability
+    for a in range(len(own)):
+        excess = probability[a] / (2.0 * risk)
         k = math.sqrt(2.0 * math.log(excess)) if excess > 1.0 else 0.0
-        level = max(level, work.branch[h, which] + k * work.branch[h, 2])
-    low, high, sources = 0.0, math.inf, len(bank.running) - OTHERS + ALL_IN_VIEW
+        level = max(level, distance[a] + k * own[a])
+    low, high = 0.0, math.inf
     for _ in range(ROUNDS):
         away = level / sigma
         spent = math.erfc(away / math.sqrt(2.0))
         slope = 2.0 * math.exp(-0.5 * away * away) / sigma
-        for side in (-1.0, 1.0):
-            for b in range(sources):
-                if bank.running[b]:
-                    own = math.sqrt(bank.covariance[b, ARC, ARC])
-                    away = (level + side * abs(bank.mean[b, ARC] - place)) / own
-                    spent += bank.prior[b] * 0.5 * math.erfc(away / math.sqrt(2.0))
-                    slope += bank.prior[b] * math.exp(-0.5 * away * away) / own
-            for h in range(1, count):
-                prior, own = work.branch[h, 3], work.branch[h, 2]
-                away = (level + side * work.branch[h, which]) / own
-                spent += prior * 0.5 * math.erfc(away / math.sqrt(2.0))
-                slope += prior * math.exp(-0.5 * away * away) / own
+        for a in range(len(own)):
+            for side in (-1.0, 1.0):
+                away = (level + side * distance[a]) / own[a]
+                spent += probability[a] * 0.5 * math.erfc(away / math.sqrt(2.0))
+                slope += probability[a] * math.exp(-0.5 * away * away) / own[a]
         slope /= math.sqrt(2.0 * math.pi)
         if spent > risk:
             low = level
@@ -425,12 +213,12 @@ def _solve(
     return level
 
 
-@borrowing
-def speed_bound(speed: float, sigma: float, bank: Subfilters, parameters: Parameters) -> float:
+@inner
+def bound_speed(parameters: Record, state: State, sigma: float) -> float:
     """Return the bound of the error of the speed: what carries the level over the epochs until the next one."""
-    bound = parameters.level_k_speed * sigma
-    for b in range(len(bank.running) - OTHERS + ALL_IN_VIEW):
-        if bank.running[b]:
-            own = math.sqrt(bank.covariance[b, SPEED, SPEED])
-            bound = max(bound, abs(bank.mean[b, SPEED] - speed) + bank.k_speed[b] * own)
-    return bound
+    bound, first = parameters.level_k_speed * sigma, len(state.hypothesis)
+    for b in range(find_others(state) + ALL_IN_VIEW):
+        if state.source[b].running:
+            away = abs(state.x[first + b, SPEED] - state.x[0, SPEED])
+            bound = max(bound, away + state.source[b].k_speed * math.sqrt(state.P[first + b, SPEED, SPEED]))
+    return float(bound)

@@ -1,12 +1,14 @@
-"""Which measurements an epoch has, their variances, and the clocks that begin with them."""
+"""Choice of an epoch's measurements, their variances, and the clocks that begin with them."""
 
 from __future__ import annotations
 
 import math
 
-from railfix.core.arrays import Floats
-from railfix.kernels.compiling import borrowing
-from railfix.kernels.tracking.algebra import insert, median, middle, restart
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.adaptation import is_faulty
 from railfix.kernels.tracking.constants import (
     BIAS_INFLATED,
     DIRECTION_MPS,
@@ -16,168 +18,159 @@ from railfix.kernels.tracking.constants import (
     UNKNOWN_CLOCK,
 )
 from railfix.kernels.tracking.layout import (
+    CLOCK_COUNT,
+    CODE,
     CODE_CLOCK,
-    CODED,
-    DIRECTION,
+    DOPPLER,
     DRIFT,
-    HYPOTHESES,
-    OF_EPOCH,
+    OFFSETS,
+    PHASE,
     PHASE_CLOCK,
-    RANGE_ROW,
-    SCALE_DOPPLER,
-    SCALE_PHASE,
+    RANGE_COLUMN,
     SPEED,
-    WHEEL_ROW,
-    Active,
-    Epochs,
-    KernelState,
-    Outputs,
-    Parameters,
+    WHEEL_COLUMN,
+    Given,
     Rows,
-    Work,
+    State,
 )
-from railfix.kernels.tracking.learning import is_faulty
+from railfix.kernels.tracking.model import restart
+from railfix.kernels.tracking.update import Equations, median
 
 #: Times since that differ by less are equal: their rounding depends on where a chunk begins [s].
 TIE_S = 1e-6
 
 
-@borrowing
-def code_interval_s(epochs: Epochs, t: int, parameters: Parameters, state: KernelState, outputs: Outputs) -> float:
-    """Time that the codes of an epoch stand for [s]; 0 where they are not used, as others were within the period.
+@inner
+def _code_interval_s(given: Given, t: int, state: State) -> float:
+    """Return the time that the codes of an epoch stand for [s]; 0 where they are not used.
 
-    Their variances are settled with it, those of codes that are left out are inflated.
+    They are not used where phases or Dopplers carry on and others were used within the period.
     """
-    dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - state.scalars[CODED], False
-    for k in range(epochs.has.shape[2]):
-        coded = coded or epochs.has[0, t, k]
+    epoch, period = given.epoch[t], given.parameters[0].code_period_s
+    dt, since, coded = epoch.interval_s, epoch.time_s - state.monitors[0].coded_s, False
+    for k in range(given.channel.shape[1]):
+        coded = coded or given.channel[t, k].has[CODE]
     if not coded:
         return float(dt)
-    recent = epochs.motion_measured[t] and since < parameters.code_period_s - 0.5 * dt - TIE_S
-    code_s = 0.0 if recent else min(max(since, dt), max(parameters.code_period_s, dt))
-    for k in range(epochs.has.shape[2]):
-        if recent:
-            epochs.has[0, t, k] = False
+    if epoch.motion_measured and since < period - 0.5 * dt - TIE_S:
+        return 0.0
+    return float(min(max(since, dt), max(period, dt)))
+
+
+@inner
+def _is_sensor_used(given: Given, t: int, column: int, state: State) -> bool:
+    """Return whether a sensor has measured; a wheel without a sign needs a direction, a range to a unit a speed."""
+    sensor, monitors = given.sensor[t, column], state.monitors[0]
+    used = math.isfinite(sensor.value) and (column < RANGE_COLUMN or abs(state.x[0, SPEED]) >= STILL_MPS)
+    if column == WHEEL_COLUMN and sensor.unsigned and monitors.direction == 0.0:
+        for h in range(monitors.hypotheses):
+            used = used and abs(state.x[h, SPEED]) > DIRECTION_MPS
+    return used
+
+
+@inner
+def choose_measurements(given: Given, t: int, state: State) -> Rows:
+    """Return the measurements of an epoch, codes first, then changes of phases, Dopplers and sensors."""
+    channels, sensors, monitors = given.channel.shape[1], given.sensor.shape[1], state.monitors[0]
+    most = 3 * channels + sensors
+    channel, variance = np.empty(most, dtype=np.intp), np.empty(most)
+    left_out, ends, size = np.zeros(most, dtype=np.bool_), np.zeros(3, dtype=np.intp), 0
+    code_s = _code_interval_s(given, t, state)
+    for kind in range(3):
+        scale = 1.0
+        if kind == PHASE:
+            scale = math.exp(monitors.log_phase_scale)
+        elif kind == DOPPLER:
+            scale = math.exp(monitors.log_doppler_scale)
+        for k in range(channels):
+            record = given.channel[t, k]
+            if not record.has[kind] or (kind == CODE and code_s == 0.0):
+                continue
+            channel[size], variance[size] = k, record.variance[kind] * scale
+            if kind == CODE:
+                variance[size] /= min(code_s, 1.0)
+                known = not given.fresh[t, record.satellite]
+                if known and is_faulty(state.code_bias[record.satellite]):
+                    left_out[size] = True
+                    variance[size] *= BIAS_INFLATED
+            size += 1
+        ends[kind] = size
+    for column in range(sensors):
+        if _is_sensor_used(given, t, column, state):
+            channel[size], variance[size] = column, given.sensor[t, column].sigma ** 2
+            size += 1
+    return Rows(
+        slice(0, ends[0]), slice(ends[0], ends[1]), slice(ends[1], ends[2]), slice(ends[2], size), channel[:size],
+        variance[:size], left_out[:size], code_s,
+    )  # fmt: skip
+
+
+@inner
+def start_clocks(
+    given: Given, t: int, rows: Rows, offset_known: Masks, x: Floats, P: Floats, equations: Equations, restarted: Masks
+) -> None:
+    """Start the clocks of an epoch in a predicted Gaussian, and take them off its innovations.
+
+    The median of each kind of innovation goes into its clock; clocks that have stepped restart. `restarted` gets
+    whether the clock of the phases, their drift, and the offset of the first constellation have.
+    """
+    restarted[:] = False
+    if rows.code.stop > 0:
+        restarted[2] = _start_code_clocks(given, t, rows, offset_known, x, P, equations)
+    for kind in (PHASE, DOPPLER):
+        own = rows.phase if kind == PHASE else rows.doppler
+        if own.stop == own.start:
             continue
-        epochs.variance[0, t, k] /= min(code_s, 1.0)
-        slot = epochs.slot[k]
-        if slot >= 0 and epochs.has[0, t, k] and not epochs.fresh[t, slot]:
-            outputs.faulty[t, k] = is_faulty(state.code_bias[slot])
-            if outputs.faulty[t, k]:
-                epochs.variance[0, t, k] *= BIAS_INFLATED
-    return float(code_s)
+        away, unknown = median(equations.value[own]), PHASE_CLOCK if kind == PHASE else DRIFT
+        variance = P[unknown, unknown]
+        if variance > UNKNOWN_CLOCK**2 or abs(away) > STEPPED * math.sqrt(variance + 0.25):
+            x[unknown] += away
+            equations.value[own] -= away
+            restart(P, unknown, UNKNOWN_CLOCK**2)
+            restarted[kind - 1] = True
 
 
-@borrowing
-def choose_rows(epochs: Epochs, t: int, rows: Rows) -> None:
-    """List the channels of each kind of measurement."""
-    counts = rows.counts
-    for kind in range(4):
-        counts[kind] = 0
-    for k in range(epochs.has.shape[2]):
-        if epochs.has[0, t, k]:
-            rows.codes[counts[0]] = k
-            counts[0] += 1
-        if epochs.has[1, t, k]:
-            rows.phases[counts[1]] = k
-            counts[1] += 1
-        if epochs.has[2, t, k]:
-            rows.dopplers[counts[2]] = k
-            counts[2] += 1
-
-
-@borrowing
-def choose_sensors(epochs: Epochs, t: int, state: KernelState, rows: Rows, work: Work) -> None:
-    """List the sensors that have measured; a wheel without a sign needs a direction, a range to a unit a speed."""
-    count = int(state.scalars[HYPOTHESES])
-    for kind in range(epochs.sensor.shape[1]):
-        known = math.isfinite(epochs.sensor[t, kind])
-        known = known and (kind < RANGE_ROW or abs(work.mean[0, SPEED]) >= STILL_MPS)
-        if kind == WHEEL_ROW and epochs.unsigned and state.scalars[DIRECTION] == 0.0:
-            for h in range(count):
-                known = known and abs(work.mean[h, SPEED]) > DIRECTION_MPS
-        if known:
-            rows.sensors[rows.counts[3]] = kind
-            rows.counts[3] += 1
-
-
-@borrowing
-def write_variances(epochs: Epochs, t: int, state: KernelState, rows: Rows, variance: Floats) -> None:
-    """Write the variances of the measurements, with what has been learnt of phases and Dopplers."""
-    nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
-    for i in range(nc):
-        variance[i] = epochs.variance[0, t, rows.codes[i]]
-    for i in range(nph):
-        variance[nc + i] = epochs.variance[1, t, rows.phases[i]] * math.exp(state.scalars[SCALE_PHASE])
-    for i in range(nd):
-        variance[nc + nph + i] = epochs.variance[2, t, rows.dopplers[i]] * math.exp(state.scalars[SCALE_DOPPLER])
-    for j in range(rows.counts[3]):
-        variance[nc + nph + nd + j] = epochs.sensor_sigma[t, rows.sensors[j]] ** 2
-
-
-@borrowing
-def _start_code_clocks(epochs: Epochs, active: Active, state: KernelState, rows: Rows, work: Work, h: int) -> None:
+@inner
+def _start_code_clocks(
+    given: Given, t: int, rows: Rows, known: Masks, x: Floats, P: Floats, equations: Equations
+) -> bool:
     """Take the median innovation of the codes into their clock, and those of new constellations into their offsets.
 
-    At the first epoch the first constellation is that of the clock.
+    At the first epoch the first constellation is that of the clock. Returns whether it is the first epoch.
     """
-    mean, value, ordered, known = work.mean, work.value, work.ordered, state.offset_known
-    n, nc, first, some = mean.shape[1] - OF_EPOCH, rows.counts[0], epochs.offset[rows.codes[0]], False
-    for g in range(len(known)):
-        some = some or known[g]
-    if not some:
-        unknown = active.offset[first]
-        work.spread[h, unknown, unknown] = FIRST_OFFSET_M2
-        work.restarted[h, 2] = True
-    size = 0
-    for i in range(nc):
-        if known[epochs.offset[rows.codes[i]]]:
-            insert(ordered, size, value[h, i])
-            size += 1
-    begun = size == 0
-    for i in range(nc):
-        if begun and epochs.offset[rows.codes[i]] == first:
-            insert(ordered, size, value[h, i])
-            size += 1
-    clock = middle(ordered, size)
-    mean[h, n + CODE_CLOCK] += clock
-    for g in range(len(known)):
-        own = clock
-        if not known[g] and not (begun and g == first):
-            size = 0
-            for i in range(nc):
-                if epochs.offset[rows.codes[i]] == g:
-                    insert(ordered, size, value[h, i])
-                    size += 1
-            if size > 0:
-                own = middle(ordered, size)
-                mean[h, active.offset[g]] += own - clock
-        for i in range(nc):
-            if epochs.offset[rows.codes[i]] == g:
-                value[h, i] -= own
+    codes, value = rows.code.stop, equations.value
+    clock_of, some = np.empty(codes, dtype=np.intp), False
+    for j in range(codes):
+        clock_of[j] = given.channel[t, rows.channel[j]].clock
+        some = some or known[clock_of[j]]
+    first, begins = clock_of[0], True
+    for g in range(CLOCK_COUNT):
+        begins = begins and not known[g]
+    if begins:
+        P[OFFSETS + first, OFFSETS + first] = FIRST_OFFSET_M2
+    settled = np.empty(CLOCK_COUNT, dtype=np.bool_)
+    for g in range(CLOCK_COUNT):
+        settled[g] = known[g] if some else g == first
+    clock = _median_of_clocks(value, clock_of, settled)
+    x[CODE_CLOCK] += clock
+    for g in range(CLOCK_COUNT):
+        own, away = np.zeros(CLOCK_COUNT, dtype=np.bool_), clock
+        own[g] = True
+        if not settled[g]:
+            away = _median_of_clocks(value, clock_of, own)
+            x[OFFSETS + g] += 0.0 if math.isnan(away) else away - clock
+        for j in range(codes):
+            if clock_of[j] == g:
+                value[j] -= away
+    return bool(begins)
 
 
-@borrowing
-def start_clocks(epochs: Epochs, active: Active, state: KernelState, rows: Rows, work: Work, h: int) -> None:
-    """Take the median of each kind of innovation into its clock; clocks that have stepped restart."""
-    mean, spread, value = work.mean, work.spread, work.value
-    n = mean.shape[1] - OF_EPOCH
-    work.restarted[h, 0] = work.restarted[h, 1] = work.restarted[h, 2] = False
-    if rows.counts[0] > 0:
-        _start_code_clocks(epochs, active, state, rows, work, h)
-    begin = rows.counts[0]
-    for kind in range(1, 3):
-        end = begin + rows.counts[kind]
-        if end > begin:
-            away = median(value, h, begin, end - begin, work.ordered)
-            unknown = n + PHASE_CLOCK if kind == 1 else DRIFT
-            own_variance = spread[h, unknown, unknown]
-            stepped = own_variance > UNKNOWN_CLOCK**2
-            stepped = stepped or abs(away) > STEPPED * math.sqrt(own_variance + 0.25)
-            if stepped:
-                mean[h, unknown] += away
-                for i in range(begin, end):
-                    value[h, i] -= away
-                restart(spread, unknown, UNKNOWN_CLOCK**2, h)
-                work.restarted[h, kind - 1] = True
-        begin = end
+@inner
+def _median_of_clocks(value: Floats, clock_of: Indices, chosen: Masks) -> float:
+    """Return the median innovation of the codes of some clocks; NaN without any."""
+    some, size = np.empty(len(clock_of)), 0
+    for j in range(len(clock_of)):
+        if chosen[clock_of[j]]:
+            some[size] = value[j]
+            size += 1
+    return median(some[:size])

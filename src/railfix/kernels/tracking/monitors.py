@@ -1,14 +1,16 @@
 """Monitors of the filter's place: velocity across the line, the open end of a map, a step of all codes.
 
-Where one of them speaks against the place its level is withheld; where it lasts the track is lost, and places are
-sought over the whole line.
+Where one of them contradicts the place its level is held back; where it lasts the track is lost, and places are sought
+over the whole line.
 """
 
 from __future__ import annotations
 
 import math
 
-from railfix.kernels.compiling import borrowing
+import numpy as np
+
+from railfix.kernels.compiling import inner
 from railfix.kernels.tracking.constants import (
     ACROSS_DOUBT,
     ACROSS_LOST,
@@ -22,122 +24,107 @@ from railfix.kernels.tracking.constants import (
     MOTION_FIT,
     REACH_M,
     REACH_SIGMAS,
-    STEP_HELD_S,
+    STEP_HOLD_S,
     STEP_S,
     STEP_SIGMAS,
     VELOCITY_FLOOR_MPS,
     YOUNG,
-    YOUNG_HELD_S,
+    YOUNG_HOLD_S,
 )
-from railfix.kernels.tracking.course import point_at
-from railfix.kernels.tracking.layout import (
-    ACCELERATION,
-    ACROSS,
-    ARC,
-    BRANCH_S,
-    HYPOTHESES,
-    MAP_LOG_VARIANCE,
-    MOTION_MISFIT,
-    OTHERS,
-    RIGHT,
-    SHIFT,
-    SHIFT_VARIANCE,
-    SPEED,
-    STEP_TIME,
-    WEAK_CODE,
-    WEAK_MOTION,
-    WITHHELD,
-    WRONG_MAP,
-    Epochs,
-    KernelState,
-    LineArrays,
-    Parameters,
-    Subfilters,
-    Work,
-)
+from railfix.kernels.tracking.layout import ACCELERATION, ARC, MAP_RIGHT, SPEED, WRONG_MAP, Given, Record, State
+from railfix.kernels.tracking.line import write_point
+from railfix.kernels.tracking.subfilters import find_others
 
 
-@borrowing
-def contradiction(
-    epochs: Epochs, t: int, line: LineArrays, parameters: Parameters, state: KernelState, work: Work, h: int
-) -> float:
+@inner
+def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
     """Return the square of the velocity against that of the place over its variance; NaN without a velocity.
 
     Along the line and across it, at the best of three places that the place's standard deviation allows.
     """
-    velocity, covariance, axes = epochs.velocity_mps, epochs.velocity_covariance, work.axes
-    if not math.isfinite(velocity[t, 0]):
+    epoch, line, x, P = given.epoch[t], given.line[0], state.x[h], state.P[h]
+    velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance
+    if not math.isfinite(velocity[0]):
         return math.nan
-    reach = max(REACH_M, REACH_SIGMAS * math.sqrt(state.covariance[h, ARC, ARC]))
-    age_s = epochs.velocity_age_s[t]
-    speed = state.mean[h, SPEED] - age_s * state.mean[h, ACCELERATION]
-    floor, least = 0.0, math.inf
+    reach = max(REACH_M, REACH_SIGMAS * math.sqrt(P[ARC, ARC]))
+    speed = x[SPEED] - epoch.velocity_age_s * x[ACCELERATION]
+    square, least, point, axes = 0.0, math.inf, np.empty(3), np.empty((3, 3))
     for c in range(3):
-        floor += velocity[t, c] * velocity[t, c]
-    direction = max(DIRECTION_SHARE, math.sqrt(2.0) * line.sigma_plan_m / parameters.map_correlation_m)
-    floor = VELOCITY_FLOOR_MPS**2 + direction**2 * floor
-    for turn in range(3):
-        point_at(line, state.mean[h, ARC] - age_s * speed + (turn - 1) * reach, work.point, axes, 0)
+        square += velocity[c] * velocity[c]
+    direction = max(DIRECTION_SHARE, math.sqrt(2.0) * line.sigma_plan_m / given.parameters[0].map_correlation_m)
+    floor = VELOCITY_FLOOR_MPS**2 + direction**2 * square
+    for turn in (-1.0, 0.0, 1.0):
+        write_point(given.vertex, line, x[ARC] - epoch.velocity_age_s * speed + turn * reach, point, axes)
         total = 0.0
         for k in range(2):
-            away, own = -speed if k == 0 else 0.0, floor
+            away, variance = -speed if k == 0 else 0.0, floor
             for c in range(3):
-                away += velocity[t, c] * axes[0, k, c]
+                away += velocity[c] * axes[k, c]
                 for e in range(3):
-                    own += axes[0, k, c] * covariance[t, c, e] * axes[0, k, e]
+                    variance += axes[k, c] * covariance[c, e] * axes[k, e]
             if k == 0:
-                own += state.covariance[h, SPEED, SPEED]
-            total += away * away / own
+                variance += P[SPEED, SPEED]
+            total += away * away / variance
         least = min(least, total)
     return least
 
 
-@borrowing
-def watch(
-    parameters: Parameters,
-    state: KernelState,
-    bank: Subfilters,
-    square: float,
-    shift: float,
-    beyond_m: float,
-    dt: float,
-    code_s: float,
+@inner
+def update_monitors(
+    parameters: Record, state: State, square: float, shift: float, beyond_m: float, dt: float, code_s: float
 ) -> None:
     """Take the contradictions of an epoch into the state.
 
-    `square` is `contradiction` of the most probable hypothesis, `shift` the one that its codes imply, `beyond_m` how
+    `square` is `compute_contradiction` of the hypothesis reported, `shift` the one that its codes imply, `beyond_m` how
     far its place is beyond an open end of the line, `code_s` the time that the codes stand for.
     """
-    scalars = state.scalars
+    monitors = state.monitors[0]
     if not math.isnan(square):
         gained = (min(square, LARGEST_SQUARE) - ALLOWED_SQUARE) * min(dt, 1.0)
-        scalars[ACROSS] = max(scalars[ACROSS] + gained, 0.0)
-    if beyond_m > 0.0 and scalars[WEAK_MOTION] >= parameters.end_doubt_s:
-        scalars[ACROSS] = ACROSS_LOST
-    if code_s > 0.0:
-        stepped = abs(shift) > STEP_SIGMAS
-        scalars[STEP_TIME] = scalars[STEP_TIME] + code_s if stepped else max(scalars[STEP_TIME] - 0.5 * code_s, 0.0)
-    withheld = 0.0
-    doubtful = scalars[WEAK_CODE] > parameters.level_doubt_code_s or scalars[WEAK_MOTION] > parameters.level_doubt_s
-    doubtful = doubtful or scalars[MOTION_MISFIT] > 1.0 - MOTION_FIT
-    if doubtful or scalars[ACROSS] > ACROSS_DOUBT or beyond_m > 0.0:
-        withheld = parameters.level_hold_s
-    if scalars[BRANCH_S] < parameters.level_start_s:
+        monitors.across = max(monitors.across + gained, 0.0)
+    if beyond_m > 0.0 and monitors.weak_motion_s >= parameters.end_doubt_s:
+        monitors.across = ACROSS_LOST
+    if code_s > 0.0 and abs(shift) > STEP_SIGMAS:
+        monitors.step_s += code_s
+    elif code_s > 0.0:
+        monitors.step_s = max(monitors.step_s - 0.5 * code_s, 0.0)
+    hold = 0.0
+    if _is_doubtful(parameters, monitors) or beyond_m > 0.0:
+        hold = parameters.level_hold_s
+    if monitors.branch_s < parameters.level_start_s:
         largest = -math.inf
-        for h in range(int(scalars[HYPOTHESES])):
-            largest = max(largest, state.log_probability[h])
+        for h in range(monitors.hypotheses):
+            largest = max(largest, state.hypothesis[h].log_probability)
         if largest < math.log(YOUNG):
-            withheld = YOUNG_HELD_S
-    if scalars[SHIFT] ** 2 > DRIFT_SIGMAS**2 * scalars[SHIFT_VARIANCE] or scalars[MAP_LOG_VARIANCE] > DRIFT_LOG:
-        withheld = parameters.level_hold_s
-    for b in range(len(bank.running)):
-        if bank.running[b] and bank.weak_s[b] > parameters.level_doubt_s:
-            withheld = parameters.level_hold_s
-    wrong = len(bank.running) - OTHERS + WRONG_MAP
-    if wrong >= 0 and bank.running[wrong]:
-        reach = BESIDE_SIGMAS * math.sqrt(bank.covariance[wrong, RIGHT, RIGHT])
-        if abs(bank.mean[wrong, RIGHT]) > max(BESIDE_M, reach):
-            withheld = parameters.level_hold_s
-    if scalars[STEP_TIME] >= STEP_S:
-        withheld = STEP_HELD_S
-    scalars[WITHHELD] = max(scalars[WITHHELD] - dt, withheld)
+            hold = YOUNG_HOLD_S
+    drift = monitors.code_shift**2 > DRIFT_SIGMAS**2 * monitors.code_shift_variance
+    if drift or monitors.map_log_variance > DRIFT_LOG or _is_contradicted_by_subfilter(parameters, state):
+        hold = parameters.level_hold_s
+    if monitors.step_s >= STEP_S:
+        hold = STEP_HOLD_S
+    monitors.level_hold_s = max(monitors.level_hold_s - dt, hold)
+
+
+@inner
+def _is_doubtful(parameters: Record, monitors: Record) -> bool:
+    """Return whether codes, motion or the velocity across the line contradict the place."""
+    return bool(
+        monitors.weak_code_s > parameters.level_doubt_code_s
+        or monitors.weak_motion_s > parameters.level_doubt_s
+        or monitors.motion_misfit > 1.0 - MOTION_FIT
+        or monitors.across > ACROSS_DOUBT
+    )
+
+
+@inner
+def _is_contradicted_by_subfilter(parameters: Record, state: State) -> bool:
+    """Return whether a sub-filter is contradicted by its measurements, or that of the map lies aside."""
+    for b in range(len(state.source)):
+        if state.source[b].running and state.source[b].contradicted_s > parameters.level_doubt_s:
+            return True
+    wrong = find_others(state) + WRONG_MAP
+    if wrong < 0 or not state.source[wrong].running:
+        return False
+    row = len(state.hypothesis) + wrong
+    reach = BESIDE_SIGMAS * math.sqrt(state.P[row, MAP_RIGHT, MAP_RIGHT])
+    return bool(abs(state.x[row, MAP_RIGHT]) > max(BESIDE_M, reach))

@@ -1,16 +1,18 @@
-"""Epochs one after the other: the recursion of the filter along the track.
+"""The filter along the track, epoch by epoch.
 
-Places are sought outside (`railfix.tracking.search`), between the prediction of an epoch and what follows it.
+An epoch reads: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt and monitor, correct
+the sub-filters, prune, level and status. Places are sought outside (`railfix.tracking.search`), between the prediction
+of an epoch and what follows it.
 """
 
 from __future__ import annotations
 
 import math
 
-from railfix.core.arrays import Floats
-from railfix.kernels.compiling import borrowing, borrowing_kernel
-from railfix.kernels.tracking.algebra import invert, log_determinant, restart
-from railfix.kernels.tracking.branches import keep_hypotheses, leading, reweigh
+import numpy as np
+
+from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
 from railfix.kernels.tracking.constants import (
     ACROSS_DOUBT,
     ACROSS_LOST,
@@ -20,8 +22,8 @@ from railfix.kernels.tracking.constants import (
     DIRECTION_MPS,
     DOUBTFUL,
     EXPIRED,
-    FREED_M,
-    FREED_SIGMAS,
+    INFLATED_M,
+    INFLATED_SIGMAS,
     LEAST_RISE,
     LOST,
     MOTION_FIT,
@@ -34,351 +36,356 @@ from railfix.kernels.tracking.constants import (
     TRACKING,
     WEAK_FIT,
 )
-from railfix.kernels.tracking.course import beyond_end, on_course
-from railfix.kernels.tracking.equations import combine, write_equations
+from railfix.kernels.tracking.equations import linearise, new_equations
+from railfix.kernels.tracking.evidence import compute_evidence, refit_inflated_prior
+from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
-    ACROSS,
     ARC,
-    BRANCH_M,
-    BRANCH_S,
-    CODED,
-    COMBINED,
-    DIRECTION,
-    DISTANCE_SINCE_CODE,
-    HYPOTHESES,
-    MAP_LOG_VARIANCE,
-    MEASURED,
-    MOTION_MISFIT,
-    OF_EPOCH,
-    OPEN,
-    OTHERS,
+    CODE,
+    DRIFT,
+    FORCE_OFFSET,
+    MOTION,
+    OFFSETS,
+    PHASE_CLOCK,
     PREDICTION,
     PREVIOUS_ARC,
+    RADAR,
+    RANGE_COLUMN,
     REST,
     REST_LOST,
+    SATELLITES,
     SPEED,
-    WEAK_CODE,
-    WEAK_MOTION,
+    TERMS,
+    WHEEL,
     WHOLE,
-    WITHHELD,
     WRONG_MAP,
-    Active,
-    Epochs,
-    Inputs,
-    KernelState,
-    LineArrays,
-    Outputs,
-    Parameters,
+    Given,
+    Results,
     Rows,
-    Subfilters,
-    Work,
+    State,
+    Trace,
 )
-from railfix.kernels.tracking.learning import code_shift, learn, write_rows
-from railfix.kernels.tracking.level import advance_subfilters, speed_bound, write_branches, write_level
-from railfix.kernels.tracking.measurements import (
-    choose_rows,
-    choose_sensors,
-    code_interval_s,
-    start_clocks,
-    write_variances,
+from railfix.kernels.tracking.level import bound_speed, find_branches, write_level
+from railfix.kernels.tracking.line import excess_beyond_end, wrap_arc, write_point
+from railfix.kernels.tracking.measurements import choose_measurements, start_clocks
+from railfix.kernels.tracking.model import add_bend, narrow_speed_range, predict, restart
+from railfix.kernels.tracking.monitors import compute_contradiction, update_monitors
+from railfix.kernels.tracking.subfilters import advance_subfilters, find_others
+from railfix.kernels.tracking.update import (
+    Correction,
+    correct_state,
+    mean_weights,
+    new_fit,
+    predict_quantities,
+    reweight,
+    write_first_weights,
 )
-from railfix.kernels.tracking.monitors import contradiction, watch
-from railfix.kernels.tracking.prediction import add_bend, possible, predict
-from railfix.kernels.tracking.references import by_reference
-from railfix.kernels.tracking.update import apply_update, first_weights, mean_weights, reweight, second_start
 
 
-@borrowing
-def _wrap_closed_line(line: LineArrays, state: KernelState, bank: Subfilters) -> None:
-    """Let places beyond an end of a closed line go on where it closes."""
-    for h in range(int(state.scalars[HYPOTHESES])):
-        back = on_course(line, state.mean[h, ARC]) - state.mean[h, ARC]
-        if back != 0.0:
-            state.mean[h, ARC] += back
-            state.origin_m[h] += back
-            for b in range(len(bank.running)):
-                if h == 0 and bank.running[b]:
-                    bank.mean[b, ARC] += back
-
-
-@borrowing
-def _needs_search(epochs: Epochs, t: int, parameters: Parameters, state: KernelState) -> bool:
+@inner
+def _needs_search(given: Given, t: int, state: State) -> bool:
     """Return whether places have to be sought before an epoch: the track is lost or in doubt, or after a gap."""
-    scalars = state.scalars
-    lost = scalars[WEAK_MOTION] >= parameters.lost_motion_s or scalars[WEAK_CODE] >= parameters.lost_code_s
-    lost = lost or scalars[ACROSS] >= ACROSS_LOST
-    beside = scalars[WEAK_MOTION] >= BESIDE_AFTER_S or scalars[ACROSS] >= ACROSS_DOUBT
-    beside = beside or scalars[MOTION_MISFIT] > 1.0 - MOTION_FIT
-    beside = beside and scalars[MEASURED] > epochs.time_s[t] - 1.5 * epochs.interval_s[t]
+    epoch, parameters, monitors = given.epoch[t], given.parameters[0], state.monitors[0]
+    lost = monitors.weak_motion_s >= parameters.lost_motion_s or monitors.weak_code_s >= parameters.lost_code_s
+    lost = lost or monitors.across >= ACROSS_LOST
+    doubtful = monitors.weak_motion_s >= BESIDE_AFTER_S or monitors.across >= ACROSS_DOUBT
+    doubtful = doubtful or monitors.motion_misfit > 1.0 - MOTION_FIT
+    doubtful = doubtful and monitors.measured_s > epoch.time_s - 1.5 * epoch.interval_s
     coded = False
-    for k in range(epochs.has.shape[2]):
-        coded = coded or epochs.has[0, t, k]
-    gap = coded and epochs.time_s[t] - scalars[MEASURED] > parameters.gap_s
-    return bool(lost or gap or (beside and scalars[HYPOTHESES] <= parameters.most_hypotheses // 2))
+    for k in range(given.channel.shape[1]):
+        coded = coded or given.channel[t, k].has[CODE]
+    gap = coded and epoch.time_s - monitors.measured_s > parameters.gap_s
+    return bool(lost or gap or (doubtful and monitors.hypotheses <= parameters.most_hypotheses // 2))
 
 
-@borrowing
-def _reset_code_errors(epochs: Epochs, t: int, active: Active, state: KernelState, bank: Subfilters) -> None:
+@inner
+def _reset_code_errors(given: Given, t: int, state: State) -> None:
     """Make the code errors of satellites that come into view independent of all else."""
-    for i in range(epochs.fresh.shape[1]):
-        if epochs.fresh[t, i]:
-            k = active.satellite[i]
+    for i in range(given.fresh.shape[1]):
+        if given.fresh[t, i]:
             state.code_bias[i] = 0.0
-            for h in range(int(state.scalars[HYPOTHESES])):
-                state.mean[h, k] = 0.0
-                restart(state.covariance, k, 1.0, h)
-            for b in range(len(bank.running)):
-                if bank.running[b]:
-                    bank.mean[b, k] = 0.0
-                    restart(bank.covariance, k, 1.0, b)
+            for row in range(len(state.x)):
+                state.x[row, SATELLITES + i] = 0.0
+                restart(state.P[row], SATELLITES + i, 1.0)
 
 
-@borrowing
-def _take(mean: Floats, covariance: Floats, to: int, new_mean: Floats, new_covariance: Floats, h: int) -> None:
-    """Copy a row of the compact unknowns."""
-    for c in range(mean.shape[1]):
-        mean[to, c] = new_mean[h, c]
-        for e in range(mean.shape[1]):
-            covariance[to, c, e] = new_covariance[h, c, e]
+@inner
+def _wrap_closed_line(given: Given, state: State) -> None:
+    """Let places beyond an end of a closed line go on where it closes."""
+    for h in range(state.monitors[0].hypotheses):
+        back = wrap_arc(given.vertex, given.line[0], state.x[h, ARC]) - state.x[h, ARC]
+        if back != 0.0:
+            state.x[h, ARC] += back
+            state.hypothesis[h].origin_m += back
+            if h == 0:
+                state.x[len(state.hypothesis) :, ARC] += back
 
 
-@borrowing
-def _predict_all(inputs: Inputs, t: int, state: KernelState, work: Work) -> None:
-    """Predict all hypotheses."""
-    scale = state.scalars[MAP_LOG_VARIANCE]
-    for h in range(int(state.scalars[HYPOTHESES])):
-        predict(inputs, t, state.mean[h], state.covariance[h], scale, 0.0, work, h)
+@inner
+def _predict_all(given: Given, t: int, state: State) -> None:
+    """Predict all hypotheses and sub-filters."""
+    monitors, first, scratch = state.monitors[0], len(state.hypothesis), np.empty(state.P.shape[1:])
+    for h in range(monitors.hypotheses):
+        predict(given, t, state.x[h], state.P[h], monitors.map_log_variance, 0.0, scratch)
+    for b in range(len(state.source)):
+        if state.source[b].running:
+            wrong_m = given.parameters[0].level_map_m if b == find_others(state) + WRONG_MAP else 0.0
+            predict(given, t, state.x[first + b], state.P[first + b], monitors.map_log_variance, wrong_m, scratch)
 
 
-@borrowing
-def _coast(inputs: Inputs, t: int, state: KernelState, bank: Subfilters, work: Work, h: int) -> None:
-    """Take over the prediction of all hypotheses and sub-filters where nothing is measured; row `h` is free."""
-    for k in range(int(state.scalars[HYPOTHESES])):
-        _take(state.mean, state.covariance, k, work.mean, work.spread, k)
-    for b in range(len(bank.running)):
-        if bank.running[b]:
-            scale = state.scalars[MAP_LOG_VARIANCE]
-            wrong_m = inputs.parameters.level_map_m if b == len(bank.running) - OTHERS + WRONG_MAP else 0.0
-            predict(inputs, t, bank.mean[b], bank.covariance[b], scale, wrong_m, work, h)
-            _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
+@inner
+def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) -> Correction:
+    """Return the correction of a predicted hypothesis up to its innovations."""
+    x, P, equations, restarted = state.x[h].copy(), state.P[h].copy(), new_equations(rows), np.zeros(3, dtype=np.bool_)
+    linearise(given, t, rows, x, (x[ARC], x[PREVIOUS_ARC]), state.monitors[0].direction, equations)
+    add_bend(given, (x[ARC], x[PREVIOUS_ARC]), P)
+    start_clocks(given, t, rows, state.offset_known, x, P, equations, restarted)
+    covariance, without_clock = predict_quantities(P, equations)
+    return Correction(
+        x, P, equations, covariance, without_clock, new_fit(rows), equations.value.copy(), restarted, x.copy(), P.copy()
+    )
 
 
-@borrowing
-def _measure(
-    inputs: Inputs, t: int, state: KernelState, bank: Subfilters, rows: Rows, work: Work, shift: float, code_s: float
-) -> int:
-    """Take over what an epoch's measurements have given, and learn from it; return the hypothesis to go by."""
-    epochs, scalars, count = inputs.epochs, state.scalars, int(state.scalars[HYPOTHESES])
-    map_log_variance = scalars[MAP_LOG_VARIANCE]
-    for h in range(count):
-        _take(state.mean, state.covariance, h, work.new_mean, work.new_covariance, h)
-    scalars[MEASURED] = epochs.time_s[t]
-    if rows.counts[0] > 0:
-        scalars[CODED] = epochs.time_s[t]
-    for i in range(rows.counts[0]):
-        state.offset_known[epochs.offset[rows.codes[i]]] = True
-    best = leading(state, count)
-    found = learn(inputs, t, state, rows, work, best, shift, code_s)
-    if len(bank.running):
-        advance_subfilters(inputs, t, bank, rows, best, map_log_variance, work, len(work.now) - 1)
-    if found and abs(shift) < FREED_SIGMAS:
-        for h in range(count):
-            state.covariance[h, ARC, ARC] += FREED_M**2
-        for b in range(len(bank.running)):
-            bank.covariance[b, ARC, ARC] += FREED_M**2
-    square, dt = contradiction(epochs, t, inputs.line, inputs.parameters, state, work, best), epochs.interval_s[t]
-    watch(inputs.parameters, state, bank, square, 0.0 if best else shift, work.beyond[best], dt, code_s)
-    return best
+@inner
+def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple[list[Correction], float]:
+    """Return the corrections of all hypotheses, and the shift that codes imply for the one reported so far.
 
-
-@borrowing
-def _update(inputs: Inputs, t: int, state: KernelState, rows: Rows, work: Work) -> float:
-    """Write all hypotheses after an epoch's measurements; return the shift that codes ask of the one in the lead."""
-    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
-    mean, new_mean = work.mean, work.new_mean
-    n, room = mean.shape[1] - OF_EPOCH, mean.shape[0] - 1
-    count, nc = int(state.scalars[HYPOTHESES]), rows.counts[0]
-    gnss = nc + rows.counts[1] + rows.counts[2]
-    size = nc + COMBINED + rows.counts[3]
-    going = leading(state, count)
-    shift, doubtful = 0.0, False
-    for turn in range(1 + RELINEARISED):
-        furthest = 0.0
-        for h in range(count):
-            work.now[h] = new_mean[h, ARC] if turn else mean[h, ARC]
-            work.before[h] = new_mean[h, n] if turn else mean[h, n + PREVIOUS_ARC]
-            write_equations(epochs, t, line, active, rows, state.scalars[DIRECTION], work, h)
-            if turn == 0:
-                add_bend(parameters, work, h)
-                start_clocks(epochs, active, state, rows, work, h)
-                for i in range(gnss + rows.counts[3]):
-                    work.innovation[h, i] = work.value[h, i]
-            combine(epochs, t, active, rows, work, h)
-            invert(work.own, h, size, work.factor, work.pivots, work.lower, work.information, h)
-            work.log_before[h] = log_determinant(work.pivots, size)
-            if turn == 0:
-                first_weights(rows, work.variance, parameters.degrees, 0.0, 0.0, work, h, h)
-                if h == going:
-                    shift = code_shift(rows, work, h)
-            work.log_after[h] = reweight(rows, work.variance, parameters.degrees, parameters.passes, work, h, h, h)
-            if turn == 0:
-                code, motion = mean_weights(rows, work.variance, work, h)
-                doubtful = doubtful or code < WEAK_FIT or motion < WEAK_FIT
-        for h in range(count):
-            if turn == 0 and doubtful:
-                second_start(parameters, rows, work, h, room)
-            apply_update(rows, work.variance, work, h)
-            furthest = max(furthest, abs(new_mean[h, ARC] - work.now[h]))
+    The equations are made again about the corrected place while it moves by more than `MOVED_M`.
+    """
+    parameters, count = given.parameters[0], state.monitors[0].hypotheses
+    degrees, rounds = (parameters.degrees_of_freedom, parameters.late_degrees_of_freedom), parameters.passes
+    corrections = [_start_correction(given, t, state, rows, h) for h in range(count)]
+    for one in corrections:
+        expected = one.covariance, one.without_clock
+        write_first_weights(rows, one.equations, expected, rows.variance, degrees, one.fit.weight)
+    leading = corrections[find_leading(state.hypothesis, count)]
+    shift = compute_code_shift(rows, leading.equations, leading.covariance, leading.fit.weight)
+    doubtful = False
+    for one in corrections:
+        reweight(rows, one.equations, one.covariance, rows.variance, degrees, rounds, one.fit)
+        code, motion = mean_weights(rows, rows.variance, one.fit.weight)
+        doubtful = doubtful or code < WEAK_FIT or motion < WEAK_FIT
+    furthest = 0.0
+    for one in corrections:
+        if doubtful:
+            refit_inflated_prior(rows, degrees, rounds, one)
+        correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
+        furthest = max(furthest, abs(one.x[ARC] - one.x_prior[ARC]))
+    for _ in range(RELINEARISED):
         if furthest < MOVED_M:
             break
-    if count > 1:
-        reweigh(line, parameters, rows, state, work, count, epochs.interval_s[t])
+        furthest = 0.0
+        for one in corrections:
+            furthest = max(furthest, _relinearise(given, t, state, rows, one))
+    return corrections, shift
+
+
+@inner
+def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction) -> float:
+    """Correct a hypothesis again with equations about the corrected place; return how far it moves from there [m]."""
+    parameters, arc = given.parameters[0], one.x[ARC]
+    degrees = parameters.degrees_of_freedom, parameters.late_degrees_of_freedom
+    linearise(given, t, rows, one.x_prior, (arc, one.x[PREVIOUS_ARC]), state.monitors[0].direction, one.equations)
+    covariance, without_clock = predict_quantities(one.P_prior, one.equations)
+    one.covariance[:], one.without_clock[:] = covariance, without_clock
+    reweight(rows, one.equations, covariance, rows.variance, degrees, parameters.passes, one.fit)
+    one.x[:], one.P[:] = one.x_prior, one.P_prior
+    correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
+    return float(abs(one.x[ARC] - arc))
+
+
+@inner
+def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction]) -> None:
+    """Update the probabilities of several hypotheses by the evidence of an epoch."""
+    parameters, count = given.parameters[0], len(corrections)
+    degrees = parameters.degrees_of_freedom, parameters.late_degrees_of_freedom
+    motion, code, arc = np.empty(count), np.empty(count), np.empty(count)
+    points, axes = np.empty((count, 3)), np.empty((3, 3))
     for h in range(count):
-        work.beyond[h] = beyond_end(line, work, h)
-    return shift
+        motion[h], code[h] = compute_evidence(rows, degrees, parameters.passes, corrections[h])
+        arc[h] = corrections[h].x[ARC]
+        write_point(given.vertex, given.line[0], arc[h], points[h], axes)
+    reweigh(parameters, state, motion, code, points, arc, given.epoch[t].interval_s)
 
 
-@borrowing
-def _finish(
-    inputs: Inputs,
-    t: int,
-    best: int,
-    status: int,
-    state: KernelState,
-    bank: Subfilters,
-    outputs: Outputs,
-    work: Work,
-) -> None:
-    """End an epoch: direction, distance on the branches, hypotheses to go on with; write its answer.
+@inner
+def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float) -> int:
+    """Take over corrected hypotheses, adapt and monitor, and correct the sub-filters; return the leading hypothesis."""
+    monitors, parameters = state.monitors[0], given.parameters[0]
+    for h, one in enumerate(corrections):
+        state.x[h], state.P[h] = one.x, one.P
+    monitors.measured_s = given.epoch[t].time_s
+    if rows.code.stop > 0:
+        monitors.coded_s = given.epoch[t].time_s
+    for j in range(rows.code.start, rows.code.stop):
+        state.offset_known[given.channel[t, rows.channel[j]].clock] = True
+    leads = find_leading(state.hypothesis, len(corrections))
+    best = corrections[leads]
+    implied = 0.0 if leads else shift
+    excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
+    if len(state.source):
+        advance_subfilters(given, t, state, rows, best, leads)
+    if excluded and abs(shift) < INFLATED_SIGMAS:  # its codes have led the place so far
+        state.P[:, ARC, ARC] += INFLATED_M**2
+    square = compute_contradiction(given, t, state, leads)
+    beyond_m = excess_beyond_end(given.line[0], best.x[ARC], math.sqrt(best.P[ARC, ARC]))
+    update_monitors(parameters, state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
+    return leads
 
-    `status` is that of an epoch without doubt and without other branches.
-    """
-    line, parameters, active, dt = inputs.line, inputs.parameters, inputs.active, inputs.epochs.interval_s[t]
-    scalars = state.scalars
-    count = int(scalars[HYPOTHESES])
-    speed = state.mean[best, SPEED]
+
+@inner
+def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, results: Results) -> None:
+    """Write innovations and weights of the measurements; where they are not believed none of them counts."""
+    result, weight = results.epoch[t], one.fit.weight
+    factor = 1.0 if believed else 0.0
+    code, motion = mean_weights(rows, rows.variance, weight)
+    result.code_weight, result.motion_weight = factor * code, factor * motion
+    for kind, own in enumerate((rows.code, rows.phase, rows.doppler)):
+        for j in range(own.start, own.stop):
+            channel = results.channel[t, rows.channel[j]]
+            channel.innovation[kind] = one.innovation[j]
+            channel.weight[kind] = 0.0 if rows.left_out[j] else factor * weight[j]
+            result.used[kind] += factor * weight[j] > 0.5 and not rows.left_out[j]
+            if rows.left_out[j]:
+                channel.faulty = True
+    for j in range(rows.sensor.start, rows.sensor.stop):
+        kind = min(rows.channel[j], RANGE_COLUMN)
+        result.used[3 + kind] += factor * weight[j] > 0.5
+        result.sensed[kind] = one.innovation[j]
+
+
+@inner
+def _write_trace(given: Given, t: int, rows: Rows, corrections: list[Correction], trace: Trace) -> None:
+    """Write what the smoother needs of the corrections."""
+    for h, one in enumerate(corrections):
+        trace.prior[h] = one.P_prior
+        unknown, coefficient, codes = one.equations.unknown, one.equations.coefficient, rows.code.stop
+        for j in range(rows.sensor.stop):
+            trace.value[h, j] = one.equations.value[j]
+            trace.variance[h, j] = rows.variance[j] / one.fit.weight[j]
+            for q in range(len(unknown)):
+                if codes <= j < rows.sensor.start:
+                    factor = one.equations.design[j, q - codes] if codes <= q < codes + MOTION else 0.0
+                else:
+                    factor = 1.0 if q == (j if j < codes else j - rows.sensor.start + codes + MOTION) else 0.0
+                if factor != 0.0:
+                    for k in range(TERMS):
+                        trace.row[h, j, unknown[q, k]] += factor * coefficient[q, k]
+        trace.restarted[h, PHASE_CLOCK], trace.restarted[h, DRIFT] = one.restarted[0], one.restarted[1]
+        if codes:
+            trace.restarted[h, OFFSETS + given.channel[t, rows.channel[0]].clock] = one.restarted[2]
+
+
+@inner
+def _finish(given: Given, t: int, leads: int, state: State, trace: Trace) -> None:
+    """Count direction, time and distance on the branches, and prune the hypotheses."""
+    monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
+    speed = state.x[leads, SPEED]
     if abs(speed) > DIRECTION_MPS:
-        scalars[DIRECTION] = math.copysign(1.0, speed)
-    scalars[BRANCH_S] += dt
-    scalars[BRANCH_M] += abs(speed) * dt
-    for h in range(count):
-        state.log_least[h] = min(state.log_least[h] + LEAST_RISE * dt, state.log_probability[h])
-    if count > 1:
-        count = keep_hypotheses(state, parameters, work, count)
-        scalars[HYPOTHESES] = count
-    if scalars[BRANCH_S] > TAKEOVER_AFTER_S and state.log_least[0] < TAKEOVER:
-        scalars[ACROSS] = ACROSS_TAKEN
-        scalars[WITHHELD] = max(scalars[WITHHELD], parameters.level_hold_s)
-    probability = math.exp(state.log_probability[0])
-    sigma = math.sqrt(state.covariance[0, ARC, ARC])
-    outputs.hypotheses[t], outputs.probability[t] = count, probability
+        monitors.direction = math.copysign(1.0, speed)
+    monitors.branch_s += dt
+    monitors.branch_m += abs(speed) * dt
+    for h in range(monitors.hypotheses):
+        one = state.hypothesis[h]
+        one.log_least = min(one.log_least + LEAST_RISE * dt, one.log_probability)
+    if monitors.hypotheses > 1:
+        kept = prune(parameters, state)
+        if len(trace.kept):
+            trace.kept[: len(kept)] = kept
+    if monitors.branch_s > TAKEOVER_AFTER_S and state.hypothesis[0].log_least < TAKEOVER:
+        monitors.across = ACROSS_TAKEN
+        monitors.level_hold_s = max(monitors.level_hold_s, parameters.level_hold_s)
+
+
+@inner
+def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
+    """Write place, speed, level and status; `status` is that of an epoch without doubt and other branches."""
+    parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
+    x, P = state.x[0], state.P[0]
+    sigma = math.sqrt(P[ARC, ARC])
+    result.hypotheses, result.probability = monitors.hypotheses, math.exp(state.hypothesis[0].log_probability)
     if not sigma <= parameters.expired_sigma_m:
-        outputs.status[t] = EXPIRED
+        result.status = EXPIRED
         return
-    far = write_branches(state, line, parameters, work, count)
+    branches, far = find_branches(given, state)
     spread = sigma * sigma
-    for h in range(1, count):
-        own = work.branch[h, 1] ** 2 + work.branch[h, 2] ** 2
-        spread += math.exp(state.log_probability[h]) * (own - sigma * sigma)
-    outputs.arc_m[t], outputs.sigma_m[t] = state.mean[0, ARC], math.sqrt(spread)
-    outputs.speed_mps[t] = state.mean[0, SPEED]
-    outputs.speed_sigma_mps[t] = math.sqrt(state.covariance[0, SPEED, SPEED])
-    outputs.acceleration_mps2[t] = state.mean[0, ACCELERATION]
-    if active.wheel >= 0:
-        outputs.wheel_scale[t] = state.mean[0, active.wheel]
-    if active.force >= 0:
-        outputs.force_offset_mps2[t] = state.mean[0, active.force]
-    if active.radar >= 0:
-        outputs.radar_scale[t] = state.mean[0, active.radar]
-    outputs.map_scale[t] = math.exp(0.5 * scalars[MAP_LOG_VARIANCE])
-    scalars[OPEN] = parameters.level_hold_s if far > parameters.level_risk else max(scalars[OPEN] - dt, 0.0)
-    if len(bank.running):
-        write_level(state, count, far, bank, parameters, work, outputs, t)
-        if scalars[WITHHELD] > 0.0:
-            outputs.ground_level_m[t] = math.inf
-        if scalars[WITHHELD] > 0.0 or scalars[OPEN] > 0.0:
-            outputs.level_m[t] = math.inf
-        outputs.amount_m[t] = max(outputs.level_m[t], SCALE_BOUND * scalars[DISTANCE_SINCE_CODE])
-        outputs.level_speed_mps[t] = speed_bound(state.mean[0, SPEED], outputs.speed_sigma_mps[t], bank, parameters)
-    if status != LOST and scalars[OPEN] > 0.0:
-        outputs.status[t] = SEVERAL_BRANCHES
-    elif status != LOST and scalars[WITHHELD] > 0.0:
-        outputs.status[t] = DOUBTFUL
+    for a in range(len(branches.sigma_m)):
+        own = branches.straight_m[a] ** 2 + branches.sigma_m[a] ** 2
+        spread += branches.probability[a] * (own - sigma * sigma)
+    result.arc_m, result.sigma_m = x[ARC], math.sqrt(spread)
+    result.speed_mps, result.speed_sigma_mps = x[SPEED], math.sqrt(P[SPEED, SPEED])
+    result.acceleration_mps2 = x[ACCELERATION]
+    result.wheel_scale, result.force_offset_mps2, result.radar_scale = x[WHEEL], x[FORCE_OFFSET], x[RADAR]
+    result.map_scale = math.exp(0.5 * monitors.map_log_variance)
+    if far > parameters.level_risk:
+        monitors.ambiguity_hold_s = parameters.level_hold_s
     else:
-        outputs.status[t] = status
+        monitors.ambiguity_hold_s = max(monitors.ambiguity_hold_s - given.epoch[t].interval_s, 0.0)
+    if len(state.source):
+        write_level(given, state, branches, far, result)
+        if monitors.level_hold_s > 0.0:
+            result.ground_level_m = math.inf
+        if monitors.level_hold_s > 0.0 or monitors.ambiguity_hold_s > 0.0:
+            result.level_m = math.inf
+        result.amount_m = max(result.level_m, SCALE_BOUND * monitors.distance_since_code_m)
+        result.level_speed_mps = bound_speed(parameters, state, result.speed_sigma_mps)
+    if status != LOST and monitors.ambiguity_hold_s > 0.0:
+        status = SEVERAL_BRANCHES
+    elif status != LOST and monitors.level_hold_s > 0.0:
+        status = DOUBTFUL
+    result.status = status
 
 
-@borrowing
-def _advance(
-    inputs: Inputs,
-    state: KernelState,
-    bank: Subfilters,
-    outputs: Outputs,
-    rows: Rows,
-    work: Work,
-    span: tuple[int, int],
-    part: int,
-) -> int:
-    """Do the epochs of a span (`advance`)."""
-    epochs, line, parameters, active = inputs.epochs, inputs.line, inputs.parameters, inputs.active
-    scalars, room = state.scalars, len(work.now) - 1
-    for t in range(span[0], span[1]):
-        if part < REST:
-            if epochs.begins[t] or (part == WHOLE and _needs_search(epochs, t, parameters, state)):
-                return t
-            _reset_code_errors(epochs, t, active, state, bank)
-            _wrap_closed_line(line, state, bank)
-            _predict_all(inputs, t, state, work)
-            if part == PREDICTION:
-                return t
-        code_s = code_interval_s(epochs, t, parameters, state, outputs)
-        choose_rows(epochs, t, rows)
-        choose_sensors(epochs, t, state, rows, work)
-        measured = rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3] > 0
-        dt, shift = epochs.interval_s[t], 0.0
-        if measured:
-            write_variances(epochs, t, state, rows, work.variance)
-            shift = _update(inputs, t, state, rows, work)
-        if not possible(parameters, state, rows, work, dt, measured):
-            # What no train can do is not believed: the prediction goes on, made again as the clocks in it were moved.
-            measured = False
-            scalars[WEAK_MOTION] += dt
-            write_rows(outputs, rows, work, t, 0, 0.0)
-            if part == WHOLE:
-                _predict_all(inputs, t, state, work)
-        if measured:
-            best = _measure(inputs, t, state, bank, rows, work, shift, code_s)
-            write_rows(outputs, rows, work, t, best, 1.0)
+@inner
+def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: Trace, lost: bool) -> None:
+    """Do an epoch whose state is predicted."""
+    monitors, dt, leads = state.monitors[0], given.epoch[t].interval_s, 0
+    rows = choose_measurements(given, t, state)
+    believed = rows.sensor.stop > 0
+    if believed:
+        corrections, shift = _correct_hypotheses(given, t, state, rows)
+        if len(corrections) > 1:
+            _reweigh_hypotheses(given, t, state, rows, corrections)
+        first = corrections[0]
+        sigma = math.sqrt(first.P[SPEED, SPEED])
+        believed = narrow_speed_range(given.parameters[0], monitors, rows, first.x[SPEED], sigma, dt)
+        if believed:
+            leads = _commit_update(given, t, state, rows, corrections, shift)
+            if len(trace.prior):
+                _write_trace(given, t, rows, corrections, trace)
         else:
-            _coast(inputs, t, state, bank, work, room)
-            best = leading(state, int(scalars[HYPOTHESES]))
-            scalars[WITHHELD] = max(scalars[WITHHELD] - dt, 0.0)
-        travel = scalars[DISTANCE_SINCE_CODE] + abs(state.mean[best, SPEED]) * dt
-        scalars[DISTANCE_SINCE_CODE] = 0.0 if measured and rows.counts[0] > 0 else travel
-        status = LOST if part == REST_LOST else (TRACKING if measured else COASTING)
-        _finish(inputs, t, best, status, state, bank, outputs, work)
-        if not math.isfinite(state.mean[0, ARC]):
-            return t + 1
-    return span[1]
+            monitors.weak_motion_s += dt
+        _write_measurements(t, rows, corrections[leads], believed, results)
+    else:
+        narrow_speed_range(given.parameters[0], monitors, rows, 0.0, math.inf, dt)
+    if not believed:  # the prediction goes on
+        leads = find_leading(state.hypothesis, monitors.hypotheses)
+        monitors.level_hold_s = max(monitors.level_hold_s - dt, 0.0)
+    monitors.distance_since_code_m += abs(state.x[leads, SPEED]) * dt
+    if believed and rows.code.stop > 0:
+        monitors.distance_since_code_m = 0.0
+    _finish(given, t, leads, state, trace)
+    status = TRACKING if believed else COASTING
+    _write_place(given, t, LOST if lost else status, state, results)
 
 
-@borrowing_kernel
-def advance(
-    inputs: Inputs,
-    state: KernelState,
-    bank: Subfilters,
-    outputs: Outputs,
-    rows: Rows,
-    work: Work,
-    span: tuple[int, int],
-    part: int,
-) -> int:
+@kernel
+def advance(given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], part: int) -> int:
     """Do the epochs of a span; return the first before which places have to be sought, or the end of the span.
 
     `part` says what of an epoch is done: `layout.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
     """
-    return _advance(
-        by_reference(inputs), by_reference(state), by_reference(bank), by_reference(outputs),
-        by_reference(rows), by_reference(work), span, part,
-    )  # fmt: skip
+    for t in range(span[0], span[1]):
+        if part < REST:
+            if given.epoch[t].begins or (part == WHOLE and _needs_search(given, t, state)):
+                return t
+            _reset_code_errors(given, t, state)
+            _wrap_closed_line(given, state)
+            _predict_all(given, t, state)
+            if part == PREDICTION:
+                return t
+        _advance_epoch(given, t, state, results, trace, part == REST_LOST)
+        if not math.isfinite(state.x[0, ARC]):
+            return t + 1
+    return span[1]

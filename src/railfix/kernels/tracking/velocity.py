@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from railfix.core.arrays import Floats, Masks
-from railfix.kernels.compiling import borrowing, kernel
-from railfix.kernels.tracking.algebra import median
+from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.tracking.update import median
 
 #: Standard deviation of the vertical velocity [m/s].
 CLIMB_MPS = 0.3
@@ -20,7 +20,7 @@ REDUNDANT = 2
 AGREEING = 0.9
 
 
-@borrowing
+@inner
 def _invert(matrix: Floats) -> None:
     """Invert a positive definite matrix of 4 rows in its place."""
     for k in range(4):
@@ -59,8 +59,8 @@ def fitted_velocities(
     """
     epochs, channels = has.shape
     velocity, covariance = np.full((epochs, 3), np.nan), np.full((epochs, 3, 3), np.nan)
-    row, rest, information = np.empty((channels, 4)), np.empty((1, channels)), np.empty(channels)
-    weight, square, ordered = np.empty(channels), np.empty(channels), np.empty(channels)
+    row, rest, information = np.empty((channels, 4)), np.empty(channels), np.empty(channels)
+    weight, square = np.empty(channels), np.empty(channels)
     prior, normal, right, solved = np.empty((4, 4)), np.empty((4, 4)), np.empty(4), np.empty(4)
     for t in range(epochs):
         count = 0
@@ -69,11 +69,11 @@ def fitted_velocities(
                 for a in range(3):
                     row[count, a] = gradient[t, k, a]
                 row[count, 3] = 1.0
-                rest[0, count], information[count], weight[count] = value[t, k], 1.0 / variance[t, k], 1.0
+                rest[count], information[count], weight[count] = value[t, k], 1.0 / variance[t, k], 1.0
                 count += 1
         if count - 3 < REDUNDANT:
             continue
-        clock = median(rest, 0, 0, count, ordered)
+        clock = median(rest[:count])
         for a in range(4):
             for b in range(4):
                 vertical = up[t, a] * up[t, b] / CLIMB_MPS**2 if a < 3 and b < 3 else 0.0
@@ -86,7 +86,7 @@ def fitted_velocities(
             for k in range(count):
                 for a in range(4):
                     scaled = row[k, a] * weight[k] * information[k]
-                    right[a] += scaled * (rest[0, k] - clock)
+                    right[a] += scaled * (rest[k] - clock)
                     for b in range(4):
                         normal[a, b] += scaled * row[k, b]
             _invert(normal)
@@ -95,7 +95,7 @@ def fitted_velocities(
                 for b in range(4):
                     solved[a] += normal[a, b] * right[b]
             for k in range(count):
-                misfit = rest[0, k] - clock
+                misfit = rest[k] - clock
                 for a in range(4):
                     misfit -= row[k, a] * solved[a]
                 square[k] = misfit * misfit * information[k]

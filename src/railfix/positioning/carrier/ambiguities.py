@@ -18,7 +18,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.observation_model import IntegerChannels, Linearised, OwnUnknowns, PhaseClocks, Phases
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 

@@ -37,7 +37,7 @@ from railfix.positioning.carrier.observation_model import (
     reduce,
     shift_phases,
 )
-from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
 SEGMENT_EPOCHS: Final = 64  #: Epochs computed together: what bounds the memory.

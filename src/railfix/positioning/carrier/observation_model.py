@@ -21,7 +21,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.normal_equations import ClockTies, Ranges
+from railfix.positioning.range_arrays import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
 PhaseClocks = Literal["own", "shared"]

@@ -50,7 +50,7 @@ def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
     draw.__doc__ = (
         f"{chart_of.__doc__}\n\n    Drawn into the axes `ax`, or into a new figure; the axes are returned.\n    "
     )
-    del draw.__wrapped__  # type: ignore[attr-defined]
+    del draw.__wrapped__
     own = signature(chart_of)
     ax = Parameter("ax", Parameter.KEYWORD_ONLY, default=None, annotation="Axes | None")
     draw.__signature__ = own.replace(parameters=[*own.parameters.values(), ax], return_annotation="Axes")  # type: ignore[attr-defined]
@@ -99,7 +99,7 @@ def new_axes(size: tuple[float, float], **axes: Any) -> Axes:
     from matplotlib import pyplot
 
     _, made = pyplot.subplots(figsize=size, layout="constrained", subplot_kw=axes)
-    return cast("Axes", made)
+    return made
 
 
 def draw_sky(sky: SkyEpochs, time: np.datetime64, *, ax: Axes | None = None) -> Axes:

@@ -27,7 +27,9 @@ from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, kernel_array
 from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
-from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, SinglePoint
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.normal_equations import Constrained, SinglePoint
+from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
 from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory
 
@@ -120,6 +122,24 @@ def robust_fit(
     )
 
 
+def robust_on_line(
+    ranges: Ranges,
+    line: Line,
+    position: Constrained,
+    *,
+    near_ecef_m: Floats | None = None,
+    limits: RobustFitLimits | None = None,
+) -> RobustFit:
+    """Fit the ranges around positions on the line; where there is none, around approximate ones, shape (T, 3)."""
+    antennas, arc = AntennaRows.on(line), position.arc_m
+    if near_ecef_m is None:
+        near_ecef_m = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(arc[rows]), axis=0))
+    at = np.where(np.isfinite(arc)[:, None], antennas.at_arc(arc), near_ecef_m)
+    axes = antennas.get_axes(np.maximum(position.section, 0))
+    information = compute_information(axes, antennas.sigma_plan_m, antennas.sigma_height_m)
+    return robust_fit(ranges, at, information=information, limits=limits)
+
+
 #: Half-widths of the 95 % interval, Student's t against the normal distribution, by degrees of freedom from 1.
 _WIDENED: Final = stdtrit(np.arange(1, 129), 0.975) / ndtri(0.975)
 
@@ -188,7 +208,7 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
     return np.asarray((limits.spread * scale**2 + own) / (limits.spread + freedom))
 
 
-def own_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
+def epoch_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
     """Return the single-epoch sigma along the line, shape (T,) [m].
 
     The standard deviation by the weights, times the larger of the receiver's scale and that of the epoch's own

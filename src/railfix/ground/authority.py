@@ -1,0 +1,86 @@
+"""Messages of the centre to a train: how far it may run and how fast, and the order to brake.
+
+An array of CBOR in canonical order: kind and version, then the fields.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from pydantic import Field
+
+from railfix.core.settings import Settings
+from railfix.ground.layout import MOST_PARTS
+from railfix.io.train_message import MessageError, validate_message
+
+#: Version of the messages; a receiver rejects others.
+VERSION: Final = 3
+
+Number = Annotated[int, Field(ge=0, lt=1 << 63)]
+Chainage = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
+SpeedPart = tuple[Chainage, Chainage, Annotated[int, Field(ge=0, lt=1 << 31)]]
+GradientPart = tuple[Chainage, Annotated[int, Field(ge=-1000, le=1000)]]
+
+
+class Authority(Settings):
+    """One authority message, sent after each report of the train, at a stop, and at least every second."""
+
+    kind: ClassVar[int] = 1
+    train: Annotated[int, Field(ge=0, lt=1 << 32)]
+    number: Number  #: Rises with every message of the centre, also over its restarts.
+    #: Sequence number of the train's newest report that the centre has stored, 0 without one: an acknowledgement, and
+    #: the train's measure of the age of this message on its own clock.
+    report: Number
+    end_cm: Chainage  #: Chainage where the authority ends.
+    direction: Literal[-1, 1]
+    stopped: bool  #: The train is ordered to stop.
+    #: The end is one that the train is asked to take in place of a further one, where it can stop before it.
+    shortens: bool = False
+    session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Start on board that `report` is of.
+    overlap_cm: Number = 0  #: Way beyond the end that is kept for a train that passes it at release speed.
+    #: Chainages, lower first, and highest speed [cm/s] of each speed restriction in the interval.
+    restrictions: Annotated[tuple[SpeedPart, ...], Field(max_length=MOST_PARTS)] = ()
+    #: Gradient in thousandths, uphill with rising chainage positive, from a chainage to that of the next part.
+    gradients: Annotated[tuple[GradientPart, ...], Field(max_length=MOST_PARTS)] = ()
+
+    def encode(self) -> bytes:
+        """Return the bytes of the message."""
+        import cbor2
+
+        return cbor2.dumps([self.kind, VERSION, *self.model_dump().values()], canonical=True)
+
+    @classmethod
+    def decode(cls, data: bytes) -> Authority:
+        """Return the authority, or the `BrakeOrder`, of some bytes.
+
+        Raises
+        ------
+        MessageError
+            The bytes are no such message of this version.
+        """
+        import cbor2
+
+        try:
+            kind, version, *values = cbor2.loads(data)
+        except (cbor2.CBORDecodeError, ValueError, TypeError, OverflowError, RecursionError, MemoryError):
+            raise MessageError("is no authority: an array of CBOR was expected") from None
+        found: dict[Any, type[Authority]] = {Authority.kind: Authority, BrakeOrder.kind: BrakeOrder}
+        model = found.get(kind) if type(kind) is int else None
+        if model is None or version != VERSION:
+            raise MessageError(f"is of kind {kind!r} and version {version!r}; an authority of {VERSION} was expected")
+        if len(values) != len(model.model_fields):
+            raise MessageError(f"has {len(values)} fields, {len(model.model_fields)} were expected")
+        message = validate_message(model, dict(zip(model.model_fields, values, strict=True)))
+        if message.encode() != data:  # bytes behind it, a truth value for a number, another order
+            raise MessageError("is no authority in its canonical form")
+        return message
+
+
+class BrakeOrder(Authority):
+    """Order to brake to a stop: needs no store, grants nothing, and is repeated until a report names its number.
+
+    `number` is that of the last authorities; any later authority without `stopped` ends the order.
+    """
+
+    kind: ClassVar[int] = 2
+    reason: Annotated[str, Field(max_length=200)] = ""

@@ -1,0 +1,186 @@
+"""Braking curves: how fast a train may run so that it stops before an end, on a line with gradients.
+
+After the shape of SUBSET-026 chapter 3.13, in its simplest form: one deceleration of the train with a safety factor,
+gradients as steps, no rotating mass, no adhesion, no service brake, no display of its own. Places are distances in
+running direction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from pydantic import Field
+
+from railfix.core.settings import Settings
+
+GRAVITY_MPS2: Final = 9.80665
+#: Highest speed that is looked for [m/s], and the number of halvings of it.
+_TOP_MPS, _HALVINGS = 150.0, 40
+
+
+class BrakeLimits(Settings):
+    """Brakes of a train, and times before them."""
+
+    #: Deceleration on level track, and the share of it that is counted on.
+    braking_mps2: float = Field(default=0.5, gt=0)
+    safety: float = Field(default=0.9, gt=0, le=1)
+    least_mps2: float = Field(default=0.05, gt=0)  #: Deceleration that is counted on down any gradient.
+    build_up_s: float = Field(default=2.0, ge=0)  #: Time from the intervention until the brakes act.
+    cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most the time of the build-up.
+    traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until then.
+    warning_s: float = Field(default=1.0, ge=0)  #: The warning comes so long before the intervention.
+    reaction_s: float = Field(default=3.0, ge=0)  #: The permitted speed leaves the driver so long before it.
+    over_mps: float = Field(default=1.5, ge=0)  #: A restriction may be exceeded by so much before the intervention.
+
+
+class Target(NamedTuple):
+    """A speed that a train keeps from a place on."""
+
+    at_m: float
+    speed_mps: float
+
+
+class Steps(NamedTuple):
+    """Gradients as steps: uphill in running direction positive, from a place on to the next; level before the first."""
+
+    from_m: Sequence[float] = ()
+    gradient: Sequence[float] = ()
+
+
+def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
+    """Return the square of the speed at a place from which full brakes lead to the speed of a target there [m2/s2].
+
+    ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)``; beyond the target negative.
+    """
+    if at_m >= target.at_m:
+        return target.speed_mps**2 - (at_m - target.at_m)
+    square, low = target.speed_mps**2, at_m
+    bounds = [*(place for place in steps.from_m if low < place < target.at_m), target.at_m]
+    for high in bounds:
+        square += 2.0 * (high - low) * deceleration_mps2(low, steps, brakes)
+        low = high
+    return square
+
+
+def deceleration_mps2(at_m: float, steps: Steps, brakes: BrakeLimits) -> float:
+    """Return the deceleration that is counted on at a place [m/s^2]."""
+    gradient = 0.0
+    for place, value in zip(*steps, strict=True):
+        if place > at_m:
+            break
+        gradient = value
+    return max(brakes.safety * brakes.braking_mps2 + GRAVITY_MPS2 * gradient, brakes.least_mps2)
+
+
+def stopping_m(at_m: float, speed_mps: float, steps: Steps, brakes: BrakeLimits) -> float:
+    """Return where a train comes to rest that is braked now: after the build-up, under traction until it is cut [m]."""
+    place, speed = _after_build_up(at_m, speed_mps, brakes)
+    square, ahead = speed**2, [step for step in steps.from_m if step > place]
+    for step in ahead:
+        deceleration = deceleration_mps2(place, steps, brakes)
+        if square <= 2.0 * deceleration * (step - place):
+            break
+        square -= 2.0 * deceleration * (step - place)
+        place = step
+    return place + square / (2.0 * deceleration_mps2(place, steps, brakes))
+
+
+def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple[float, float]:
+    """Return place and speed at which the brakes act."""
+    cut = min(brakes.cut_s, brakes.build_up_s)
+    faster = speed_mps + brakes.traction_mps2 * cut
+    way = speed_mps * cut + 0.5 * brakes.traction_mps2 * cut**2 + faster * (brakes.build_up_s - cut)
+    return at_m + way, faster
+
+
+def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
+    """Return the speed above which the train is braked, or above which it would be so long afterwards [m/s].
+
+    The largest speed from which the train is on `braking_speed` when its brakes act. That place and the square of the
+    curve are linear in it between two changes of gradient: a quadratic equation of each, from the target backward.
+    """
+    if at_m >= target.at_m:
+        return 0.0
+    way, faster = _after_build_up(0.0, 0.0, brakes)
+    time = before_s + brakes.build_up_s
+    places = [at_m, *(place for place in steps.from_m if at_m < place < target.at_m), target.at_m]
+    square = target.speed_mps**2
+    for low, high in reversed(list(pairwise(places))):
+        deceleration = deceleration_mps2(low, steps, brakes)
+        half = faster + deceleration * time
+        rest = half**2 - faster**2 + square + 2.0 * deceleration * (high - at_m - way)
+        speed = math.sqrt(max(rest, 0.0)) - half
+        if low == at_m or (rest >= 0.0 and at_m + speed * time + way >= low):
+            return max(speed, 0.0)
+        square += 2.0 * deceleration * (high - low)
+    return 0.0
+
+
+def _largest(fits: Callable[[float], bool]) -> float:
+    """Return the largest speed that fits, where all smaller ones do; 0 where none does."""
+    low, high = 0.0, _TOP_MPS
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def release_mps(overlap_m: float, at_m: float, steps: Steps, brakes: BrakeLimits) -> float:
+    """Return the speed at which a train may pass the end of its authority, as it stops within the overlap [m/s]."""
+    if overlap_m <= 0.0:
+        return 0.0
+    return _largest(lambda speed: stopping_m(at_m, speed, steps, brakes) <= at_m + overlap_m)
+
+
+class Supervised(NamedTuple):
+    """Speeds of a train at a place [m/s], and the target that gives them."""
+
+    permitted_mps: float
+    warning_mps: float
+    intervention_mps: float
+    target: Target
+    release_mps: float = 0.0
+
+
+def supervise(
+    front_m: float,
+    rear_m: float,
+    *,
+    end_m: float,
+    overlap_m: float = 0.0,
+    restrictions: Sequence[tuple[float, float, float]] = (),
+    steps: Steps | None = None,
+    brakes: BrakeLimits,
+) -> Supervised:
+    """Return the speeds of a train between its safe rear and front ends, the lowest of all its targets.
+
+    Restrictions: where they begin and end, and their speed; the whole train keeps them.
+    """
+    steps = steps or Steps()
+    release = release_mps(overlap_m, end_m, steps, brakes)
+    found = [_supervised(front_m, Target(end_m, 0.0), steps, brakes, release=release)]
+    for low_m, high_m, speed in restrictions:
+        if low_m < front_m and rear_m < high_m:
+            limits = speed, speed + 0.5 * brakes.over_mps, speed + brakes.over_mps
+            found.append(Supervised(*limits, Target(low_m, speed)))
+        elif front_m <= low_m < end_m:
+            found.append(_supervised(front_m, Target(low_m, speed), steps, brakes))
+    lowest = min(found, key=lambda each: each.permitted_mps)
+    return lowest._replace(
+        warning_mps=min(each.warning_mps for each in found),
+        intervention_mps=min(each.intervention_mps for each in found),
+    )
+
+
+def _supervised(
+    front_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, release: float = 0.0
+) -> Supervised:
+    """Return the speeds ahead of one target; to a stop not below the release speed, up to the end."""
+    aimed = target if target.speed_mps == 0.0 else target._replace(speed_mps=target.speed_mps + brakes.over_mps)
+    brake, warn = (intervention_mps(front_m, aimed, steps, brakes, before_s=s) for s in (0.0, brakes.warning_s))
+    permitted = intervention_mps(front_m, target, steps, brakes, before_s=brakes.reaction_s)
+    floor = max(target.speed_mps, release if front_m <= target.at_m else 0.0)
+    return Supervised(max(permitted, floor), max(warn, floor), max(brake, floor), target, release)

@@ -1,0 +1,192 @@
+"""Changes of trains by order: an interval corrected, trains entered, removed, joined and divided.
+
+What the reports cannot say is taken from who has seen it; each change leaves its trains stopped, to be released one by
+one (`railfix.ground.stops.release_train`), and frees nothing that a train may still occupy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+from railfix.ground.layout import Layout, PointName, overlap
+from railfix.ground.state import Interlocking, PointState, TrainInterval, with_train
+from railfix.ground.stops import OCCUPIED, close_section, pieces_of
+
+#: Trains that are joined are at most so far apart by their intervals [m].
+APART_M: Final = 50.0
+
+Changed = tuple[Interlocking, str | None]
+
+
+def _placed(
+    train: TrainInterval, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
+) -> TrainInterval | str:
+    """Return a train between two chainages, without an authority; or why it cannot be there."""
+    low, high = sorted((rear_m, front_m))
+    if direction not in (-1, 1) or track not in (1, 2):
+        return "direction is -1 or 1, and track 1 or 2"
+    if direction * (front_m - rear_m) < train.length_m:
+        return f"from rear_m to front_m in running direction there is no room for a train of {train.length_m:g} m"
+    if low < layout.stations[0].begin_m or high > layout.stations[-1].end_m:
+        return "the interval reaches beyond the line"
+    stations = layout.stations_between(low, high)
+    tracks = dict.fromkeys(stations, track)
+    # between stations the route ends where it began: in the station behind the train
+    behind = [k for k, s in enumerate(layout.stations) if direction * (s.begin_m - front_m) < 0.0]
+    station = max(behind) if direction > 0 else min(k for k, s in enumerate(layout.stations) if s.end_m > front_m)
+    if station not in tracks:
+        tracks[station] = track
+    return replace(
+        train, direction=direction, rear_m=rear_m, front_m=front_m, end_m=front_m, tracks=tracks, station=station,
+        standstill=True, claimed_m=None, reported_m=None, contradiction=None, asked_m=None, held=False, parted=None,
+        speed_mps=None,
+    )  # fmt: skip
+
+
+def correct_interval(
+    state: Interlocking, train: int, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
+) -> Changed:
+    """Return the state with the interval of a stopped train set by hand, and the reason of a refusal.
+
+    Its routes and its authority end; points that it no longer stands on are free.
+    """
+    known = state.trains.get(train)
+    if known is None:
+        return state, f"there is no train {train}"
+    if known.stop is None:
+        return state, f"train {train} is not stopped: stop it first"
+    moved = _placed(known, layout, direction=direction, rear_m=rear_m, front_m=front_m, track=track)
+    if isinstance(moved, str):
+        return state, moved
+    moved = replace(moved, stop="its interval was corrected by order")
+    return _refused_overlap(state, moved, layout, without_locks(state.points, train))
+
+
+def enter_train(
+    state: Interlocking,
+    train: int,
+    layout: Layout,
+    *,
+    length_m: float,
+    direction: int,
+    rear_m: float,
+    front_m: float,
+    track: int,
+) -> Changed:
+    """Return the state with another train anywhere on the line, also one that reports nothing; a refusal's reason."""
+    if train in state.trains:
+        return state, f"there is a train {train} already"
+    if not 0 < train < 1 << 32 or not length_m > 0.0:
+        return state, "a number from 1 to 4294967295 and a length above 0 m were expected"
+    new = TrainInterval(
+        train=train, direction=1, rear_m=rear_m, front_m=front_m, end_m=front_m, sequence=-1, tracks={}, station=0,
+        length_m=length_m, stop="entered by order",
+    )  # fmt: skip
+    moved = _placed(new, layout, direction=direction, rear_m=rear_m, front_m=front_m, track=track)
+    return (state, moved) if isinstance(moved, str) else _refused_overlap(state, moved, layout, state.points)
+
+
+def _refused_overlap(
+    state: Interlocking, train: TrainInterval, layout: Layout, points: Mapping[PointName, PointState]
+) -> Changed:
+    """Return the state with a train, unless another one is where it is to be."""
+    pieces = pieces_of(train, layout)
+    for other in state.trains.values():
+        if other.train != train.train and overlap(pieces, pieces_of(other, layout)):
+            return state, f"the interval of train {other.train} is there"
+    return with_train(replace(state, points=points), train), None
+
+
+def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[PointName, PointState]:
+    """Return points that a train locks no more."""
+    return {
+        name: replace(point, locked={n: since for n, since in point.locked.items() if n != train})
+        if train in point.locked
+        else point
+        for name, point in points.items()
+    }
+
+
+def remove_train(state: Interlocking, train: int, layout: Layout) -> Changed:
+    """Return the state without a train, whose sections are occupied by vehicles that report nothing.
+
+    They are freed by their detection, or by an order of who has seen them free.
+    """
+    known = state.trains.get(train)
+    if known is None:
+        return state, f"there is no train {train}"
+    if known.stop is None or not known.standstill:
+        return state, f"train {train} is not stopped, or does not stand still"
+    pieces = pieces_of(known, layout)
+    trains = {number: other for number, other in state.trains.items() if number != train}
+    state = replace(state, trains=trains, points=without_locks(state.points, train))
+    for name, own in layout.sections.items():
+        # a station as a whole only where its points are occupied: its tracks are sections of their own
+        if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
+            state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
+    return state, None
+
+
+def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> Changed:
+    """Return the state in which one train is part of the one in front of it: both lengths, one interval."""
+    first, second = state.trains.get(lead), state.trains.get(other)
+    if first is None or second is None or lead == other:
+        return state, "two trains of the line were expected"
+    if not all(train.stop is not None and train.standstill for train in (first, second)):
+        return state, "one of the trains is not stopped, or does not stand still"
+    d = first.direction
+    if second.direction != d or d * (first.front_m - second.front_m) < 0.0:
+        return state, f"train {other} is not behind train {lead}, in its direction"
+    if d * (first.rear_m - second.interval_m[1]) > APART_M:
+        return state, f"the intervals of the trains are more than {APART_M:g} m apart"
+    if any(first.tracks[k] != track for k, track in second.tracks.items() if k in first.tracks):
+        return state, "the trains are on different tracks of a station"
+    joined = replace(
+        first, rear_m=d * min(d * first.rear_m, d * second.rear_m), length_m=first.length_m + second.length_m,
+        tracks={**second.tracks, **first.tracks}, stop=f"joined with train {other}", claimed_m=None, reported_m=None,
+        parted=None,
+    )  # fmt: skip
+    points = dict(state.points)
+    for name, point in state.points.items():
+        if other in point.locked:
+            locked = {lead if n == other else n: since for n, since in point.locked.items()}
+            points[name] = replace(point, locked=locked)
+    trains = {n: train for n, train in state.trains.items() if n != other}
+    after, reason = _refused_overlap(replace(state, trains=trains), joined, layout, points)
+    return (after, None) if reason is None else (state, reason)
+
+
+def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:
+    """Return the state in which the rear of a train, behind a length of it, is another train.
+
+    Their intervals share what the bounds of the place leave open, until they are apart.
+    """
+    known = state.trains.get(train)
+    if known is None:
+        return state, f"there is no train {train}"
+    if other in state.trains or not 0 < other < 1 << 32:
+        return state, f"{other} is no number for the other part"
+    if known.stop is None or not known.standstill:
+        return state, f"train {train} is not stopped, or does not stand still"
+    if not 0.0 < length_m < known.length_m:
+        return state, f"a length between 0 and {known.length_m:g} m was expected"
+    if known.reported_m is None or known.outside_m() > 0.0:
+        return state, f"train {train} has not reported where it stands"
+    d = known.direction
+    back, front = sorted(d * end for end in known.reported_m)
+    cut = d * (front - length_m)  # the front part's rear end is at most here
+    rear = d * max(min(back + known.length_m - length_m, d * cut), d * known.rear_m)
+    stop = f"divided: trains {train} and {other}"
+    first = replace(known, rear_m=rear, length_m=length_m, stop=stop, claimed_m=None, parted=other)
+    second = replace(
+        known, train=other, front_m=cut, end_m=cut, length_m=known.length_m - length_m, stop=stop, sequence=-1,
+        session=0, claimed_m=None, reported_m=None, measured_ns=None, line=None, asked_m=None, station=known.station,
+        parted=None,
+    )  # fmt: skip
+    points = {
+        name: replace(point, locked={**point.locked, other: None}) if train in point.locked else point
+        for name, point in state.points.items()
+    }
+    return with_train(with_train(replace(state, points=points), first), second), None

@@ -1,0 +1,285 @@
+"""Orders of the page: who gave them, what they change, and which are given twice before they count.
+
+Each order is a line of the log with its identity and its outcome. What rests on what somebody has seen, and no report
+confirms, is ordered twice: by two people, or by one after a time to think.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Final, Protocol
+
+from railfix.ground.centre import TrainState
+from railfix.ground.changes import correct_interval, divide_train, enter_train, join_trains, remove_train
+from railfix.ground.layout import MOST_PARTS
+from railfix.ground.state import Interlocking, Restriction
+from railfix.ground.stops import CLOSED, OCCUPIED, close_section, open_section
+from railfix.ground.supervision import Supervision
+from railfix.ground.web import Order
+
+#: An order that is given twice comes again so long after the first, at least and at most [s]; of another at once.
+AGAIN_S: Final = 3.0, 60.0
+#: Longest reason that is taken [characters].
+LONGEST_REASON: Final = 200
+Values = dict[str, Any]
+
+
+def number_of(values: Values, name: str) -> int | str:
+    """Return an integer of an order, or what is wrong with it."""
+    value = values.get(name)
+    return value if type(value) is int else f"{name}: a number was expected"
+
+
+def metres_of(values: Values, *names: str) -> list[float] | str:
+    """Return numbers of an order, or what is wrong with the first that is none."""
+    found = [values.get(name) for name in names]
+    for name, value in zip(names, found, strict=True):
+        if type(value) not in (int, float) or not abs(value) < 1e7:  # type: ignore[arg-type]
+            return f"{name}: a number was expected"
+    return [float(value) for value in found]  # type: ignore[arg-type]
+
+
+class OrderedCentre(Protocol):
+    """What orders need of the centre (`railfix.ground.control.ControlCentre`)."""
+
+    supervision: Supervision
+
+    @property
+    def clock(self) -> Callable[[], float]:
+        """Centre's clock [s]."""
+
+    def log(self, text: str, *, train: int | None = None) -> None:
+        """Write a line of the log."""
+
+    def released(self, train: int) -> tuple[Interlocking, str | None]:
+        """Return the state with the stop of a train released, and the reason of a refusal."""
+
+    def confirm_start(self) -> str | None:
+        """Go on without the trains that have not been heard since the start."""
+
+    def changed(self, state: Interlocking) -> None:
+        """Take a state in which an order has changed trains."""
+
+    def release(self) -> str | None:
+        """Release a stop of all trains."""
+
+    def stop(self, train: int | None) -> str | None:
+        """Stop a train, or every train with None."""
+
+    def set_route(self, train: int) -> str | None:
+        """Set a train's route to the next station."""
+
+    def ask_route_back(self, train: int) -> str | None:
+        """Ask a train to give its route to the next station back."""
+
+
+@dataclass(kw_only=True)
+class OrderDesk:
+    """Orders of one centre."""
+
+    centre: OrderedCentre
+    #: Orders that have been given once, by name and values: when and by whom.
+    _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
+
+    def given(self, name: str, order: Callable[[Values, str], str | None], values: Values, by: str = "") -> str | None:
+        """Carry an order out, with a line in the log; return the reason of a refusal."""
+        reason = order(values, by)
+        shown = json.dumps({key: value for key, value in values.items() if key != "password"})
+        outcome = "done" if reason is None else f"refused: {reason}"
+        train = values.get("train")
+        who = by or "the page"
+        self.centre.log(f"order of {who}: {name} {shown}: {outcome}", train=train if type(train) is int else None)
+        return reason
+
+    def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
+        """Return None where an order comes the second time, in time; else what to do."""
+        key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.centre.clock(), AGAIN_S
+        asked = self._asked.pop(key, None)
+        if asked is not None:
+            least_s = 0.0 if asked[1] != by else least_s
+            if least_s <= now - asked[0] <= most_s:
+                return None
+        self._asked = {k: v for k, v in self._asked.items() if now - v[0] <= most_s}
+        self._asked[key] = now, by
+        return (
+            f"{what}: order it again in {AGAIN_S[0]:g} to {most_s:g} s, or let another person order it, if that is so"
+        )
+
+    def asked_s(self, name: str, values: Values) -> float:
+        """Return when an order was given the first time, now where it was not [s]."""
+        key = f"{name} {json.dumps(values, sort_keys=True)}"
+        return self._asked.get(key, (self.centre.clock(), ""))[0]
+
+    def release_train(self, values: Values, by: str) -> str | None:
+        """Release the stop of a train; nothing says of a silent one that it still is where it was: ordered twice."""
+        train = number_of(values, "train")
+        if isinstance(train, str):
+            return train
+        state, reason = self.centre.released(train)
+        record = self.centre.supervision.records.get(train)
+        silent = record is None or record.state is not TrainState.TRACKED
+        if reason is None and silent:
+            reason = self.confirmed("release-train", values, by, f"train {train} is silent, and stands, whole")
+        if reason is None:
+            self.centre.supervision.state = state
+        return reason
+
+    def twice(
+        self, name: str, change: Callable[[Values], tuple[Interlocking, str | None]], what: str, values: Values, by: str
+    ) -> str | None:
+        """Carry a change of trains out at its second order; a reason in words is part of it."""
+        reason = values.get("reason")
+        if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
+            return f"reason: one to {LONGEST_REASON} characters were expected: who has seen what"
+        since_s = self.asked_s(name, values)
+        before = self.centre.supervision.state
+        state, refused = change(values)
+        refused = refused or self._moved_meanwhile(before, state, since_s)
+        refused = refused or self.confirmed(name, values, by, what)
+        if refused is None:
+            self.centre.changed(state)
+        return refused
+
+    def _moved_meanwhile(self, before: Interlocking, after: Interlocking, since_s: float) -> str | None:
+        """Return the train whose place, as it reports since the first order, its new interval does not cover."""
+        for number, train in after.trains.items():
+            known, record = before.trains.get(number), self.centre.supervision.records.get(number)
+            if known is None or known is train or known.reported_m is None or record is None:
+                continue
+            if (
+                record.heard_s >= since_s - self.centre.supervision.centre.lost_s
+                and replace(train, reported_m=known.reported_m).outside_m() > 0.0
+            ):
+                return "train {} reports {:.0f} to {:.0f} m, outside of that interval".format(number, *known.reported_m)
+        return None
+
+    def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
+        """Return the state after a change of trains, and the reason of a refusal."""
+        state, layout = self.centre.supervision.state, self.centre.supervision.layout
+        train = number_of(values, "train")
+        if isinstance(train, str):
+            return state, train
+        if of in ("correct", "enter"):
+            ends, track = metres_of(values, "rear_m", "front_m"), number_of(values, "track")
+            direction = number_of(values, "direction")
+            for value in (ends, track, direction):
+                if isinstance(value, str):
+                    return state, value
+            place: Any = {"rear_m": ends[0], "front_m": ends[1], "track": track, "direction": direction}
+            if of == "correct":
+                return correct_interval(state, train, layout, **place)
+            length = metres_of(values, "length_m")
+            if isinstance(length, str):
+                return state, length
+            return enter_train(state, train, layout, length_m=length[0], **place)
+        if of == "remove":
+            return remove_train(state, train, layout)
+        other = number_of(values, "other")
+        if isinstance(other, str):
+            return state, other
+        if of == "join":
+            return join_trains(state, train, other, layout)
+        length = metres_of(values, "length_m")
+        if isinstance(length, str):
+            return state, length
+        return divide_train(state, train, other, length_m=length[0])
+
+    def confirm_start(self, values: Values, by: str) -> str | None:
+        """Go on after a start without the trains that are not heard: the database is the newest."""
+        if not self.centre.supervision.awaited:
+            return self.centre.confirm_start()
+        what = f"the database is no older copy, and not heard are {self.centre.supervision.awaited_text}"
+        return self.confirmed("confirm-start", values, by, what) or self.centre.confirm_start()
+
+    def section(self, values: Values, by: str, *, of: str) -> str | None:
+        """Bar a section, or end that: of one that was occupied at the second order."""
+        supervision, name = self.centre.supervision, str(values.get("section", ""))
+        layout, state = supervision.layout, supervision.state
+        if name not in layout.sections:
+            return f"there is no section {name!r}"
+        kind = CLOSED if of in ("close", "open") else OCCUPIED
+        if of in ("close", "occupy"):
+            supervision.state = close_section(state, name, layout, f"{name} is {kind}", kind=kind)
+            return None
+        if (name, kind) not in state.bars:
+            return f"{name!r} is not {kind}"
+        if of == "free" and (reason := self.confirmed("free-section", values, by, f"{name} is free of vehicles")):
+            return reason
+        supervision.state = open_section(state, name, kind)
+        return None
+
+    def detect(self, values: Values, _by: str) -> str | None:
+        """Take what the detection of a section says: occupied, free, or null where it is not known any more."""
+        name, occupied = str(values.get("section", "")), values.get("occupied")
+        if name not in self.centre.supervision.layout.sections:
+            return f"there is no section {name!r}"
+        if occupied is not None and not isinstance(occupied, bool):
+            return "occupied: true, false or null was expected"
+        self.centre.supervision.set_section_detected(name, occupied)
+        return None
+
+    def restrict(self, values: Values, by: str) -> str | None:
+        """Set a temporary speed restriction by its name, or lift it, ordered twice."""
+        supervision, name = self.centre.supervision, str(values.get("name", "")).strip()
+        state = supervision.state
+        if not 0 < len(name) <= 40:
+            return "name: one to 40 characters were expected"
+        if values.get("lift") is True:
+            if name not in state.restrictions:
+                return f"there is no restriction {name!r}"
+            reason = self.confirmed("restrict", values, by, f"nothing needs the restriction {name}")
+            if reason is None:
+                kept = {key: value for key, value in state.restrictions.items() if key != name}
+                supervision.state = replace(state, restrictions=kept)
+            return reason
+        found = metres_of(values, "low_m", "high_m", "speed_mps")
+        if isinstance(found, str):
+            return found
+        new = Restriction(*found)
+        if not new.low_m < new.high_m or not 0.0 < new.speed_mps <= 100.0:
+            return "low_m below high_m, and a speed up to 100 m/s were expected"
+        if name in state.restrictions:
+            return f"there is a restriction {name!r} already: lift it, or take another name"
+        if len(state.restrictions) >= MOST_PARTS:
+            return f"there are {MOST_PARTS} restrictions already, the most that an authority names"
+        supervision.state = replace(state, restrictions={**state.restrictions, name: new})
+        return None
+
+    def orders(self) -> dict[str, Order]:
+        """Return the orders by name; each takes its values and who gives it."""
+        centre = self.centre
+
+        def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:
+            def given(values: Values, _: str) -> str | None:
+                train = number_of(values, "train")
+                return train if isinstance(train, str) else order(train)
+
+            return given
+
+        def changing(of: str, what: str) -> Callable[[Values, str], str | None]:
+            return lambda values, by: self.twice(of, partial(self.change, of=of), what, values, by)
+
+        orders: dict[str, Callable[[Values, str], str | None]] = {
+            "close-section": partial(self.section, of="close"),
+            "open-section": partial(self.section, of="open"),
+            "occupy-section": partial(self.section, of="occupy"),
+            "free-section": partial(self.section, of="free"),
+            "detect-section": self.detect,
+            "restrict": self.restrict,
+            "confirm-start": self.confirm_start,
+            "release": lambda _values, _by: centre.release(),
+            "route": of_train(centre.set_route),
+            "route-back": of_train(centre.ask_route_back),
+            "stop": of_train(centre.stop),
+            "stop-all": lambda _values, _by: centre.stop(None),
+            "release-train": self.release_train,
+            "correct-train": changing("correct", "the train is inside that interval, and stands"),
+            "enter-train": changing("enter", "the train is inside that interval, and stands"),
+            "remove-train": changing("remove", "the train is no longer to be supervised"),
+            "join-trains": changing("join", "the trains are coupled, and stand"),
+            "divide-train": changing("divide", "the train is divided there, and both parts stand"),
+        }
+        return {name: partial(self.given, name, order) for name, order in orders.items()}

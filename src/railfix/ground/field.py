@@ -1,0 +1,37 @@
+"""Simulated points: there is no interface to real ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from railfix.ground.layout import PointName
+
+
+@dataclass(kw_only=True)
+class SimulatedPoints:
+    """Points that lose their detection at a command, and are detected in their new position some seconds later."""
+
+    move_s: float
+    clock: Callable[[], float]
+    lie: dict[PointName, int] = field(default_factory=dict)  #: Track that each leads to; 1 where none is given.
+    _moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)
+    _answers: dict[PointName, int | None] = field(default_factory=dict)
+
+    def command(self, point: PointName, track: int) -> None:
+        """Begin to move points to a track."""
+        self._moving[point] = self.clock() + self.move_s, track
+        self._answers[point] = None
+
+    def ask(self, point: PointName) -> None:
+        """Answer what points are detected at."""
+        self._answers[point] = None if point in self._moving else self.lie.get(point, 1)
+
+    def take_detected(self) -> Mapping[PointName, int | None]:
+        """Return what points have come to be detected at since the last call."""
+        answers, self._answers = self._answers, {}
+        for point, (until, track) in list(self._moving.items()):
+            if until <= self.clock():
+                del self._moving[point]
+                self.lie[point] = answers[point] = track
+        return answers

@@ -1,0 +1,199 @@
+"""Keys and certificates of the links: made, renewed with overlap, revoked, and looked at before they end.
+
+One authority signs the certificates of the centre and of the trains. Its key stays with who makes keys: in the folder
+where they are made, and in none that is handed over.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from railfix.core.errors import InputFileError, OutputError
+
+#: Validity of the certificates, of the authority's own, and the time before the end at which it is an alarm [days].
+VALID_DAYS: Final = 365
+AUTHORITY_DAYS: Final = 3650
+WARNING_DAYS: Final = 30
+_ISSUER: Final = "railfix authority"
+_PEM: Final = serialization.Encoding.PEM
+
+
+def check_keys(folder: Path, name: str) -> None:
+    """Raise InputFileError where a file that an end of the links needs is not there."""
+    for file in ("authority.pem", f"{name}.pem", f"{name}.key"):
+        if not (folder / file).is_file():
+            raise InputFileError(folder / file, "is not there; railfix ground keys writes it")
+
+
+class Revoked(NamedTuple):
+    """Certificates that do not count any more: by name, such as ``train-7``, and by serial number."""
+
+    names: frozenset[str] = frozenset()
+    serials: frozenset[int] = frozenset()
+
+    def has(self, certificate: x509.Certificate) -> bool:
+        """Return whether a certificate is one of them."""
+        return name_of(certificate) in self.names or certificate.serial_number in self.serials
+
+
+def name_of(certificate: x509.Certificate) -> str | None:
+    """Return the common name of a certificate, None where it has none."""
+    names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
+    return str(names[0].value) if names else None
+
+
+def read_revoked(folder: Path) -> Revoked:
+    """Return the certificates that do not count any more: the words of ``revoked.txt``.
+
+    A name (``train-7``) revokes every certificate of it, also later ones; a serial number (``0x5a1f...``, as
+    `railfix ground keys` prints it) that one alone, so that a train whose key was lost gets another.
+    InputFileError: when the file is there and cannot be read.
+    """
+    path = folder / "revoked.txt"
+    try:
+        words = path.read_text(encoding="utf-8").split()
+        serials = {word for word in words if word.startswith("0x")}
+        return Revoked(frozenset(words) - serials, frozenset(int(word, 16) for word in serials))
+    except FileNotFoundError:
+        return Revoked()
+    except (OSError, ValueError) as error:
+        raise InputFileError(path, f"cannot be read ({error})") from None
+
+
+def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
+    """Return the certificates of an end, and of the authority, that end within `WARNING_DAYS`, a sentence each."""
+    limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
+    found = []
+    for file in (f"{name}.pem", "authority.pem"):
+        # of an authority that was renewed the newest counts
+        newest = max(x509.load_pem_x509_certificates((folder / file).read_bytes()), key=lambda c: c.not_valid_after_utc)
+        if newest.not_valid_after_utc <= limit:
+            day = newest.not_valid_after_utc.date().isoformat()
+            found.append(f"the certificate {file} ends on {day}; renew it (railfix ground keys --renew)")
+    return found
+
+
+def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
+    """Write the authority's key and certificate, and those of ``centre`` and of each ``train-N``; return the files.
+
+    In a folder with an authority only what is not there yet is written: trains are added so. ``authority.key`` stays
+    there; it is in no folder that is handed to a train or a centre. Keys can be read by their owner alone.
+    OutputError: when there is nothing to write, or a file cannot be written. InputFileError: when a file of the
+    authority cannot be read.
+    """
+    names = ["centre", *(f"train-{number}" for number in trains)]
+    if (folder / "authority.key").exists():
+        signing, issuer = _read_authority(folder)
+        names = [name for name in names if not (folder / f"{name}.pem").exists()]
+        if not names:
+            raise OutputError(f"{folder}: every certificate is there already; --renew makes new ones")
+        parts: dict[str, bytes] = {}
+    else:
+        signing = ec.generate_private_key(ec.SECP256R1())
+        issuer = _signed(_ISSUER, signing.public_key(), signing, days=max(AUTHORITY_DAYS, valid_days))
+        parts = {"authority.pem": issuer.public_bytes(_PEM), "authority.key": _private(signing)}
+    days = _within(issuer, valid_days)
+    for name in names:
+        parts |= _pair(name, signing, days=days)
+    return _write(folder, parts, replace=False)
+
+
+def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
+    """Write new keys and certificates in place of those of the centre and of trains; return the files.
+
+    Those before stay valid until their end, so that each end takes its new files over by itself, at its next start or
+    connection. An authority that would end before them is renewed as well: ``authority.pem`` has the old and the new
+    certificate, and is handed to every end before the new ones. InputFileError, OutputError as `write_keys`.
+    """
+    signing, issuer = _read_authority(folder)
+    parts: dict[str, bytes] = {}
+    if _within(issuer, valid_days) < valid_days:
+        old = (folder / "authority.pem").read_bytes()
+        signing = ec.generate_private_key(ec.SECP256R1())
+        issuer = _signed(_ISSUER, signing.public_key(), signing, days=max(AUTHORITY_DAYS, valid_days))
+        parts = {"authority.pem": issuer.public_bytes(_PEM) + old, "authority.key": _private(signing)}
+    for name in ("centre", *(f"train-{number}" for number in trains)):
+        parts |= _pair(name, signing, days=valid_days)
+    return _write(folder, parts, replace=True)
+
+
+def _read_authority(folder: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
+    """Return the authority's key and its newest certificate."""
+    path = folder / "authority.key"
+    try:
+        key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+        certificates = x509.load_pem_x509_certificates((folder / "authority.pem").read_bytes())
+    except (OSError, ValueError, TypeError) as error:
+        raise InputFileError(
+            path, f"cannot be read with authority.pem ({error}); name the folder of the keys"
+        ) from None
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificates[0].public_key():
+        raise InputFileError(path, "is not the key of authority.pem")
+    return key, certificates[0]
+
+
+def _within(issuer: x509.Certificate, days: int) -> int:
+    """Return a validity that ends with the authority's [days]."""
+    return min(days, (issuer.not_valid_after_utc - datetime.now(UTC)).days)
+
+
+def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(_PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+
+
+def _pair(name: str, signing: ec.EllipticCurvePrivateKey, *, days: int) -> dict[str, bytes]:
+    """Return a new certificate and key as files by name."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    certificate = _signed(name, key.public_key(), signing, days=days)
+    return {f"{name}.pem": certificate.public_bytes(_PEM), f"{name}.key": _private(key)}
+
+
+def _signed(
+    name: str, public: ec.EllipticCurvePublicKey, signing: ec.EllipticCurvePrivateKey, *, days: int
+) -> x509.Certificate:
+    """Return a certificate of a name, signed by the authority."""
+    now = datetime.now(UTC)
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)]))
+        .issuer_name(x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, _ISSUER)]))
+        .public_key(public)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(hours=1))
+        .not_valid_after(now + timedelta(days=days))
+        .add_extension(x509.BasicConstraints(ca=name == _ISSUER, path_length=None), critical=True)
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(signing.public_key()), critical=False
+        )
+    )  # fmt: skip
+    return builder.sign(signing, hashes.SHA256())
+
+
+def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path]:
+    """Write files, keys for their owner alone, each whole or not at all; return their paths."""
+    written = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in parts.items():
+            mode = 0o600 if name.endswith(".key") else 0o644
+            path = folder / (f"{name}.new" if replace else name)
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+                file.write(data)
+            written.append(folder / name)
+        for name in parts if replace else ():
+            (folder / f"{name}.new").replace(folder / name)
+    except FileExistsError as error:
+        raise OutputError(f"{error.filename}: is there already; remove it, or name another folder") from None
+    except OSError as error:
+        raise OutputError(f"{folder}: keys cannot be written ({error.strerror})") from None
+    return written

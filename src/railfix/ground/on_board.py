@@ -1,0 +1,268 @@
+"""A train's supervision by the newest authority: its age, the end, the braking curve, and orders to brake."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Final
+
+from pydantic import Field
+
+from railfix.core.settings import option
+from railfix.ground.authority import Authority, BrakeOrder
+from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, supervise
+from railfix.ground.links import LinkMode
+from railfix.ground.positions import Clock
+
+#: Way back of the safe front end that is no error of two places [m].
+ROLLED_M: Final = 50.0
+#: Reports of which the time of sending is remembered.
+REMEMBERED: Final = 600
+REPORT_S: Final = 1.0  #: Time between two reports.
+
+
+class OnBoardLimits(BrakeLimits):
+    """Limits on board."""
+
+    #: Time limit of authorities: the train brakes where the newest one answers a report that was sent longer ago.
+    fresh_s: float = option(
+        "Time limit of authorities: older ones brake the train.", 15.0, name="--fresh", metavar="S", gt=0
+    )
+    #: A train without a place runs on from the last one for this time, at that one's highest speed; then it brakes.
+    placeless_s: float = Field(default=5.0, ge=0)
+    clock: Clock = option(
+        "Positions are of a recording: report each as of now, at the recording's own pace.", "live", name="--replay"
+    )
+    mode: LinkMode = option("Send reports over bearer A alone, and over B while A fails.", "both", name="--spare")
+
+
+@dataclass(kw_only=True)
+class Motion:
+    """Newest place of a train: safe ends, highest speed, and when it was there, None where that is not known."""
+
+    front_m: float
+    rear_m: float
+    speed_mps: float
+    at_s: float | None
+
+
+@dataclass(kw_only=True)
+class OnBoard:
+    """Authority of a train, as known on board.
+
+    The age of an authority is counted from the sending of the report that it answers, on the train's monotonic clock.
+    It is never too small, whatever the links do, and clocks of train and centre need not agree.
+    """
+
+    direction: int
+    #: End of the authority, the front end before the first; it is extended, and shortened where the centre asks for it
+    #: and the train can stop before.
+    end_m: float
+
+    limits: OnBoardLimits = field(default_factory=OnBoardLimits)
+    session: int = 0  #: Of the reports: what answers those of another start is refused.
+    number: int = -1  #: Of the newest authority, -1 before the first.
+    stopped: bool = False  #: The newest authority is an order to stop.
+    order: BrakeOrder | None = None  #: Order to brake that the train obeys.
+    authority: Authority | None = None  #: The newest one.
+    #: Where the train's safe front end would come to rest if it braked now, the further of the last two places; None:
+    #: it agrees to no shorter end.
+    stops_at_m: float | None = None
+    #: When the newest report was sent that an authority has answered; None before the first.
+    answered_s: float | None = None
+    #: Newest report from before the last turn, or from before this start: what answers it or an older one is refused.
+    before_turn: int = -1
+
+    _newest: int = -1
+    _granted: bool = False
+    _place_m: float | None = None
+    _motion: Motion | None = None
+    _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
+
+    def note_report(self, sequence: int, now_s: float) -> None:
+        """Note a report that is sent."""
+        self._sent[sequence] = now_s
+        self._newest = sequence
+        if len(self._sent) > REMEMBERED:
+            self._sent.popitem(last=False)
+
+    def note_position(
+        self,
+        safe_front_m: float | None,
+        speed_mps: float | None,
+        *,
+        speed_bound_mps: float = 0.0,
+        safe_rear_m: float | None = None,
+        now_s: float | None = None,
+    ) -> None:
+        """Note where the train's safe ends are, and its speed; one wrong place alone agrees to no shorter end.
+
+        A train that has rolled back brakes: what the centre granted before does not know of it. Without a place or a
+        speed it runs on from the one before (`OnBoardLimits.placeless_s`).
+        """
+        before, self._place_m, self.stops_at_m = self._place_m, None, None
+        if safe_front_m is None:
+            return
+        if self._motion is not None and self.direction * (safe_front_m - self._motion.front_m) < -ROLLED_M:
+            self.before_turn, self._granted, self.answered_s = self._newest - 1, False, None
+        if speed_mps is None:
+            return
+        self._motion = Motion(
+            front_m=safe_front_m,
+            rear_m=safe_front_m if safe_rear_m is None else safe_rear_m,
+            speed_mps=speed_mps + speed_bound_mps if speed_mps > 0.0 else 0.0,
+            at_s=now_s,
+        )
+        if self.order is not None and speed_mps == 0.0:
+            self._withdraw(safe_front_m)
+        d, way = self.direction, self._motion.speed_mps * REPORT_S
+        self._place_m = d * stopping_m(d * safe_front_m + way, self._motion.speed_mps, self._steps(), self.limits)
+        self.stops_at_m = self._further(before, self._place_m)
+
+    def _further(self, before_m: float | None, now_m: float) -> float | None:
+        """Return the further of two places in running direction, None without the first [m]."""
+        return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
+
+    def _withdraw(self, front_m: float) -> None:
+        """End the authority at the front: a train that stands by order gets a new one with its release."""
+        self.end_m = self.direction * min(self.direction * self.end_m, self.direction * front_m)
+        self._granted = False
+
+    def receive(self, authority: Authority) -> bool:
+        """Take an authority; return whether it counts: it is newer, for this direction, and of this side of a turn.
+
+        One that answers a report from before the last change of ends may have been granted for the direction of now
+        two changes ago. An order to brake always counts; one that is late lasts until the next authority.
+        """
+        if isinstance(authority, BrakeOrder):
+            # also of a centre whose database is an older copy, and knows no numbers as high as the train's
+            if self.order is None or authority.number >= self.order.number:
+                self.order = authority
+            return True
+        if authority.number <= self.number or authority.direction != self.direction or not self._answers(authority):
+            return False
+        if self.order is not None and not self._ends_order(authority):
+            return False
+        end, held = self.direction * authority.end_cm / 100.0, self.direction * self.end_m
+        agrees = self.stops_at_m is not None and self.direction * self.stops_at_m <= end
+        if not self._may_take(authority, agrees=agrees):
+            return False
+        if self._begins():
+            self.end_m, self._granted = self.direction * end, True
+        elif not authority.shortens:
+            self.end_m = self.direction * max(end, held)
+        elif agrees:
+            self.end_m = self.direction * min(end, held)
+        self.number, self.stopped, self.authority = authority.number, authority.stopped, authority
+        self.order = None
+        if (sent_s := self._sent.get(authority.report)) is not None:
+            self.answered_s = sent_s
+        return True
+
+    def _ends_order(self, authority: Authority) -> bool:
+        """Return whether an authority ends the order to brake; one that does not counts for nothing but its age."""
+        assert self.order is not None
+        if authority.number > self.order.number and not authority.stopped:
+            return True
+        if authority.number > self.number and (sent_s := self._sent.get(authority.report)) is not None:
+            self.answered_s = sent_s
+        return False
+
+    def _answers(self, authority: Authority) -> bool:
+        """Return whether an authority answers a report of this start on board and since the last change of ends."""
+        return authority.session == self.session and authority.report > self.before_turn
+
+    def _begins(self) -> bool:
+        """Return whether an authority is the first since the start, the last turn or an order to brake."""
+        return not self._granted
+
+    def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
+        """Return whether a shorter end may be taken: what a train held before its start is not known.
+
+        It brakes until it can agree.
+        """
+        return not authority.shortens or agrees or self._granted
+
+    def acknowledgement(self) -> dict[str, int]:
+        """Return what a report says of the orders that the train holds: nothing before the first."""
+        order = {} if self.order is None else {"brake_order": self.order.number}
+        if self.number < 0:
+            return order
+        end_cm = self.direction * math.ceil(self.direction * self.end_m * 100.0)
+        return {"authority": self.number, "authority_end_cm": end_cm, **order}
+
+    def age_s(self, now_s: float) -> float:
+        """Age of the newest authority at most [s]; infinite before the first."""
+        return float("inf") if self.answered_s is None else now_s - self.answered_s
+
+    def _steps(self) -> Steps:
+        """Return the gradients of the authority in running direction."""
+        parts = () if self.authority is None else self.authority.gradients
+        if self.direction > 0:
+            return Steps([c / 100.0 for c, _ in parts], [p / 1000.0 for _, p in parts])
+        # backward: a gradient holds from the begin of the next part down to its own, and before the first it is level
+        ends = [-c / 100.0 for c, _ in parts[::-1]]
+        return Steps([-math.inf, *ends], [*(-p / 1000.0 for _, p in parts[::-1]), 0.0])
+
+    def supervised(self, now_s: float | None = None) -> Supervised | None:
+        """Return the speeds that the train may run at, None before its first place.
+
+        Its place is carried on from the newest, where the instants of both are known.
+        """
+        if (motion := self._motion) is None:
+            return None
+        d, restrictions = self.direction, () if self.authority is None else self.authority.restrictions
+        parts = [
+            (min(d * low, d * high) / 100.0, max(d * low, d * high) / 100.0, cmps / 100.0)
+            for low, high, cmps in restrictions
+        ]
+        return supervise(
+            d * motion.front_m + self._carried_m(now_s),
+            d * motion.rear_m,
+            end_m=d * self.end_m,
+            overlap_m=0.0 if self.authority is None else self.authority.overlap_cm / 100.0,
+            restrictions=parts,
+            steps=self._steps(),
+            brakes=self.limits,
+        )
+
+    def _carried_m(self, now_s: float | None) -> float:
+        """Return how far the train can have run since its newest place [m]."""
+        motion = self._motion
+        if motion is None or motion.at_s is None or now_s is None:
+            return 0.0
+        return motion.speed_mps * max(now_s - motion.at_s, 0.0)
+
+    def brake_reason(self, now_s: float) -> str | None:
+        """Return why the train brakes, None where it may run on."""
+        if self.order is not None:
+            return f"ordered to stop: {self.order.reason}" if self.order.reason else "ordered to stop"
+        if self.stopped:
+            return "ordered to stop"
+        return self.stale_reason(now_s) or self.curve_reason(now_s)
+
+    def stale_reason(self, now_s: float) -> str | None:
+        """Return what is too old for the train to run by: its authority, or its place."""
+        if self.age_s(now_s) > self.limits.fresh_s:
+            return "no fresh authority"
+        at_s = None if self._motion is None else self._motion.at_s
+        return "no place" if at_s is not None and now_s - at_s > self.limits.placeless_s else None
+
+    def curve_reason(self, now_s: float) -> str | None:
+        """Return why the train is braked by its curve: the speed, what was allowed, and by how much it overruns."""
+        found, motion = self.supervised(now_s), self._motion
+        if found is None or motion is None or motion.speed_mps <= found.intervention_mps:
+            return None
+        d = self.direction
+        place = d * motion.front_m + self._carried_m(now_s)
+        over = stopping_m(place, motion.speed_mps, self._steps(), self.limits) - d * self.end_m
+        overruns = f", {over:.0f} m beyond it" if over > 0.0 else ""
+        target = f"{found.target.speed_mps:.1f} m/s at {d * found.target.at_m:.0f} m"
+        return f"{motion.speed_mps:.1f} m/s where {found.intervention_mps:.1f} m/s lead to {target}{overruns}"
+
+    def turn(self, direction: int, front_m: float) -> None:
+        """Begin in the other direction, without an authority."""
+        self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
+        self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None
+        self._motion, self.authority = None, None

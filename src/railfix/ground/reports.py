@@ -1,0 +1,363 @@
+"""What a position report does to the interval of its train: pure functions.
+
+Nothing here proves a report right: `CHECKS` find reports that cannot be right together with those before. What stays
+unseen (errors inside the train's own bounds) is assumed away in ``docs/ground.md``.
+
+The safe rear end moves to what two reports in a row confirm, of a complete train of its configured length. A report
+that contradicts what is known of its train stops that train and its neighbours. Whatever else is wrong with it, the
+interval comes to cover the place that it names, as far as the train can have got there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+from railfix.ground.layout import Layout
+from railfix.ground.state import Interlocking, InterlockingLimits, TrainInterval, with_train
+from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
+
+#: Difference of a reported length from the configured one that is rounding [m].
+LENGTH_ROUNDING_M: Final = 0.02
+#: Speed of a train that stands, at most; and against the facing, from which a train rolls back [m/s].
+STANDING_MPS: Final = 0.5
+SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
+#: Largest sum of over- and under-reading amount of a report that is taken.
+WIDEST_M: Final = 1000.0
+#: Instants of places are so uncertain for what an interval covers: as old as a place may be when it is sent [s].
+INSTANT_S: Final = 5.0
+#: Beginning of the reason where a train holds an authority beyond the end of its interval.
+HOLDS_MORE: Final = "the train holds an authority beyond its interval,"
+
+
+def is_placed(message: TrainMessage) -> bool:
+    """Return whether a report has a place with both bounds, of a train whose front end is known."""
+    known = None not in (message.chainage_cm, message.over_cm, message.under_cm)
+    placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
+    return known and placed and message.facing != 0 and Unknown.FRONT_END not in message.unknown
+
+
+def is_newer(known: TrainInterval, message: TrainMessage) -> bool:
+    """Return whether a report comes after those that are known: of a later start on board, or a higher number."""
+    return (message.session or 0) != known.session or message.sequence > known.sequence
+
+
+def stands(message: TrainMessage) -> bool:
+    """Return whether a report says that the train stands, and its speed does not deny it."""
+    return message.standstill and abs(message.speed_cmps or 0) / 100.0 <= STANDING_MPS
+
+
+def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
+    """Return whether the safe rear end may follow a report: the train is complete and has its configured length."""
+    return message.complete and abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacedReport:
+    """A report with a place, beside what is known of its train."""
+
+    known: TrainInterval
+    message: TrainMessage
+    layout: Layout
+    limits: InterlockingLimits
+    granted: int  #: Number of the last authorities.
+    #: Time since the place before, at most [s]: negative where the report's clock is behind that of the one before,
+    #: None where it is not known, as at the first report.
+    elapsed_s: float | None
+
+    @property
+    def front_m(self) -> float:
+        """Reported front end [m]."""
+        return (self.message.chainage_cm or 0) / 100.0
+
+    @property
+    def over_m(self) -> float:
+        """Distance that the front end is behind the reported one at most [m]."""
+        return (self.message.over_cm or 0) / 100.0
+
+    @property
+    def under_m(self) -> float:
+        """Distance that the front end is ahead of the reported one at most [m]."""
+        return (self.message.under_cm or 0) / 100.0
+
+    @property
+    def speed_mps(self) -> float | None:
+        """Reported speed [m/s]."""
+        return None if self.message.speed_cmps is None else abs(self.message.speed_cmps) / 100.0
+
+    @property
+    def rear_m(self) -> float:
+        """Safe rear end by this report alone [m]."""
+        return self.front_m - self.message.facing * (self.over_m + self.known.length_m)
+
+    @property
+    def ahead_m(self) -> float:
+        """Safe front end by this report alone [m]."""
+        return self.front_m + self.message.facing * self.under_m
+
+    @property
+    def turns(self) -> bool:
+        """Whether the train looks the other way than before."""
+        return self.message.facing != self.known.direction
+
+
+def no_length(report: PlacedReport) -> str | None:
+    """Return the reason of a report without a train length."""
+    return "the report has no train length" if report.message.length_cm == 0 else None
+
+
+def other_line(report: PlacedReport) -> str | None:
+    """Return the reason of a report of another line."""
+    line, known = report.message.line, report.known.line
+    return None if known in (None, line) else f"the report is of line {line}, the train is on line {known}"
+
+
+def wide_bounds(report: PlacedReport) -> str | None:
+    """Return the reason of a place that is hardly known."""
+    wide = report.over_m + report.under_m > WIDEST_M
+    return f"the bounds of the place are wider than {WIDEST_M:g} m" if wide else None
+
+
+def off_line(report: PlacedReport) -> str | None:
+    """Return the reason of a place off the line."""
+    first, last = report.layout.stations[0].begin_m, report.layout.stations[-1].end_m
+    on_line = first - report.over_m <= report.front_m <= last + report.under_m
+    return None if on_line else f"the place is not on the line: {report.front_m:.0f} m"
+
+
+def moving_standstill(report: PlacedReport) -> str | None:
+    """Return the reason of a standstill with a speed."""
+    moving = report.message.standstill and not stands(report.message)
+    return f"the train stands, and runs at {report.speed_mps:.1f} m/s" if moving else None
+
+
+def unknown_authority(report: PlacedReport) -> str | None:
+    """Return the reason of an authority that the centre has not given, as far as its database knows."""
+    held = report.message.authority or 0
+    if held <= report.granted:
+        return None
+    return f"the train holds authority {held}, the centre's database ends at {report.granted}"
+
+
+def wrong_turn(report: PlacedReport) -> str | None:
+    """Return what a change of ends contradicts: the train stands where it stood, its rear end is now the front."""
+    if not report.turns:
+        return None
+    if not report.message.standstill:
+        return "the train has changed ends while it runs"
+    known, facing = report.known, report.message.facing
+    if facing * report.front_m - report.over_m > facing * known.rear_m:
+        return "the train has changed ends and is behind its interval"
+    if facing * report.front_m + report.under_m - known.length_m < facing * known.interval_m[1]:
+        return "the train has changed ends and is beyond its interval"
+    return None
+
+
+def holds_more(report: PlacedReport) -> str | None:
+    """Return the reason of an authority that reaches beyond the interval."""
+    end_cm = report.message.authority_end_cm
+    if report.turns or end_cm is None or report.known.direction * (end_cm / 100.0 - report.known.end_m) <= 0.02:
+        return None
+    return f"{HOLDS_MORE} to {end_cm / 100.0:.0f} m"
+
+
+def too_fast(report: PlacedReport) -> str | None:
+    """Return the reason of a speed that no train has."""
+    fast = report.speed_mps is not None and report.speed_mps > report.limits.speed_mps
+    return f"the speed {report.speed_mps:.0f} m/s is above {report.limits.speed_mps:g} m/s" if fast else None
+
+
+def older_place(report: PlacedReport) -> str | None:
+    """Return the reason of a place that is older than that before."""
+    older = report.elapsed_s is not None and report.elapsed_s < 0.0
+    return "the place is older than that of the report before" if older else None
+
+
+def longest_way_m(before: float | None, now: float | None, elapsed_s: float, limits: InterlockingLimits) -> float:
+    """Return how far a train can have run, between reports of its speed where it has given both [m]."""
+    top = limits.speed_mps
+    if before is not None and now is not None:
+        # speeds in between are at most so much above both ends
+        top = min(top, max(before, now) + SPEED_ERROR_MPS + 0.5 * limits.acceleration_mps2 * elapsed_s)
+    return top * elapsed_s
+
+
+def impossible_way(report: PlacedReport) -> str | None:
+    """Return the reason of a way that no train makes in the time, or that was not possible at all."""
+    known, elapsed = report.known, report.elapsed_s
+    if report.turns:
+        return None
+    if elapsed is None:  # at its first report it stands; after a start on board it may be anywhere in its interval
+        end = known.front_m if known.reported_m is None else known.interval_m[1]
+        way = known.direction * (report.front_m - end) - report.over_m
+        return f"the train is {way:.0f} m or more ahead of where it is known to be" if way > 0.0 else None
+    way = known.direction * (report.front_m - known.front_m) - report.over_m
+    if way > longest_way_m(known.speed_mps, report.speed_mps, max(elapsed, 0.0), report.limits):
+        return f"the train has moved {way:.0f} m or more in {elapsed:.1f} s"
+    return None
+
+
+def beyond_authority(report: PlacedReport) -> str | None:
+    """Return the reason of a place beyond the authority."""
+    beyond = report.known.direction * (report.front_m - report.known.end_m) - report.over_m
+    return "the train is beyond its authority" if not report.turns and beyond > 0.0 else None
+
+
+def rolled_back(report: PlacedReport) -> str | None:
+    """Return the reason of a place behind the interval."""
+    ahead = report.known.direction * (report.front_m - report.known.rear_m) + report.under_m
+    return "the train has rolled back" if not report.turns and ahead < report.known.length_m else None
+
+
+def runs_backward(report: PlacedReport) -> str | None:
+    """Return the reason of a train that runs against its facing."""
+    message, speed = report.message, report.speed_mps
+    backward = message.direction == -report.known.direction and (speed is None or speed > STANDING_MPS)
+    return "the train runs backward" if backward and not message.standstill and not report.turns else None
+
+
+Check = Callable[[PlacedReport], str | None]
+#: What a report may contradict, in the order in which the reason is named.
+CHECKS: tuple[Check, ...] = (
+    no_length, other_line, wide_bounds, off_line, moving_standstill, unknown_authority, wrong_turn, holds_more,
+    too_fast, older_place, impossible_way, beyond_authority, rolled_back, runs_backward,
+)  # fmt: skip
+
+
+def compute_contradiction(report: PlacedReport) -> str | None:
+    """Return what a placed report contradicts, None where it may be right."""
+    return next((reason for check in CHECKS if (reason := check(report)) is not None), None)
+
+
+def covered_m(report: PlacedReport) -> tuple[float, float]:
+    """Return rear and front end of an interval that has grown to the reported place.
+
+    No further than the train can have got since the place before, and not beyond the line.
+    """
+    known, d = report.known, report.known.direction
+    reach = math.inf if report.elapsed_s is None else max(report.elapsed_s, INSTANT_S) * report.limits.speed_mps
+    over, under = min(report.over_m, WIDEST_M), min(report.under_m, WIDEST_M)
+    facing = report.message.facing
+    ends = d * (report.front_m - facing * (over + known.length_m)), d * (report.front_m + facing * under)
+    first, last = sorted(d * end for end in (report.layout.stations[0].begin_m, report.layout.stations[-1].end_m))
+    back = max(min(ends), d * known.rear_m - reach, first)
+    front = min(max(ends), d * known.interval_m[1] + reach, last)
+    return d * min(back, d * known.rear_m), d * max(front, d * known.front_m)
+
+
+def _noted(report: PlacedReport) -> TrainInterval:
+    """Return the train with what any placed report says, whatever it contradicts; its interval as it was."""
+    message = report.message
+    low, high = sorted((report.rear_m, report.ahead_m))
+    return replace(
+        report.known,
+        session=message.session or 0,
+        sequence=message.sequence,
+        standstill=stands(message),
+        measured_ns=message.time_ns,
+        speed_mps=report.speed_mps,
+        reported_m=(low, high),
+        claimed_m=None,
+        contradiction=None,
+        held_end_m=None if message.authority_end_cm is None or report.turns else message.authority_end_cm / 100.0,
+    )
+
+
+def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:
+    """Return a train that is stopped, its interval grown to the reported place."""
+    rear, front = covered_m(report)
+    noted = _noted(report)
+    end_cm = report.message.authority_end_cm
+    end = end_cm / 100.0 if reason.startswith(HOLDS_MORE) and end_cm is not None else noted.end_m
+    return replace(noted, stop=noted.stop or reason, contradiction=reason, end_m=end, rear_m=rear, front_m=front)
+
+
+def report_received(
+    state: Interlocking,
+    message: TrainMessage,
+    layout: Layout,
+    *,
+    limits: InterlockingLimits | None = None,
+    elapsed_s: float | None = None,
+) -> Interlocking:
+    """Return the state after a position report.
+
+    A train that looks the other way than before has changed ends; that counts only at a standstill inside its
+    station, and the interval still covers where the train stood. A report that contradicts what is known stops the
+    train and moves its interval outward alone. `elapsed_s` is the time since the place before at most, by the
+    centre's own clock, where that is known.
+    """
+    before = state.trains.get(message.train)
+    if before is None or not is_placed(message) or not is_newer(before, message):
+        return state
+    report = PlacedReport(
+        known=before,
+        message=message,
+        layout=layout,
+        limits=limits or InterlockingLimits(),
+        granted=state.granted,
+        elapsed_s=_elapsed_s(before, message, elapsed_s),
+    )
+    contradiction = compute_contradiction(report)
+    if contradiction is not None:
+        return _with_granted(with_train(state, stop_contradicted(report, contradiction)), message)
+    confirmed, facing = confirms_rear(before, message), message.facing
+    rear, ahead, noted = report.rear_m, report.ahead_m, _noted(report)
+    if report.turns and not (confirmed and layout.station_at(*sorted((rear, ahead))) == before.station):
+        return with_train(state, noted)
+    known = replace(noted, line=message.line, claimed_m=rear if confirmed else None)
+    if report.turns:
+        return with_train(state, _turn(known, facing, rear, ahead, layout))
+    if confirmed and before.claimed_m is not None and before.stop is None:
+        agreed = agreed_rear(facing, rear, before.claimed_m)
+        known = replace(known, rear_m=facing * furthest(facing, agreed, before.rear_m))
+    # of a stopped train the interval only grows
+    front = ahead if before.stop is None else facing * max(facing * ahead, facing * before.front_m)
+    return with_train(state, replace(known, front_m=front))
+
+
+def agreed_rear(facing: int, rear_m: float, claimed_m: float) -> float:
+    """Return the rear end of two reports in a row, along the facing: one wrong report alone moves it nowhere [m]."""
+    return min(facing * rear_m, facing * claimed_m)
+
+
+def furthest(facing: int, agreed_m: float, known_m: float) -> float:
+    """Return the rear end that is kept, along the facing: no wider bound moves it back [m]."""
+    return max(agreed_m, facing * known_m)
+
+
+def _elapsed_s(known: TrainInterval, message: TrainMessage, by_centre_s: float | None) -> float | None:
+    """Return the time since the place before, at most, by the train's clock and the centre's [s]."""
+    if known.measured_ns is None or (message.session or 0) != known.session:
+        return by_centre_s
+    by_train_s = (message.time_ns - known.measured_ns) / 1e9
+    # a clock that was set forward makes no way possible
+    return by_train_s if by_centre_s is None or by_train_s < 0.0 else max(min(by_train_s, by_centre_s), 0.0)
+
+
+#: Numbers of authorities up to which a train's word is taken for what an older copy of the database does not know.
+_MOST_NUMBERS: Final = 1 << 62
+
+
+def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
+    """Return the state whose next authorities have higher numbers than the train holds."""
+    held = message.authority or 0
+    return replace(state, granted=held) if state.granted < held < _MOST_NUMBERS else state
+
+
+def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
+    """Return a train that has changed ends: no authority beyond its front, and where it stood is still occupied."""
+    covered = facing * max(facing * ahead, facing * known.rear_m)
+    back = facing * min(facing * rear, facing * known.front_m)
+    under = {known.station, *layout.stations_between(*sorted((back, covered)))}
+    return replace(
+        known,
+        direction=facing,
+        rear_m=back,
+        front_m=covered,
+        end_m=ahead,
+        tracks={station: track for station, track in known.tracks.items() if station in under},
+        asked_m=None,
+    )

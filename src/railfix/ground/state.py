@@ -1,0 +1,210 @@
+"""State of the interlocking: intervals of trains, points, bars and speed restrictions; and its texts for the store.
+
+Texts: the head, one a train, one a pair of points. Values are never written to: each step returns new ones.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+from pydantic import Field
+
+from railfix.core.errors import InputFileError
+from railfix.core.settings import Settings
+from railfix.ground.layout import PointName
+
+
+class InterlockingLimits(Settings):
+    """Limits of the interlocking."""
+
+    margin_m: float = Field(default=20.0, ge=0)  #: Kept between the end of an authority and what limits it.
+    #: Kept beyond the end as well for a train that passes it at release speed; 0: there is no release speed.
+    overlap_m: float = Field(default=0.0, ge=0)
+    #: Points are released this long after the safe rear end has passed them.
+    release_s: float = Field(default=3.0, ge=0)
+    #: The field answers the question for the detection of points within this time; else the trains on them are stopped.
+    answer_s: float = Field(default=10.0, gt=0)
+    speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
+    #: Highest acceleration and deceleration, between two reports with speeds.
+    acceleration_mps2: float = Field(default=2.0, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainInterval:
+    """Interval and route of a train."""
+
+    train: int
+    direction: int
+    #: Last safe rear and front ends.
+    rear_m: float
+    front_m: float
+    end_m: float  #: End of the authority.
+    sequence: int  #: Newest report, and the start on board that it is of (`TrainMessage.session`).
+    session: int = 0
+    tracks: Mapping[int, int]  #: Track in each station of the route.
+    station: int  #: Station where the route ends.
+    length_m: float  #: Length of the train as configured.
+    standstill: bool = True
+    #: Safe rear end of the newest report; the interval begins there once the next one confirms it. None where the
+    #: newest report does not confirm the train's integrity and length.
+    claimed_m: float | None = None
+    line: int | None = None  #: Line of the train's reports; None before the first.
+    #: Instant of the newest place, on the train's clock; None before the first report since a start on board.
+    measured_ns: int | None = None
+    speed_mps: float | None = None  #: Newest speed.
+    #: Ends of the train by the newest report with a place, whatever else was wrong with it, lower first; and what
+    #: that report contradicted.
+    reported_m: tuple[float, float] | None = None
+    contradiction: str | None = None
+    held_end_m: float | None = None  #: End of the authority that the train holds, by its newest report.
+    stop: str | None = None  #: Why the train is stopped, until it is released by hand.
+    asked_m: float | None = None  #: Shorter end of the authority that the train is asked to agree to.
+    asked_number: int = 0  #: Number of the first authority that asks for it.
+    held: bool = False  #: A route was taken back: the next one is set by hand.
+    parted: int | None = None  #: Train that was divided from the rear of this one, until they are apart.
+
+    @cached_property
+    def interval_m(self) -> tuple[float, float]:
+        """Rear end and furthest end of the occupied interval [m]."""
+        return self.rear_m, max(self.end_m * self.direction, self.front_m * self.direction) * self.direction
+
+    @cached_property
+    def span_m(self) -> tuple[float, float]:
+        """Ends of the occupied interval, lower first [m]."""
+        low, high = sorted(self.interval_m)
+        return low, high
+
+    def overlaps(self, low_m: float, high_m: float) -> bool:
+        """Return whether some chainage between two is occupied."""
+        return self.span_m[0] < high_m and low_m < self.span_m[1]
+
+    def has_passed(self, low_m: float, high_m: float) -> bool:
+        """Return whether the rear end is beyond what lies between two chainages, in running direction."""
+        return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
+
+    def outside_m(self) -> float:
+        """Return how far the newest reported place lies outside the interval, 0 where it may be inside [m]."""
+        if self.reported_m is None:
+            return 0.0
+        front = max(self.direction * end for end in self.reported_m)
+        beyond = front - self.direction * self.interval_m[1]
+        behind = self.direction * self.rear_m + self.length_m - front
+        return max(beyond, behind, 0.0) if max(beyond, behind) > ROUNDING_M else 0.0
+
+
+#: Difference of two ends that is rounding [m].
+ROUNDING_M: Final = 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointState:
+    """Points as the interlocking knows them."""
+
+    wanted: int = 1  #: Track they are commanded to.
+    detected: int | None = 1  #: Track they are detected at; None while they move, or before the field has answered.
+    #: The field has been given the command since `wanted` was stored.
+    commanded: bool = True
+    #: Trains that lock them: None until the train's rear end has passed, then the time of release [s].
+    locked: Mapping[int, float | None] = field(default_factory=dict)
+
+    @property
+    def lies(self) -> bool:
+        """Whether the points are detected where they are wanted."""
+        return self.detected == self.wanted
+
+
+class Restriction(NamedTuple):
+    """Temporary speed restriction: highest speed of a train while any part of it is between two chainages."""
+
+    low_m: float
+    high_m: float
+    speed_mps: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interlocking:
+    """State of the interlocking."""
+
+    trains: Mapping[int, TrainInterval]
+    points: Mapping[PointName, PointState]
+    stopped: bool = False  #: True while no authority is extended and no route set: satellite positioning is suspended.
+    granted: int = 0  #: Number of the last authorities that were sent.
+    #: Sections (`Layout.sections`) that no authority reaches into, each with why: `railfix.ground.stops.BARS`.
+    bars: frozenset[tuple[str, str]] = frozenset()
+    restrictions: Mapping[str, Restriction] = field(default_factory=dict)  #: By name.
+
+
+def with_train(state: Interlocking, train: TrainInterval) -> Interlocking:
+    """Return the state with the newer interval of a train."""
+    return replace(state, trains={**state.trains, train.train: train})
+
+
+def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Interlocking:
+    """Return the state with trains stopped; one that is stopped already keeps its reason."""
+    for number in trains:
+        known = state.trains[number]
+        if known.stop is None:
+            state = with_train(state, replace(known, stop=reason))
+    return state
+
+
+#: Name of the text without trains and points, and beginnings of the names of theirs.
+HEAD: Final = "interlocking"
+_TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
+
+
+def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str | None]:
+    """Return the texts by name; with a state before only those that may have changed, None for one to be removed."""
+    head = {
+        "stopped": state.stopped,
+        "granted": state.granted,
+        "bars": sorted(state.bars),
+        "restrictions": state.restrictions,
+    }
+    texts: dict[str, str | None] = {HEAD: json.dumps(head)}
+    trains, points = (before.trains, before.points) if before is not None else ({}, {})
+    for number, train in state.trains.items():
+        if train is not trains.get(number):
+            texts[f"{_TRAIN}{number}"] = json.dumps(_values(train))
+    texts.update((f"{_TRAIN}{number}", None) for number in trains if number not in state.trains)
+    for (station, side), point in state.points.items():
+        if point is not points.get((station, side)):
+            texts[f"{_POINTS}{station} {side}"] = json.dumps(_values(point))
+    return texts
+
+
+def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
+    """Return the state from its texts. Times of release begin again: the clock of the process before is not known.
+
+    InputFileError: when an older version wrote them.
+    """
+    head = json.loads(texts[HEAD] or "")
+    if "bars" not in head:
+        raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
+    trains, points = {}, {}
+    for name, text in texts.items():
+        if name.startswith(_TRAIN):
+            values = json.loads(text or "")
+            tracks = {int(station): track for station, track in values.pop("tracks").items()}
+            reported = values.pop("reported_m")
+            trains[int(name.removeprefix(_TRAIN))] = TrainInterval(
+                **values, tracks=tracks, reported_m=None if reported is None else tuple(reported)
+            )
+        elif name.startswith(_POINTS):
+            values = json.loads(text or "")
+            station, side = map(int, name.removeprefix(_POINTS).split())
+            points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
+    # in the order of the line, whatever the order of the texts
+    return Interlocking(
+        trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
+        granted=head["granted"], bars=frozenset((name, kind) for name, kind in head["bars"]),
+        restrictions={name: Restriction(*values) for name, values in head["restrictions"].items()},
+    )  # fmt: skip
+
+
+def _values(record: TrainInterval | PointState) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}

@@ -1,0 +1,114 @@
+"""Commits to the store beside the centre's work: in a thread, one at a time, so that a database that hangs holds up
+nothing but what waits for its commit.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+from railfix.ground.store import DatabaseError
+
+#: A commit that takes longer is an alarm [s].
+HANGS_S: Final = 2.0
+#: Time between attempts to write to a database that fails [s].
+RETRY_S: Final = 1.0
+
+
+class Writer(Protocol):
+    """What carries a commit out: at once, or in a thread."""
+
+    def submit(self, work: Callable[[], None]) -> Future[None]:
+        """Begin some work; return its outcome."""
+
+
+class DirectWriter:
+    """Writer that carries the work out before it returns."""
+
+    def submit(self, work: Callable[[], None]) -> Future[None]:
+        """Do the work; return its outcome."""
+        outcome: Future[None] = Future()
+        _carry_out(work, outcome)
+        return outcome
+
+
+class ThreadWriter:
+    """Writer with a thread of its own, which does not keep the process from ending.
+
+    `done` is called, in that thread, after each work.
+    """
+
+    def __init__(self, done: Callable[[], None] = lambda: None) -> None:
+        self._done = done
+        self._queue: queue.Queue[tuple[Callable[[], None], Future[None]] | None] = queue.Queue()
+        self._thread = threading.Thread(target=self._run, name="railfix store", daemon=True)
+        self._thread.start()
+
+    def submit(self, work: Callable[[], None]) -> Future[None]:
+        """Begin some work after that before; return its outcome."""
+        outcome: Future[None] = Future()
+        self._queue.put((work, outcome))
+        return outcome
+
+    def stop(self, wait_s: float) -> bool:
+        """End the thread after the work that was begun; return whether it has ended in time."""
+        self._queue.put(None)
+        self._thread.join(wait_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while (item := self._queue.get()) is not None:
+            _carry_out(*item)
+            self._done()
+
+
+def _carry_out(work: Callable[[], None], outcome: Future[None]) -> None:
+    try:
+        work()
+    except Exception as error:  # noqa: BLE001 (whoever asks for the outcome gets it)
+        outcome.set_exception(error)
+    else:
+        outcome.set_result(None)
+
+
+@dataclass(kw_only=True)
+class Commits:
+    """Commits of the centre, one at a time, and what is wrong with them.
+
+    `alarm`: why the store does not take the state; nothing is granted meanwhile, and stops go out all the same.
+    """
+
+    writer: Writer = field(default_factory=DirectWriter)
+    alarm: str | None = None
+    _open: tuple[Future[None], Callable[[], None], float] | None = None
+    _failed_s: float = float("-inf")
+
+    def may_begin(self, now_s: float) -> bool:
+        """Return whether a commit may begin: none is under way, and none failed just before."""
+        return self._open is None and now_s - self._failed_s >= RETRY_S
+
+    def begin(self, work: Callable[[], None], then: Callable[[], None], now_s: float) -> None:
+        """Begin a commit; `then` is called by `settle` once it is done."""
+        self._open = self.writer.submit(work), then, now_s
+
+    def settle(self, now_s: float) -> None:
+        """Take the outcome of a commit that is done; raise what is no failure of the database."""
+        if self._open is None:
+            return
+        outcome, then, begun_s = self._open
+        if not outcome.done():
+            if now_s - begun_s > HANGS_S:
+                self.alarm = f"the database has not answered for {now_s - begun_s:.0f} s; nothing is granted"
+            return
+        self._open = None
+        try:
+            outcome.result()
+        except DatabaseError as error:
+            self.alarm, self._failed_s = f"{error}; nothing is granted", now_s
+            return
+        self.alarm = None
+        then()

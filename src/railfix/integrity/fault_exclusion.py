@@ -1,0 +1,182 @@
+"""Detect and exclude faulty satellites, then find the positions again: RAIM (P1 2.3(4), P4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Codes, Floats, Indices, Masks
+from railfix.integrity.raim import (
+    Detection,
+    Exclusion,
+    LinearModel,
+    Outcome,
+    RaimLimits,
+    detect,
+    exclude,
+    linear_model,
+    reliability,
+    worst_channel,
+)
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.line_fix import FixLimits, LineFix, fix_on_line, refit_epochs
+from railfix.positioning.normal_equations import point_position
+from railfix.positioning.range_arrays import Ranges, without
+from railfix.positioning.receiver_noise import robust_on_line
+from railfix.positioning.search_index import SearchIndex
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaimResult:
+    """Detection and exclusion of T epochs."""
+
+    outcome: Codes  #: `raim.Outcome`, shape (T,).
+    #: Before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
+    statistic: Floats
+    threshold: Floats
+    excluded: Masks  #: Shape (T, K).
+    own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
+    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN where
+    #: there is no position, where a fault is left in it, or where the level or RAIM is off; shape (T,).
+    protection_level_m: Floats
+
+    @property
+    def faulty(self) -> Masks:
+        """Epochs with a fault left in the position, shape (T,)."""
+        return np.asarray((self.outcome == int(Outcome.INSEPARABLE)) | (self.outcome == int(Outcome.UNRESOLVED)))
+
+
+def compute_statistic(
+    ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
+) -> RaimResult:
+    """Return the statistic of the residuals and its threshold (P4) without judging: every outcome is UNTESTABLE."""
+    found = _detect(ranges, fix, scale, limits or RaimLimits())
+    return RaimResult(
+        outcome=np.full(len(ranges), int(Outcome.UNTESTABLE), dtype=np.int8), statistic=found.statistic,
+        threshold=found.threshold, excluded=np.zeros(ranges.code_m.shape, dtype=bool),
+        own_error_m=np.full(ranges.code_m.shape, np.nan), protection_level_m=np.full(len(ranges), np.nan),
+    )  # fmt: skip
+
+
+def _detect(ranges: Ranges, fix: LineFix, scale: ArrayLike, limits: RaimLimits) -> Detection:
+    constrained = fix.constrained
+    return detect(constrained.wsse, constrained.residual_m, ranges.redundancy, limits=limits, scale=scale)
+
+
+def exclude_faults(
+    ranges: Ranges,
+    line: Line,
+    fix: LineFix,
+    *,
+    scale: ArrayLike = 1.0,
+    agreeing: Masks | None = None,
+    model: LinearModel | None = None,
+    limits: RaimLimits | None = None,
+    fix_limits: FixLimits | None = None,
+) -> tuple[Ranges, LineFix, RaimResult]:
+    """Return ranges and positions without up to two faulty satellites, and the verdict on each epoch (P1 2.3(4), P4).
+
+    The sum of squared residuals is tested against chi-square (P4, false alarm 1e-3), or against 100 m^2 (P1 table 6,
+    mode "fixed"). Every satellite, then every pair is left out; a set is excluded where the rest passes and each of its
+    own errors is over the limit. Of two satellites that disagree with the rest, the rest can be the faulty ones: a pair
+    of which the robust fit of the epoch keeps a range is not believed. Where a fault stays unresolved, the position is
+    that of the ranges that the robust fit keeps (`RaimResult.faulty`).
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Of `weighted_ranges`.
+    line : Trajectory, SearchIndex or AntennaRows
+    fix : LineFix
+        Positions from these ranges (`fix_on_line`).
+    scale : array_like, shape (T,) or ()
+        Standard deviation of this receiver's ranges over that of the weights (`noise_scale`).
+    agreeing : ndarray of bool, shape (T, M), optional
+        Ranges that a robust fit on the line keeps (`robust_fit`), by default computed here.
+    model : LinearModel, optional
+        That of the positions (`linear_model`), by default computed here.
+    limits, fix_limits : RaimLimits, FixLimits, optional
+    """
+    antennas, limits, fix_limits = AntennaRows.on(line), limits or RaimLimits(), fix_limits or FixLimits()
+    scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),))
+    if not (scale > 0.0).all(where=np.isfinite(scale)):
+        raise ValueError("scale must be positive: the standard deviation of the ranges over that of their weights")
+    raim, test = compute_statistic(ranges, fix, scale, limits=limits), _detect(ranges, fix, scale, limits)
+    raim.outcome[test.testable] = Outcome.PASSED
+    failing = test.detected.nonzero()[0]
+    if not len(failing):
+        return ranges, fix, raim
+    if model is None:
+        model = linear_model(ranges, antennas, fix.constrained.arc_m, section=fix.constrained.section)
+    if agreeing is None:
+        agreeing = robust_on_line(ranges, antennas, fix.constrained).kept
+    exclusion = exclude(model.take(failing), limits=limits, scale=scale[failing])
+    _put(raim, failing, exclusion)
+    for index, epochs in antennas.split(failing[exclusion.outcome == Outcome.UNRESOLVED]):
+        second = _second_attempt(ranges, index, fix, epochs, model.take(epochs), scale, limits, fix_limits)
+        _put(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
+    if limits.mode == "chi_square":
+        _by_robust_fit(raim, ranges, agreeing, failing, limits.min_redundancy)
+    changed = failing[raim.excluded[failing].any(axis=1)]
+    if not len(changed):
+        return ranges, fix, raim
+    ranges = without(ranges, raim.excluded)
+    fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
+    # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
+    raim.outcome[changed[_detect(ranges, fix, scale, limits).detected[changed]]] = Outcome.UNRESOLVED
+    return ranges, fix, raim
+
+
+def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices | slice = slice(None)) -> None:
+    """Write some rows of an exclusion of `epochs` into a result."""
+    at = epochs[rows]
+    for name in ("outcome", "excluded", "own_error_m"):
+        getattr(raim, name)[at] = getattr(exclusion, name)[rows]
+
+
+def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
+    """Exclude the ranges that the robust fit rejects where no exclusion is believed."""
+    pair = raim.outcome[failing] == Outcome.EXCLUDED_TWO
+    contradicted = pair & (raim.excluded[failing] & agreeing[failing]).any(axis=1)
+    unresolved = contradicted | (raim.outcome[failing] == Outcome.UNRESOLVED)
+    epochs = failing[unresolved]
+    if not len(epochs):
+        return
+    rejected = (ranges.weight[epochs] > 0) & ~agreeing[epochs]
+    rest = without(ranges.take(epochs), rejected)
+    raim.outcome[epochs], raim.own_error_m[epochs] = Outcome.UNRESOLVED, np.nan
+    raim.excluded[epochs] = rejected & (rest.redundancy >= min_redundancy)[:, None]
+
+
+def _second_attempt(
+    ranges: Ranges,
+    index: SearchIndex,
+    fix: LineFix,
+    epochs: Indices,
+    model: LinearModel,
+    scale: Floats,
+    limits: RaimLimits,
+    fix_limits: FixLimits,
+) -> Exclusion:
+    """Return the exclusion of unresolved epochs, linearised at their position without the worst satellite.
+
+    A large fault on a curve moves the position to a part of the line with another direction, where the
+    linear model does not hold for the true position.
+    """
+    worst = np.zeros((len(epochs), ranges.code_m.shape[1]), dtype=bool)
+    worst[np.arange(len(epochs)), worst_channel(model)] = True
+    all_ranges = ranges.take(epochs)
+    part = without(all_ranges, worst)
+    point = point_position(part, fix.point.ecef_m[epochs], limits=fix_limits.single_point)
+    solved = fix_on_line(part, index, point, fix_limits).constrained
+    return exclude(
+        linear_model(all_ranges, index, solved.arc_m, section=solved.section), limits=limits, scale=scale[epochs]
+    )
+
+
+def add_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, *, limits: RaimLimits) -> RaimResult:
+    """Return the RAIM result with P4's protection level, where no fault is left in the position."""
+    level = reliability(model, limits=limits, scale=scale).protection_level_m
+    return replace(raim, protection_level_m=np.where(raim.faulty, np.nan, level))

@@ -1,0 +1,128 @@
+"""Satellites whose codes are wrong for a minute: found by the mean of their clipped residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, copy_with
+from railfix.core.channel_state import join_channels
+from railfix.integrity.raim import LinearModel, linear_model
+from railfix.integrity.raim.model import update_model
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
+from railfix.positioning.range_arrays import Ranges, without
+from railfix.positioning.receiver_noise import LastingErrorLimits, LastingErrorState
+from railfix.positioning.windows import Windows
+
+#: Below this share of its own error in its residual a range shows nothing of it.
+_LEAST_REDUNDANCY: Final = 0.1
+#: A mean that is smaller is forgotten.
+_FORGOTTEN: Final = 1e-12
+#: Degrees of freedom that are left, so that the rest is still checked.
+_LEAST_FREEDOM: Final = 2
+
+
+class BiasLimits(NamedTuple):
+    """Limits of the means, and of the positions that are found again."""
+
+    lasting: LastingErrorLimits = LastingErrorLimits()
+    fix: FixLimits = FixLimits()
+
+
+class PersistentBiases(NamedTuple):
+    """Positions without the satellites that are wrong for long, T epochs."""
+
+    ranges: Ranges
+    fix: LineFix
+    model: LinearModel  #: Of the positions.
+    rejected: Masks  #: Shape (T, K).
+
+
+def reject_persistent_biases(
+    time: Datetimes,
+    channel: Strings,
+    ranges: Ranges,
+    line: Line,
+    fix: LineFix,
+    noise: Floats,
+    states: Sequence[LastingErrorState],
+    limits: BiasLimits,
+) -> tuple[PersistentBiases, list[LastingErrorState]]:
+    """Return ranges, positions and model without satellites whose codes are wrong for a minute, and the new states.
+
+    RAIM looks at single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
+    time. The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    channel : ndarray of str, shape (K,)
+        Satellite and signal of each channel.
+    ranges, line, fix
+        As for `exclude_faults`.
+    noise : ndarray, shape (T,)
+        Noise scale of the receiver.
+    states : sequence of LastingErrorState
+        Of each antenna after the chunk before; `LastingErrorState()` at the start.
+    limits : BiasLimits
+        With `LastingErrorLimits.most_satellites` 0 nothing is rejected.
+    """
+    antennas, (lasting, fix_limits) = AntennaRows.on(line), limits
+    model = linear_model(ranges, antennas, fix.constrained.arc_m, section=fix.constrained.section)
+    left_out = np.zeros(ranges.code_m.shape, dtype=np.bool_)
+    if not lasting.most_satellites:
+        return PersistentBiases(ranges, fix, model, left_out), list(states)
+    windows = Windows.of(
+        time, antennas.parts, [(state.time, state.age) for state in states],
+        window_s=lasting.memory_s, least_epochs=lasting.memory_s,
+    )  # fmt: skip
+    share = np.minimum(windows.step_s, 1.0)[:, None] / lasting.memory_s
+    joined = join_channels(channel, [state.channel for state in states], [_is_remembered(state) for state in states])
+    sums = np.zeros((lasting.most_satellites, len(states), len(joined.channel)))
+    for k, state in enumerate(states):
+        sums[: state.sums.shape[1], k] = joined.arrange(state.sums.T, 0.0, k)
+    error = _own_errors(model, noise, lasting.clipped)
+    for turn in range(lasting.most_satellites):
+        mean, sums[turn] = windows.sums(joined.widen(share * error, 0.0), sums[turn])
+        found = _find_worst(mean[:, : joined.present], ranges, lasting.share)
+        if not found.any():
+            continue
+        found &= (without(ranges, found).redundancy >= _LEAST_FREEDOM)[:, None]
+        left_out |= found
+        if found.any():
+            ranges = without(ranges, found)
+            solved = np.flatnonzero(found.any(axis=1))
+            fix = refit_epochs(ranges, antennas, fix, solved, fix_limits)
+            model = update_model(model, ranges, antennas, fix.constrained, solved)
+            error = _own_errors(model, noise, lasting.clipped)
+    after_states = [
+        copy_with(state, time=when, age=age, channel=joined.channel, sums=sums[:, k].T) if len(time[rows]) else state
+        for k, (rows, state, (when, age)) in enumerate(zip(antennas.parts, states, windows.last, strict=True))
+    ]
+    return PersistentBiases(ranges, fix, model, left_out), after_states
+
+
+def _find_worst(mean: Floats, ranges: Ranges, share: float) -> Masks:
+    """Return the used range of each epoch whose mean is the largest, where it is beyond the limit, shape (T, K)."""
+    used = ranges.weight > 0
+    found = np.zeros_like(used)
+    if mean.shape[1]:
+        rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)
+        found[rows, worst] = np.abs(mean[rows, worst]) > share
+    return found & used
+
+
+def _is_remembered(state: LastingErrorState) -> Masks:
+    """Return the channels whose means are not forgotten, shape (S,)."""
+    return np.asarray((np.abs(state.sums) > _FORGOTTEN).any(axis=1))
+
+
+def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
+    """Return the residuals over their standard deviations, clipped, over `clipped`; 0 where nothing checks a range."""
+    checked = model.redundancy > _LEAST_REDUNDANCY
+    own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
+    own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]
+    return np.asarray(np.minimum(np.maximum(own, -clipped), clipped) / clipped)

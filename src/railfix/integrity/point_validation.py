@@ -1,0 +1,56 @@
+"""Validation of conventional positions, as in single-point programs (RTKLIB: `valsol` of pntpos.c)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from functools import lru_cache
+
+import numpy as np
+
+from railfix import kernels
+from railfix.core.arrays import Codes, Floats, kernel_array
+from railfix.integrity.raim import RaimLimits, detect
+from railfix.positioning.normal_equations import SinglePoint, SinglePointLimits
+from railfix.positioning.range_arrays import Ranges
+
+
+class PointStatus(IntEnum):
+    """Result of the validation of a conventional position."""
+
+    #: Both checks passed; residuals without a redundant range pass.
+    VALID = 0
+    #: There is no position.
+    NO_POSITION = 1
+    #: The residuals exceed what noise explains.
+    RESIDUALS = 2
+    #: The dilution of precision is over its limit.
+    DILUTION = 3
+
+
+@lru_cache
+def _of_residuals(limits: SinglePointLimits) -> RaimLimits:
+    return RaimLimits(false_alarm=limits.false_alarm)
+
+
+def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
+    """Return the `PointStatus` of each position, every constellation with a clock of its own, shape (T,).
+
+    `noise_scale`: standard deviation of this receiver's ranges over the sigmas of the weights, shape (T,).
+    """
+    test = detect(
+        point.wsse, point.residual_m, ranges.n_used - ranges.n_clocks - 3, scale=noise_scale,
+        limits=_of_residuals(limits),
+    )  # fmt: skip
+    located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
+    over = ~(position_dilution(ranges, point.ecef_m) <= limits.dilution_limit)
+    status = np.where(over, int(PointStatus.DILUTION), int(PointStatus.VALID))
+    status = np.where(test.detected, int(PointStatus.RESIDUALS), status)
+    return np.where(located, status, int(PointStatus.NO_POSITION)).astype(np.int8)
+
+
+def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
+    """Return the position dilution of precision, every constellation with a clock of its own, shape (T,).
+
+    Root of the trace of the position's covariance for ranges of unit sigma; NaN where the geometry is singular.
+    """
+    return kernels.ranges.dilutions(ranges.arrays, kernel_array(ecef_m))

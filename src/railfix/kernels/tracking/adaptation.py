@@ -1,0 +1,163 @@
+"""Adaptation to the measurements: noise of phases and Dopplers, doubt, the map's lengths, faulty satellites.
+
+The innovation of a code over its standard deviation has a mean near 0 over a minute, reflections included: they come
+and go. A clock record that is wrong, or a reflection that lasts, keeps its sign. The mean of the innovations, each
+clipped to a standard deviation, so that single large ones count little, distinguishes them: such a satellite's
+codes are left out (`is_faulty`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.constants import (
+    BIAS_FAULTY,
+    BIAS_MEMORY_S,
+    BIAS_MOST,
+    BIAS_SATELLITES,
+    BIAS_SHORT,
+    CODE_LEAK,
+    LARGEST_SCALE,
+    LEAST_SCALE,
+    MISFIT_CLIPPED,
+    MISFIT_CODES,
+    MISFIT_LARGEST,
+    MISFIT_LEARNT_S,
+    MISFIT_MOST,
+    MOTION_FIT_S,
+    MOTION_LEAK,
+    NOMINAL_M,
+    SCALE_S,
+    STEP_SIGMAS,
+)
+from railfix.kernels.tracking.layout import FORCE_COLUMN, Given, Record, Rows, State
+from railfix.kernels.tracking.update import Equations, Fit, mean_weights
+
+
+@inner
+def mean_square(rows: Rows, own: slice, found: Fit) -> float:
+    """Return the weighted mean square of the residuals of a kind over their variances; NaN of three or fewer."""
+    size, total = own.stop - own.start, 0.0
+    for j in range(own.start, own.stop):
+        total += found.weight[j] * (found.residual[j] ** 2 + found.fitted[j]) / rows.variance[j]
+    return total / size if size > 3 else math.nan
+
+
+@inner
+def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
+    """Return the logarithm of a variance's scale after an epoch with some mean square; NaN leaves it."""
+    if not math.isnan(mean_square):
+        log_scale += (1.0 - math.exp(-min(dt, 1.0) / SCALE_S)) * math.log(mean_square)
+    return min(max(log_scale, LEAST_SCALE), LARGEST_SCALE)
+
+
+@inner
+def update_doubt(parameters: Record, monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
+    """Count how long motion and codes have had low weights, and filter the misfit of Dopplers and phases."""
+    code, motion = mean_weights(rows, rows.variance, found.weight)
+    if motion < parameters.lost_motion_weight:
+        monitors.weak_motion_s += dt
+    else:
+        monitors.weak_motion_s = max(monitors.weak_motion_s - MOTION_LEAK * dt, 0.0)
+    misfit = 0.0 if math.isnan(motion) else 1.0 - motion
+    for j in range(rows.sensor.start, rows.sensor.stop):
+        misfit = 0.0 if rows.channel[j] < FORCE_COLUMN else misfit  # a sensor measures the speed
+    monitors.motion_misfit += (1.0 - math.exp(-dt / MOTION_FIT_S)) * (misfit - monitors.motion_misfit)
+    if rows.code_s > 0.0:
+        if code < parameters.lost_code_weight:
+            monitors.weak_code_s += rows.code_s
+        else:
+            monitors.weak_code_s = max(monitors.weak_code_s - CODE_LEAK * rows.code_s, 0.0)
+
+
+@inner
+def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float) -> bool:
+    """Adapt the state to an epoch's fit; return whether another satellite's codes are left out from here on.
+
+    `shift` is that of `compute_code_shift` of the hypothesis reported.
+    """
+    monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
+    of_dopplers, of_phases = mean_square(rows, rows.doppler, found), mean_square(rows, rows.phase, found)
+    monitors.log_doppler_scale = update_scale(monitors.log_doppler_scale, of_dopplers, dt)
+    monitors.log_phase_scale = update_scale(monitors.log_phase_scale, of_phases, dt)
+    update_doubt(parameters, monitors, rows, found, dt)
+    update_map_scale(monitors, shift, rows.code_s, parameters)
+    beyond, early, excluded = 0, 0, False
+    for j in range(rows.code.start, rows.code.stop):
+        channel = given.channel[t, rows.channel[j]]
+        sigma = channel.code_sigma_m * math.sqrt(1.0 + parameters.code_white_share**2)
+        bias = state.code_bias[channel.satellite]
+        if abs(bias) > BIAS_FAULTY and abs(bias) * sigma > NOMINAL_M:
+            beyond += 1
+            early += bias < 0.0
+        state.code_bias[channel.satellite] = update_bias(bias, innovation[j] / sigma, rows.code_s)
+        excluded = excluded or (is_faulty(state.code_bias[channel.satellite]) and not is_faulty(bias))
+    if early and beyond > BIAS_SATELLITES:
+        monitors.level_hold_s = max(monitors.level_hold_s, parameters.level_hold_s)
+    return bool(excluded)
+
+
+@inner
+def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
+    """Return a satellite's mean innovation after another one, over its standard deviation."""
+    share = 1.0 - math.exp(-min(code_s, 1.0) / BIAS_MEMORY_S)
+    return code_bias + share * (min(max(innovation, -BIAS_MOST), BIAS_MOST) - code_bias)
+
+
+@inner
+def is_faulty(code_bias: float) -> bool:
+    """Return whether a mean of innovations is that of a satellite whose codes are left out."""
+    return bool(code_bias > BIAS_FAULTY or code_bias < BIAS_SHORT)
+
+
+@inner
+def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, weight: Floats) -> float:
+    """Return the shift of the place that the codes of an epoch imply, over its standard deviation; 0 with few codes.
+
+    The score of the innovations v against a shift, ``h' S^-1 v / sqrt(h' S^-1 h)`` with h the coefficients of the arc
+    length: standard normal and white over epochs where the model holds.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (Q, Q)
+        Of the quantities.
+    weight : ndarray, shape (M,)
+    """
+    codes = rows.code.stop
+    if codes < MISFIT_CODES:
+        return 0.0
+    S, h, v = covariance[:codes, :codes].copy(), equations.coefficient[:codes, 0].copy(), equations.value[:codes].copy()
+    for j in range(codes):
+        S[j, j] += rows.variance[j] / min(weight[j], 1.0)
+    score = information = 0.0
+    for i in range(codes):  # elimination: S = L D L', and the products of L^-1 h and L^-1 v over D
+        score += h[i] * v[i] / S[i, i]
+        information += h[i] ** 2 / S[i, i]
+        for j in range(i + 1, codes):
+            share = S[j, i] / S[i, i]
+            h[j] -= share * h[i]
+            v[j] -= share * v[i]
+            S[j, i:] -= share * S[i, i:]
+    if not information > 0.0:
+        return 0.0
+    return float(min(max(score / math.sqrt(information), -MISFIT_MOST), MISFIT_MOST))
+
+
+@inner
+def update_map_scale(monitors: Record, shift: float, dt: float, parameters: Record) -> None:
+    """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
+    dt = min(dt, 1.0)
+    share = 1.0 - math.exp(-dt / parameters.map_misfit_s)
+    shift = 0.0 if abs(shift) > STEP_SIGMAS else min(max(shift, -MISFIT_CLIPPED), MISFIT_CLIPPED)
+    mean = (1.0 - share) * monitors.code_shift + share * shift
+    variance = (1.0 - share) ** 2 * monitors.code_shift_variance + share**2
+    monitors.code_shift, monitors.code_shift_variance = mean, variance
+    beyond = abs(mean) / (np.sqrt(variance) * parameters.map_misfit_sigmas)
+    scale = monitors.map_log_variance * math.exp(-dt / parameters.map_misfit_kept_s)
+    if beyond > 1.0:
+        scale += 2.0 * math.log(beyond) * dt / MISFIT_LEARNT_S
+    monitors.map_log_variance = min(scale, MISFIT_LARGEST)

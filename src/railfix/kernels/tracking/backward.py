@@ -1,0 +1,63 @@
+"""Information of later epochs carried backward through an epoch, for the smoother."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import kernel
+from railfix.kernels.tracking.layout import Record
+from railfix.kernels.tracking.model import compute_transition
+from railfix.kernels.tracking.update import correct
+
+
+@kernel
+def before_measurements(
+    P: Floats, row: Floats, value: Floats, variance: Floats, vector: Floats, matrix: Floats
+) -> tuple[Floats, Floats]:
+    """Return what later epochs say of the unknowns before an epoch's measurements, with these.
+
+    Of one measurement with row h, innovation d and ``s = h' P h + r`` (G. J. Bierman, 1973)::
+
+        l = h d / s + (I - h g' / s) l          L = h h' / s + (I - h g' / s) L (I - g h' / s)          g = P h
+
+    The measurements are taken in the order of the filter, and backward from the last.
+
+    Parameters
+    ----------
+    P : ndarray, shape (N, N)
+        Covariance before the measurements.
+    row, value, variance : ndarray, shapes (M, N), (M,), (M,)
+    vector, matrix : ndarray, shapes (N,), (N, N)
+        Information l and L of later epochs after the measurements.
+    """
+    count, size = row.shape
+    P, x, gain = P.copy(), np.zeros(size), np.empty(size)
+    covariance, innovation, total = np.empty((count, size)), np.empty(count), np.full(count, math.inf)
+    for j in range(count):
+        if variance[j] < math.inf:
+            covariance[j] = P @ row[j]
+            innovation[j], total[j] = value[j] - row[j] @ x, row[j] @ covariance[j] + variance[j]
+            correct(x, P, covariance[j], innovation[j], total[j], gain)
+    vector, matrix = vector.copy(), matrix.copy()
+    for j in range(count - 1, -1, -1):
+        if total[j] < math.inf:
+            h, g, s = row[j], covariance[j], total[j]
+            vector += h * ((innovation[j] - g @ vector) / s)
+            across = matrix @ g
+            for a in range(size):
+                matrix[a] -= (h[a] * across + across[a] * h) / s
+                matrix[a] += h[a] * h * (1.0 + g @ across / s) / s
+    return vector, matrix
+
+
+@kernel
+def transition_matrix(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Floats:
+    """Return F as a matrix, shape (N, N)."""
+    F, matrix = compute_transition(speed, epoch, parameters, unknowns), np.zeros((unknowns, unknowns))
+    for i in range(unknowns):
+        for k in range(3):
+            matrix[i, F.unknown[i, k]] += F.coefficient[i, k]
+    return matrix

@@ -1,0 +1,181 @@
+"""Probabilities of hypotheses, and which of them go on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.constants import (
+    ALIKE,
+    MOST_MOTION,
+    MOST_ODDS,
+    MOTION_M,
+    RECENT_MOST,
+    RECENT_S,
+    SWITCH,
+)
+from railfix.kernels.tracking.layout import ARC, Record, Records, State
+
+
+@inner
+def log_sum(values: Floats) -> float:
+    """Return the logarithm of the sum of exponentials."""
+    largest, total = values[0], 0.0
+    for value in values:
+        largest = max(largest, value)
+    for value in values:
+        total += math.exp(value - largest)
+    return float(largest + math.log(total))
+
+
+@inner
+def clip_odds(odds: float, gained: float, reach: float) -> float:
+    """Return the logarithm of odds after a gain, no further than a reach unless they were before."""
+    return min(max(odds + gained, min(odds, -reach)), max(odds, reach))
+
+
+@inner
+def reweigh(
+    parameters: Record, state: State, evidence: Floats, code_evidence: Floats, points: Floats, arc: Floats, dt: float
+) -> None:
+    """Update the probabilities of branches, and the part of them that codes gave, by evidence of motion and codes.
+
+    With d the distance of a branch from the most probable one, the difference of the evidence counts by
+    ``d^2 / (d^2 + map_branch_m^2)``: branches within the error of the map differ in their ranges at every epoch alike.
+
+    Motion (Dopplers, phases, sensors) has errors of seconds: that of a second counts once, at any rate of epochs, and
+    by `MOST_MOTION` an epoch at most; its odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2,
+    nor than one for `MOTION_M` of travel.
+
+    Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
+    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, n being 1 and one more in
+    `code_common_s` or `code_common_travel_m`; between branches that are closer than `branch_floor_m` now never below
+    `branch_floor`, whatever was gained while they were apart.
+
+    Between laps within `ALIKE` times map_branch_m what codes say now is kept as `log_recent`, for `find_leading` alone.
+
+    Parameters
+    ----------
+    evidence, code_evidence : ndarray, shape (H,)
+        Logarithms of the evidence of the motion, and of the codes beside it.
+    points : ndarray, shape (H, 3) [m]
+    arc : ndarray, shape (H,) [m]
+    dt : float [s]
+    """
+    hypothesis, monitors, count = state.hypothesis, state.monitors[0], len(evidence)
+    travel = monitors.branch_m
+    independent = 1.0 + monitors.branch_s / parameters.code_common_s + travel / parameters.code_common_travel_m
+    best = 0
+    for h in range(1, count):
+        if hypothesis[h].log_probability > hypothesis[best].log_probability:
+            best = h
+    first, first_code = hypothesis[best].log_probability, hypothesis[best].log_code
+    of_second = min(dt, 1.0)
+    most, floor = MOST_MOTION * of_second, math.log(parameters.branch_floor)
+    after, after_code = np.empty(count), np.empty(count)
+    for h in range(count):
+        one = hypothesis[h]
+        square = 0.0
+        for c in range(3):
+            square += (points[h, c] - points[best, c]) ** 2
+        part = square / (square + parameters.map_branch_m**2)
+        reach = min(MOST_ODDS * square / parameters.map_branch_m**2, travel / MOTION_M)
+        gained = min(max(of_second * (evidence[h] - evidence[best]), -most), most)
+        motion = clip_odds(one.log_probability - one.log_code - (first - first_code), part * gained, reach)
+        reach = independent * square / (2.0 * parameters.code_common_m**2)
+        gained = code_evidence[h] - code_evidence[best]
+        code = clip_odds(one.log_code - first_code, part * gained, reach)
+        if square < parameters.branch_floor_m**2:
+            code = min(max(code, floor), -floor)
+        recent = math.exp(-dt / RECENT_S) * one.log_recent
+        apart = abs(arc[h] - arc[best]) > parameters.start_separation_m
+        if apart and square < (ALIKE * parameters.map_branch_m) ** 2:
+            recent += part * gained
+        one.log_recent = min(max(recent, -RECENT_MOST), RECENT_MOST)
+        after[h], after_code[h] = motion + code, code
+    total = log_sum(after)
+    for h in range(count):
+        hypothesis[h].log_probability, hypothesis[h].log_code = after[h] - total, after_code[h]
+
+
+@inner
+def find_leading(hypothesis: Records, count: int) -> int:
+    """Return the hypothesis to report: the first unless another is `SWITCH` as probable with what codes said lately."""
+    best = 0
+    for h in range(1, count):
+        lead = hypothesis[h].log_probability + hypothesis[h].log_recent
+        if lead > hypothesis[best].log_probability + hypothesis[best].log_recent:
+            best = h
+    lead = hypothesis[best].log_probability + hypothesis[best].log_recent
+    lead -= hypothesis[0].log_probability + hypothesis[0].log_recent
+    return best if lead > math.log(SWITCH) else 0
+
+
+@inner
+def prune(parameters: Record, state: State) -> Indices:
+    """Order the hypotheses, merge twins, drop the improbable; return the earlier indices of those left.
+
+    Improbable ones are dropped once the first has travelled far enough for motion to have distinguished them.
+    """
+    kept, log_probability = _merge_twins(state, _rank(state.hypothesis, state.monitors[0].hypotheses))
+    size = min(len(kept), parameters.most_hypotheses)
+    kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
+    if abs(state.x[kept[0], ARC] - state.hypothesis[kept[0]].origin_m) >= parameters.decided_travel_m:
+        size = 0
+        for j in range(len(kept)):
+            if log_probability[j] > math.log(parameters.least_probability):
+                kept[size], log_probability[size] = kept[j], log_probability[j]
+                size += 1
+        kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
+    x, P, hypothesis = (
+        state.x[: len(state.hypothesis)].copy(),
+        state.P[: len(state.hypothesis)].copy(),
+        state.hypothesis.copy(),
+    )
+    for j in range(size):
+        state.x[j], state.P[j], state.hypothesis[j] = x[kept[j]], P[kept[j]], hypothesis[kept[j]]
+        state.hypothesis[j].log_probability = log_probability[j]
+    state.monitors[0].hypotheses = size
+    return kept
+
+
+@inner
+def _rank(hypothesis: Records, count: int) -> Indices:
+    """Return the hypotheses in falling order of their probability, the leading one first."""
+    first = find_leading(hypothesis, count)
+    ranked = np.empty(count, dtype=np.intp)
+    ranked[0], size = first, 1
+    for h in range(count):
+        if h == first:
+            continue
+        j = size
+        while j > 1 and hypothesis[ranked[j - 1]].log_probability < hypothesis[h].log_probability:
+            ranked[j] = ranked[j - 1]
+            j -= 1
+        ranked[j] = h
+        size += 1
+    return ranked
+
+
+@inner
+def _merge_twins(state: State, ranked: Indices) -> tuple[Indices, Floats]:
+    """Return the hypotheses without those within the standard deviations of a more probable one, and probabilities."""
+    kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
+    for k in ranked:
+        twin, sigma = -1, math.sqrt(state.P[k, ARC, ARC])
+        for j in range(size):
+            reach = max(2.0, sigma + math.sqrt(state.P[kept[j], ARC, ARC]))
+            if abs(state.x[k, ARC] - state.x[kept[j], ARC]) < reach:
+                twin = j
+                break
+        own = state.hypothesis[k].log_probability
+        if twin < 0:
+            kept[size], log_probability[size] = k, own
+            size += 1
+        else:
+            larger, smaller = max(log_probability[twin], own), min(log_probability[twin], own)
+            log_probability[twin] = larger + math.log1p(math.exp(smaller - larger))
+    return kept[:size], log_probability[:size]

@@ -1,0 +1,90 @@
+"""Points, axes and gradient of the line at an arc length (`railfix.tracking.line.Line`)."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.layout import Record, Records
+
+
+@inner
+def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
+    """Return the arc length on the line of a place beyond its end if closed (`railfix.tracking.line.Line.round_m`)."""
+    first, last = vertex[0].arc_m, vertex[-1].arc_m
+    if arc > last and line.end_turn_m > 0.0:
+        return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)
+    if arc < first and line.start_turn_m > 0.0:
+        return float(arc + math.ceil((first - arc) / line.start_turn_m) * line.start_turn_m)
+    return arc
+
+
+@inner
+def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float:
+    """Return the arc length of a place that is nearest to another (`railfix.tracking.line.Line.nearest_m`)."""
+    inside = wrap_arc(vertex, line, to)
+    nearest = place
+    if line.end_turn_m > 0.0 and place >= vertex[-1].arc_m - line.end_turn_m:
+        other = place + line.end_turn_m
+        nearest = other if abs(other - inside) < abs(nearest - inside) else nearest
+    if line.start_turn_m > 0.0 and place <= vertex[0].arc_m + line.start_turn_m:
+        other = place - line.start_turn_m
+        nearest = other if abs(other - inside) < abs(nearest - inside) else nearest
+    return nearest + to - inside
+
+
+@inner
+def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: Floats) -> None:
+    """Write point [m] and axes (tangent, right, up) of the line at an arc length; shapes (3,), (3, 3)."""
+    arc = wrap_arc(vertex, line, arc)
+    low, high = 1, len(vertex) - 1
+    while low < high:
+        half = (low + high) // 2
+        if vertex[half].arc_m <= arc:
+            low = half + 1
+        else:
+            high = half
+    here, after = vertex[low - 1], vertex[low]
+    along = arc - here.arc_m
+    share = min(max(along / (after.arc_m - here.arc_m), 0.0), 1.0)
+    for k in range(3):
+        point[k] = here.ecef_m[k] + along * here.segment[k]
+        square = 0.0
+        for c in range(3):
+            axes[k, c] = (1.0 - share) * here.axes[k, c] + share * after.axes[k, c]
+            square += axes[k, c] * axes[k, c]
+        length = math.sqrt(square)
+        for c in range(3):
+            axes[k, c] /= length
+
+
+@inner
+def gradient_at(vertex: Records, line: Record, arc: float) -> float:
+    """Return the gradient of the line, linear between the middles of segments."""
+    arc = wrap_arc(vertex, line, arc)
+    segments = len(vertex) - 1
+    low, high = 0, segments
+    while low < high:
+        half = (low + high) // 2
+        if vertex[half].middle_m <= arc:
+            low = half + 1
+        else:
+            high = half
+    if low == 0:
+        return float(vertex[0].gradient)
+    if low == segments:
+        return float(vertex[segments - 1].gradient)
+    before, after = vertex[low - 1], vertex[low]
+    share = (arc - before.middle_m) / (after.middle_m - before.middle_m)
+    return float((1.0 - share) * before.gradient + share * after.gradient)
+
+
+@inner
+def excess_beyond_end(line: Record, arc: float, sigma: float) -> float:
+    """Return how far a place is beyond an open end [m], 0 within two of its standard deviations, which are noise.
+
+    It goes on straight there: put back onto the end, it would stand while the train drives off the map.
+    """
+    excess = abs(min(max(arc, line.start_m), line.end_m) - arc)
+    return excess if excess > 2.0 * sigma else 0.0

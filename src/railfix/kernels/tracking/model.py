@@ -1,0 +1,239 @@
+r"""Process model: transition F and noise Q of all unknowns from one epoch to the next, for filter, bank and smoother.
+
+With dt the interval, v the speed and ``d = |v| dt`` the travel::
+
+    s, v, a             Singer's model: the acceleration is correlated over `acceleration_s`
+    s', v'              arc length and speed before: copies
+    phase clock, drift  B = dt d', d = d' + walk
+    code clock          new at every epoch
+    map right, up       Gauss-Markov over `map_absolute_m` of travel
+    map displacement    new at every epoch: right, up with `map_roughness_m` over `map_correlation_m`, along with
+                        `map_scale_m` a square root of a metre; the bend of the line where the place is uncertain
+    Doppler speed error Gauss-Markov over `doppler_correlation_s`
+    slow code           Gauss-Markov over `slow_code_s`
+    clock offsets, sensors' scales and offset    random walks
+    satellite's code error    Gauss-Markov over `code_correlation_s` and `code_correlation_m`, of variance 1
+
+The prediction's own standard deviation of the speed grows with every epoch without redundancy, so that reflections off
+one wall, which agree with each other, can give a wrong speed; `narrow_speed_range` follows what a train can do.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.constants import (
+    CODE_CLOCK_SIGMA_M,
+    FORCE_WALK_MPS2,
+    HEIGHT_ROUGHNESS,
+    LEAST_STEP_M2,
+    RADAR_WALK,
+    SPEED_SIGMAS,
+    WHEEL_WALK,
+)
+from railfix.kernels.tracking.layout import (
+    ARC,
+    CODE_CLOCK,
+    DOPPLER_SPEED,
+    DRIFT,
+    FORCE_OFFSET,
+    MAP_LENGTH_ERROR,
+    MAP_RIGHT,
+    MAP_UP,
+    OFFSETS,
+    PER_EPOCH,
+    PHASE_CLOCK,
+    PREVIOUS_ARC,
+    PREVIOUS_SPEED,
+    RADAR,
+    SATELLITES,
+    SLOW_CODE,
+    SPEED,
+    STEP_RIGHT,
+    STEP_UP,
+    WHEEL,
+    Given,
+    Record,
+    Rows,
+)
+from railfix.kernels.tracking.line import write_point
+from railfix.kernels.tracking.update import add_scaled
+
+#: Least variance of displacements and clocks that begin at an epoch [m2]: it keeps them from being exactly known.
+_LEAST_M2 = 1e-8
+_LEAST_CLOCK_M2 = 1e-6
+
+
+class Transition(NamedTuple):
+    """Transition F by its terms: ``F[i, unknown[i, k]] = coefficient[i, k]``; shapes (N, 3)."""
+
+    unknown: Indices
+    coefficient: Floats
+
+
+@inner
+def compute_transition(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Transition:
+    """Return the transition to an epoch from a state of some speed [m/s]."""
+    dt, travel = epoch.interval_s, abs(speed) * epoch.interval_s
+    unknown, coefficient = np.zeros((unknowns, 3), dtype=np.intp), np.zeros((unknowns, 3))
+    for i in range(unknowns):
+        unknown[i, 0], coefficient[i, 0] = i, 1.0
+    for i in range(3):
+        for k in range(3):
+            unknown[i, k], coefficient[i, k] = k, epoch.step[i, k]
+    unknown[PREVIOUS_ARC, 0], unknown[PREVIOUS_SPEED, 0] = ARC, SPEED
+    unknown[PHASE_CLOCK, 0], coefficient[PHASE_CLOCK, 0] = DRIFT, dt
+    for i in PER_EPOCH:
+        coefficient[i, 0] = 0.0
+    coefficient[MAP_RIGHT, 0] = coefficient[MAP_UP, 0] = math.exp(-travel / parameters.map_absolute_m)
+    coefficient[DOPPLER_SPEED, 0] = math.exp(-dt / parameters.doppler_correlation_s)
+    coefficient[SLOW_CODE, 0] = math.exp(-dt / parameters.slow_code_s)
+    kept = math.exp(-dt / parameters.code_correlation_s - travel / parameters.code_correlation_m)
+    for i in range(SATELLITES, unknowns):
+        coefficient[i, 0] = kept
+    return Transition(unknown, coefficient)
+
+
+@inner
+def _multiply(F: Transition, matrix: Floats, product: Floats) -> None:
+    """Write ``(F matrix)'``, shape (N, N)."""
+    row = np.empty(matrix.shape[1])
+    for i in range(len(matrix)):
+        row[:] = 0.0
+        for k in range(3):
+            if F.coefficient[i, k] != 0.0:
+                add_scaled(row, F.coefficient[i, k], matrix[F.unknown[i, k]])
+        for j in range(len(row)):
+            product[j, i] = row[j]
+
+
+@inner
+def predict(
+    given: Given, t: int, x: Floats, P: Floats, map_log_variance: float, wrong_map_m: float, scratch: Floats
+) -> None:
+    """Predict a Gaussian to epoch t, in place: ``x = F x``, ``P = F P F' + Q``.
+
+    `map_log_variance` is that of `Monitors`, `wrong_map_m` a standard deviation of the map beside the line's own [m];
+    `scratch`, shape (N, N), is overwritten.
+    """
+    epoch, parameters = given.epoch[t], given.parameters[0]
+    speed, before = x[SPEED], x.copy()
+    F = compute_transition(speed, epoch, parameters, len(x))
+    for i in range(len(x)):
+        x[i] = 0.0
+        for k in range(3):
+            x[i] += F.coefficient[i, k] * before[F.unknown[i, k]]
+    _multiply(F, P, scratch)  # (F P)' = P F'
+    _multiply(F, scratch, P)  # (F P F')' = F P F'
+    _add_noise(epoch, given.line[0], parameters, speed, (map_log_variance, wrong_map_m), F, P)
+
+
+@inner
+def _add_noise(
+    epoch: Record,
+    line: Record,
+    parameters: Record,
+    speed: float,
+    of_map: tuple[float, float],
+    F: Transition,
+    P: Floats,
+) -> None:
+    """Add the process noise Q of an interval to a covariance; `of_map`: `predict`'s logarithm and sigma of the map."""
+    dt, travel, (map_log_variance, wrong_map_m) = epoch.interval_s, abs(speed) * epoch.interval_s, of_map
+    for i in range(3):
+        for j in range(3):
+            P[i, j] += epoch.noise[i, j]
+    P[ARC, ARC] += LEAST_STEP_M2
+    P[SPEED, SPEED] += LEAST_STEP_M2
+    walk = parameters.clock_walk_mps**2  # of the drift; the phases' clock is its integral
+    P[DRIFT, DRIFT] += walk * dt
+    P[PHASE_CLOCK, PHASE_CLOCK] += walk * dt**3 / 3.0 + _LEAST_CLOCK_M2
+    P[PHASE_CLOCK, DRIFT] += walk * dt**2 / 2.0
+    P[DRIFT, PHASE_CLOCK] += walk * dt**2 / 2.0
+    P[CODE_CLOCK, CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
+    # Gauss-Markov: sigma^2 (1 - kept^2)
+    changed = 1.0 - F.coefficient[MAP_RIGHT, 0] ** 2
+    P[MAP_RIGHT, MAP_RIGHT] += (line.sigma_plan_m**2 + wrong_map_m**2) * changed
+    P[MAP_UP, MAP_UP] += (line.sigma_height_m**2 + wrong_map_m**2) * changed
+    P[SLOW_CODE, SLOW_CODE] += parameters.slow_code_m**2 * (1.0 - F.coefficient[SLOW_CODE, 0] ** 2)
+    doppler_mps = parameters.doppler_error_mps + parameters.doppler_error_share * abs(speed)
+    P[DOPPLER_SPEED, DOPPLER_SPEED] += doppler_mps**2 * (1.0 - F.coefficient[DOPPLER_SPEED, 0] ** 2)
+    for i in range(SATELLITES, len(P)):
+        P[i, i] += 1.0 - F.coefficient[i, 0] ** 2
+    # random walks
+    P[WHEEL, WHEEL] += WHEEL_WALK**2 * dt
+    P[FORCE_OFFSET, FORCE_OFFSET] += FORCE_WALK_MPS2**2 * dt
+    P[RADAR, RADAR] += RADAR_WALK**2 * dt
+    for i in range(OFFSETS, SATELLITES):
+        P[i, i] += parameters.offset_walk_m**2 * dt
+    # displacement of the map
+    changed = 2.0 * (1.0 - math.exp(-travel / parameters.map_correlation_m))
+    across = max(parameters.map_roughness_m, line.sigma_plan_m)
+    above = max(parameters.map_roughness_m, HEIGHT_ROUGHNESS * line.sigma_height_m)
+    P[STEP_RIGHT, STEP_RIGHT] = across**2 * changed + _LEAST_M2
+    P[STEP_UP, STEP_UP] = above**2 * changed + _LEAST_M2
+    # The distance on the map is the distance run less the error of the length: codes see it, phases do not.
+    length = parameters.map_scale_m**2 * math.exp(map_log_variance) * travel + parameters.phase_walk_m**2 * dt
+    P[ARC, ARC] += length
+    P[MAP_LENGTH_ERROR, MAP_LENGTH_ERROR] = length + _LEAST_M2
+    P[ARC, MAP_LENGTH_ERROR] = P[MAP_LENGTH_ERROR, ARC] = -length
+
+
+@inner
+def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
+    """Add to the displacements across what the line bends by where the place is uncertain.
+
+    `at`: arc lengths now and at the epoch before [m].
+    """
+    axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    write_point(given.vertex, given.line[0], at[0], point, axes)
+    write_point(given.vertex, given.line[0], at[1], point, before)
+    length = P[MAP_LENGTH_ERROR, MAP_LENGTH_ERROR] - _LEAST_M2
+    position_variance = min(P[ARC, ARC] - length, given.parameters[0].start_sigma_m ** 2)
+    right = up = 0.0
+    for c in range(3):
+        change = axes[0, c] - before[0, c]
+        right += change * axes[1, c]
+        up += change * axes[2, c]
+    P[STEP_RIGHT, STEP_RIGHT] += position_variance * right**2
+    P[STEP_UP, STEP_UP] += position_variance * up**2
+
+
+@inner
+def restart(P: Floats, unknown: int, variance: float) -> None:
+    """Make an unknown independent of all else."""
+    for c in range(len(P)):
+        P[unknown, c] = P[c, unknown] = 0.0
+    P[unknown, unknown] = variance
+
+
+@inner
+def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float) -> bool:
+    """Return whether a measured speed is possible after those before, and narrow the range of speeds to it.
+
+    There are no bounds on several branches. Enough satellites, or a sensor on board too, are believed whatever the
+    range. Where the speed is not believed the range grows by emergency braking, so that braking is followed from the
+    next epoch. Without a measurement `sigma` is infinite, and the range grows by service braking.
+    """
+    low, high = -math.inf, math.inf
+    if monitors.hypotheses == 1:
+        change = parameters.service_acceleration_mps2 * dt
+        low, high = monitors.least_speed_mps - change, monitors.most_speed_mps + change
+        if sigma < math.inf:
+            satellites = max(rows.phase.stop - rows.phase.start, rows.doppler.stop - rows.doppler.start)
+            sensed = rows.sensor.stop > rows.sensor.start
+            if not 0 < satellites < parameters.trusted_satellites or sensed:
+                low, high = -math.inf, math.inf
+            reach = SPEED_SIGMAS * sigma
+            if speed + reach < low or speed - reach > high:
+                change = parameters.level_acceleration_mps2 * dt
+                monitors.least_speed_mps, monitors.most_speed_mps = low - change, high + change
+                return False
+            low, high = max(low, speed - reach), min(high, speed + reach)
+    monitors.least_speed_mps, monitors.most_speed_mps = low, high
+    return True

@@ -1,0 +1,256 @@
+"""Sub-filters of the level, each without one source of measurements.
+
+Each runs the same recursion without one source (a satellite, a constellation, a sensor, all Dopplers, all phases, the
+codes of all satellites ahead or behind) or with a map that may be wrong, from its own start: a fault, however long it
+has lasted and whatever it has left in the state, is not in it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Masks
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.constants import AHEAD, JOINED
+from railfix.kernels.tracking.equations import linearise, new_equations, shift_sensors
+from railfix.kernels.tracking.layout import (
+    ALL_DOPPLERS,
+    ALL_IN_VIEW,
+    ALL_PHASES,
+    ARC,
+    CLOCK_COUNT,
+    CODE_CLOCK,
+    CODES_AHEAD,
+    CODES_BEHIND,
+    DRIFT,
+    MAP_LENGTH_ERROR,
+    MAP_RIGHT,
+    MAP_UP,
+    OFFSETS,
+    OTHERS,
+    PHASE_CLOCK,
+    PREVIOUS_ARC,
+    RANGE_COLUMN,
+    WRONG_MAP,
+    Given,
+    Rows,
+    State,
+)
+from railfix.kernels.tracking.line import write_point
+from railfix.kernels.tracking.model import add_bend, restart
+from railfix.kernels.tracking.update import (
+    Correction,
+    Equations,
+    Fit,
+    correct_state,
+    fit,
+    mean_weights,
+    new_fit,
+    predict_quantities,
+    write_first_weights,
+    write_weights,
+)
+
+
+@inner
+def find_others(state: State) -> int:
+    """Return the index of the first source after the sensors, negative where levels are off."""
+    return len(state.source) - OTHERS
+
+
+@inner
+def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
+    """Return the sources among an epoch's measurements, shape (B,); a constellation where there are several."""
+    needed, satellites, others = np.zeros(len(state.source), dtype=np.bool_), len(state.code_bias), find_others(state)
+    constellations = 0
+    for j in range(rows.code.start, rows.code.stop):
+        clock = satellites + given.channel[t, rows.channel[j]].clock
+        constellations += not needed[clock]
+        needed[clock] = True
+    if constellations < 2:
+        needed[satellites : satellites + CLOCK_COUNT] = False
+    for j in range(rows.code.start, rows.doppler.stop):
+        needed[given.channel[t, rows.channel[j]].satellite] = True
+    for j in range(rows.sensor.start, rows.sensor.stop):
+        needed[satellites + CLOCK_COUNT + min(rows.channel[j], RANGE_COLUMN)] = True
+    needed[others + ALL_DOPPLERS] = rows.doppler.stop > rows.doppler.start
+    needed[others + ALL_PHASES] = rows.phase.stop > rows.phase.start
+    for b in (CODES_AHEAD, CODES_BEHIND, WRONG_MAP):
+        needed[others + b] = rows.code.stop > 0
+    return needed
+
+
+@inner
+def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Correction, leads: int) -> None:
+    """Correct all sub-filters, which are predicted to the epoch already; `leads`: the leading hypothesis, `best`.
+
+    Each has equations of its own about its place: where the line bends between the two those of the filter do not
+    hold. One that its own measurements contradict has settled somewhere else and restarts. The filter itself is one
+    without a source that it has not absorbed. Where all restart, so does one with all satellites in view, until it
+    has become the filter: pairs are compared with it.
+    """
+    source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
+    all_in_view = find_others(state) + ALL_IN_VIEW
+    before = False
+    for b in range(len(source)):
+        before = before or (source[b].running and leads == 0)
+    needed = _find_needed(given, t, rows, state)
+    needed[all_in_view] = not before
+    absorbed = np.zeros(len(source), dtype=np.bool_)
+    for k in range(satellites):
+        if given.within_memory[t, k]:  # without a sub-filter before, the hypothesis has absorbed what it remembers
+            absorbed[satellites + source[k].clock] = True
+            needed[k] = needed[k] or not before
+    equations, found = new_equations(rows), new_fit(rows)
+    for b in range(len(source)):
+        one = source[b]
+        satellite = b < satellites
+        if leads or (satellite and not given.within_memory[t, b]):
+            one.running = False
+        if one.running and one.contradicted_s >= given.parameters[0].lost_motion_s:
+            one.running, absorbed[b] = False, True
+        x, P = state.x[first + b], state.P[first + b]
+        fresh = satellite and before and needed[b] and not one.running and not absorbed[b] and one.prior > 0.0
+        if fresh and source[all_in_view].running:
+            x[:], P[:] = state.x[first + all_in_view], state.P[first + all_in_view]
+            one.running, one.contradicted_s = True, 0.0
+        if one.running:
+            at = x[ARC], x[PREVIOUS_ARC]
+            if b == all_in_view - ALL_IN_VIEW + WRONG_MAP:
+                rotate_map_error(given, x, P)
+            add_bend(given, at, P)
+            if (satellite or b == all_in_view) and not needed[b] and _has_joined(x, P, best):
+                one.running = False
+                continue
+        elif needed[b] and (one.prior > 0.0 or b == all_in_view):
+            _begin(given, state, b, before and not absorbed[b], best)
+        else:
+            continue
+        variance = _downdate(given, t, rows, state, b, best.equations)
+        _correct(given, t, rows, variance, best, (x, P), equations, found)
+        _update_contradiction(given, t, rows, state, b, variance, found)
+
+
+@inner
+def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
+    """Return whether a sub-filter has become the filter: place and sigma within `JOINED`."""
+    sigma = math.sqrt(P[ARC, ARC])
+    near = abs(x[ARC] - best.x_prior[ARC]) < JOINED * sigma
+    return near and sigma < (1.0 + JOINED) * math.sqrt(best.P_prior[ARC, ARC])
+
+
+@inner
+def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -> None:
+    """Begin a sub-filter with the state of the filter, or with nothing known but the place."""
+    row = len(state.hypothesis) + b
+    x, P = state.x[row], state.P[row]
+    state.source[b].running, state.source[b].contradicted_s = True, 0.0
+    if copied:
+        x[:], P[:] = best.x_prior, best.P_prior
+    else:
+        x[:], P[:] = 0.0, 0.0
+        x[ARC] = x[PREVIOUS_ARC] = best.x_prior[ARC]
+        for c in range(len(x)):
+            P[c, c] = given.start_variance[c]
+    if b == find_others(state) + WRONG_MAP:
+        P[MAP_RIGHT, MAP_RIGHT] += given.parameters[0].level_map_m ** 2
+        P[MAP_UP, MAP_UP] += given.parameters[0].level_map_m ** 2
+
+
+@inner
+def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
+    """Rotate the displacement of a map that may be wrong with the line: across in a bend it is along after it.
+
+    It is in the distance on the map, not in that of the phases. What was along before is not known.
+    """
+    axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    write_point(given.vertex, given.line[0], x[ARC], point, axes)
+    write_point(given.vertex, given.line[0], x[PREVIOUS_ARC], point, before)
+    along = right = 0.0
+    for c in range(3):
+        along += before[1, c] * axes[0, c]
+        right += before[1, c] * axes[1, c]
+    x[ARC] += along * x[MAP_RIGHT]
+    x[MAP_LENGTH_ERROR] -= along * x[MAP_RIGHT]
+    x[MAP_RIGHT] *= right
+    for c in range(len(x)):
+        P[ARC, c] += along * P[MAP_RIGHT, c]
+        P[MAP_LENGTH_ERROR, c] -= along * P[MAP_RIGHT, c]
+        P[MAP_RIGHT, c] *= right
+    for c in range(len(x)):
+        P[c, ARC] += along * P[c, MAP_RIGHT]
+        P[c, MAP_LENGTH_ERROR] -= along * P[c, MAP_RIGHT]
+        P[c, MAP_RIGHT] *= right
+    P[MAP_RIGHT, MAP_RIGHT] += (along * given.parameters[0].level_map_m) ** 2
+
+
+@inner
+def _downdate(given: Given, t: int, rows: Rows, state: State, b: int, equations: Equations) -> Floats:
+    """Return the variances of the measurements for a sub-filter, infinite for those of its source, shape (M,)."""
+    satellites, others, variance = len(state.code_bias), find_others(state), rows.variance.copy()
+    if b < satellites + CLOCK_COUNT:
+        for j in range(rows.code.start, rows.doppler.stop):
+            channel = given.channel[t, rows.channel[j]]
+            if b in (channel.satellite, satellites + channel.clock):
+                variance[j] = math.inf
+    elif b < others:
+        for j in range(rows.sensor.start, rows.sensor.stop):
+            if b == satellites + CLOCK_COUNT + min(rows.channel[j], RANGE_COLUMN):
+                variance[j] = math.inf
+    elif b == others + ALL_DOPPLERS:
+        variance[rows.doppler] = math.inf
+    elif b == others + ALL_PHASES:
+        variance[rows.phase] = math.inf
+    elif b in (others + CODES_AHEAD, others + CODES_BEHIND):
+        side = 1.0 if b == others + CODES_AHEAD else -1.0
+        for j in range(rows.code.start, rows.code.stop):
+            if side * equations.coefficient[j, 0] < -AHEAD:  # moving ahead shortens its range
+                variance[j] = math.inf
+    return variance
+
+
+@inner
+def _correct(
+    given: Given,
+    t: int,
+    rows: Rows,
+    variance: Floats,
+    best: Correction,
+    gaussian: tuple[Floats, Floats],
+    equations: Equations,
+    found: Fit,
+) -> None:
+    """Correct a predicted sub-filter (x, P), in place, with the clocks that the filter has started."""
+    x, P = gaussian
+    for k in range(3):
+        if best.restarted[k]:
+            unknown = PHASE_CLOCK if k == 0 else DRIFT
+            if k == 2:
+                unknown = OFFSETS + given.channel[t, rows.channel[0]].clock
+            x[unknown] = best.x_prior[unknown]
+            restart(P, unknown, best.P_prior[unknown, unknown])
+    x[CODE_CLOCK] = best.x_prior[CODE_CLOCK]
+    linearise(given, t, rows, x, (x[ARC], x[PREVIOUS_ARC]), 1.0, equations)
+    shift_sensors(rows, x, best.x_prior, best.equations, equations)
+    covariance, without_clock = predict_quantities(P, equations)
+    degrees = given.parameters[0].degrees_of_freedom, given.parameters[0].late_degrees_of_freedom
+    write_first_weights(rows, equations, (covariance, without_clock), variance, degrees, found.weight)
+    for _ in range(given.parameters[0].level_passes - 1):
+        fit(rows, equations, covariance, variance, found)
+        write_weights(rows, variance, degrees, found)
+    correct_state(rows, equations, variance, found.weight, x, P)
+
+
+@inner
+def _update_contradiction(given: Given, t: int, rows: Rows, state: State, b: int, variance: Floats, found: Fit) -> None:
+    """Count how long the measurements of a sub-filter have contradicted it by low weights."""
+    one, parameters = state.source[b], given.parameters[0]
+    code, motion = mean_weights(rows, variance, found.weight)
+    if code < parameters.lost_code_weight or motion < parameters.lost_motion_weight:
+        one.contradicted_s += given.epoch[t].interval_s
+    elif rows.code.stop > 0:
+        one.contradicted_s = 0.0
+    if not math.isfinite(state.x[len(state.hypothesis) + b, ARC]):  # it restarts, and bounds nothing before
+        one.contradicted_s = parameters.lost_motion_s + parameters.level_doubt_s

@@ -1,0 +1,111 @@
+"""Satellite states, approximate positions and corrected pseudoranges of a chunk, by the settings of a run."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Masks, copy_with
+from railfix.core.reasons import Reason
+from railfix.gnss.observations import Observations
+from railfix.integrity.protection.araim import IntegritySupport
+from railfix.pipeline.config import Config
+from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.approximate import ANCHOR_SIGMA_M, ApproximatePosition, approximate_position
+from railfix.positioning.range_arrays import Ranges, weighted_ranges
+from railfix.positioning.search_index import SearchIndex
+from railfix.ranges.channels import Channels
+from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_satellites
+from railfix.ranges.error_model import Conditions, ErrorModel
+from railfix.ranges.sources import CorrectionSource
+from railfix.screens import Verdict, suspicion_sigma_m
+
+
+class Models(NamedTuple):
+    """Measured models: weights of the ranges in place of `Config.noise`, the screen "cn0", ARAIM levels."""
+
+    error_model: ErrorModel | None = None
+    cn0_curve: Cn0Curve | None = None
+    support: IntegritySupport | None = None
+
+
+def correct_ranges(
+    obs: Observations,
+    channels: Channels,
+    config: Config,
+    source: CorrectionSource,
+    antennas: AntennaRows,
+    *,
+    error_model: ErrorModel | None = None,
+) -> tuple[CorrectedRanges, ApproximatePosition]:
+    """Return corrected ranges of a chunk, and where the antennas are about.
+
+    An error model gives the least sigmas of the protection level; the weights are those of ``config.noise``.
+    """
+    satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)
+    raw = obs.code_m[:, channels.columns] + satellites.correction_m
+    raw = np.where(satellites.reason == 0, raw, np.nan)
+    sigma = np.broadcast_to(ANCHOR_SIGMA_M, raw.shape)
+    ranges = weighted_ranges(satellites.states.position_ecef_m, raw, sigma, channels.clock)
+    near = approximate_position(ranges, antennas, limits=config.single_point, section=config.section)
+    corrected = corrected_ranges(obs, channels, satellites, near.ecef_m, source, gross=near.gross, noise=config.noise)
+    corrected = copy_with(corrected, unsure=near.unsure)
+    if error_model is not None:
+        corrected = _apply_error_model(error_model, corrected, antennas, near.arc_m, config)
+    return corrected, near
+
+
+def fit_ranges(corrected: CorrectedRanges) -> Ranges:
+    """Return the ranges without a reason against them, ready to be fitted."""
+    return weighted_ranges(
+        corrected.satellites.position_ecef_m, corrected.used_code_m, corrected.sigma_m, corrected.channels.clock
+    )
+
+
+def reject(corrected: CorrectedRanges, mask: Masks, reason: Reason) -> CorrectedRanges:
+    """Return the ranges with a reason added to the observed channels of a mask, shape (T, K)."""
+    if not mask.any():
+        return corrected
+    hit = mask & ((corrected.reason & int(Reason.NOT_OBSERVED)) == 0)
+    return copy_with(corrected, reason=np.where(hit, corrected.reason | int(reason), corrected.reason))
+
+
+def apply_verdict(corrected: CorrectedRanges, verdict: Verdict) -> CorrectedRanges:
+    """Return the ranges with the verdict of a screen: what fails is rejected, or weighted down."""
+    failed = verdict.screened.reject
+    if verdict.error_m is None:
+        return reject(corrected, failed, verdict.reason)
+    if not failed.any():
+        return corrected
+    return copy_with(corrected, sigma_m=suspicion_sigma_m(failed, verdict.error_m, corrected.sigma_m))
+
+
+def _apply_error_model(
+    model: ErrorModel, corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, config: Config
+) -> CorrectedRanges:
+    """Return the ranges with overbounding sigma and bias by an error model; those that it does not bound rejected."""
+
+    def front_deg(index: SearchIndex, rows: slice) -> Floats:
+        return index.trajectory.body_azimuth_deg(arc_m[rows])
+
+    turned = corrected.azimuth_deg - antennas.each(front_deg)[:, None]
+    bound, bias = model.at(corrected.elevation_deg, turned, corrected.cn0_dbhz)
+    bound = np.hypot(bound, corrected.nominal_m) if model.covers == "local" or config.sbas else bound
+    unbounded = (corrected.reason == 0) & ~np.isfinite(bound)
+    return copy_with(
+        corrected, bound_sigma_m=bound, bias_m=np.nan_to_num(bias),
+        reason=np.where(unbounded, int(Reason.NO_CORRECTION), corrected.reason),
+    )  # fmt: skip
+
+
+def collect_conditions(config: Config) -> Conditions:
+    """Collect settings that the errors of ranges depend on: the conditions of an error model made from such a run."""
+    return Conditions(
+        systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
+        screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,
+        codes="smoothed" if config.carrier == "smoothed" else "raw",
+        ionosphere="sbas" if config.sbas else config.ionosphere,
+        troposphere="sbas" if config.sbas else config.troposphere,
+    )  # fmt: skip

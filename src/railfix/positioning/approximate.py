@@ -1,0 +1,80 @@
+"""Approximate positions of an antenna from raw ranges: where directions to satellites and delays are computed."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Masks, patch_rows
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.gross_errors import gross_errors
+from railfix.positioning.normal_equations import SinglePointLimits, point_position
+from railfix.positioning.range_arrays import Ranges, without
+from railfix.positioning.section_search import SectionLimits, find_section
+
+#: Standard deviation given to raw ranges for the approximate place of the antenna [m].
+ANCHOR_SIGMA_M: Final = 10.0
+#: A last step of this length leaves 25 m of a range, which turns no satellite by more than 2e-6 rad [m].
+_TOLERANCE_M: Final = 1000.0
+#: A raw 3-D position further from the line than this is not that of a train on it, however bad the ranges [m].
+MAX_FROM_LINE_M: Final = 1e5
+
+
+class ApproximatePosition(NamedTuple):
+    """Positions of an antenna good to some hundred metres, and raw codes that are wrong, T epochs by K channels."""
+
+    ecef_m: Floats  #: Shape (T, 3).
+    arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).
+    gross: Masks  #: Codes that are grossly wrong, shape (T, K).
+    unsure: Masks  #: Epochs in which a code is grossly wrong, and nothing tells which one; shape (T,).
+
+
+def approximate_position(
+    ranges: Ranges, line: Line, *, limits: SinglePointLimits | None = None, section: SectionLimits | None = None
+) -> ApproximatePosition:
+    """Return approximate positions by the raw codes that are not grossly wrong (P1 2.2(2): delays are predicted there).
+
+    The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
+    the middle of the line at every epoch so that no epoch depends on another; the 3-D position
+    itself where it is far from the line; the best-fitting point of the line where there is no 3-D position.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Codes with satellite clock and group delay applied, of equal weight (`weighted_ranges`).
+    line : Trajectory, SearchIndex or AntennaRows
+        Trajectory of the antenna.
+    limits, section : SinglePointLimits, SectionLimits, optional
+    """
+    antennas = AntennaRows.on(line)
+    middle = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(ranges.code_m[rows]), axis=0))
+    point = point_position(ranges, middle, limits=_rough(limits or SinglePointLimits()))
+    wrong = gross_errors(ranges, antennas, point)
+    again = np.flatnonzero(wrong.gross.any(axis=1))
+    if len(again):
+        ranges = without(ranges, wrong.gross)
+        retried = point_position(ranges.take(again), middle[again], limits=_rough(limits or SinglePointLimits()))
+        point = patch_rows(point, again, retried)
+    near = point.ecef_m.copy()
+    arc, solved = np.full(len(near), np.nan), np.isfinite(near[:, 0])
+    for index, found in antennas.split(solved.nonzero()[0]):
+        distance, vertex = index.tree.query(near[found])
+        close = np.asarray(distance) < MAX_FROM_LINE_M
+        own, vertex = found[close], np.asarray(vertex)[close]
+        near[own], arc[own] = index.trajectory.ecef_m[vertex], index.arc_of_points_m[vertex]
+    for index, rest in antennas.split((~solved).nonzero()[0]):
+        best = find_section(ranges.take(rest), index, point.take(rest), limits=section).vertex
+        near[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
+    for index, off in antennas.split(np.isnan(arc).nonzero()[0]):
+        arc[off], _ = index.trajectory.nearest(near[off])
+    unsure = np.isfinite(wrong.unsure_arc_m)
+    arc = np.where(unsure, wrong.unsure_arc_m, arc)
+    near = np.where(unsure[:, None], antennas.at_arc(arc), near)
+    return ApproximatePosition(near, arc, wrong.gross, unsure)
+
+
+@lru_cache
+def _rough(limits: SinglePointLimits) -> SinglePointLimits:
+    return limits.replaced(tolerance_m=max(_TOLERANCE_M, limits.tolerance_m))

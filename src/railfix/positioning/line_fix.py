@@ -1,0 +1,64 @@
+"""Section search and constrained fix of antennas from one set of ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Indices, patch_rows
+from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.normal_equations import (
+    Constrained,
+    ConstrainedLimits,
+    SinglePoint,
+    SinglePointLimits,
+    point_position,
+    position_on_line,
+)
+from railfix.positioning.range_arrays import Ranges
+from railfix.positioning.section_search import Section, SectionLimits, find_section
+
+
+class FixLimits(NamedTuple):
+    """Limits of the stages from 3-D position to position on the line."""
+
+    min_satellites: int = 3  #: P1 3.2: 2 are possible, and find wrong sections on sharp curves.
+    single_point: SinglePointLimits = SinglePointLimits()
+    section: SectionLimits = SectionLimits()
+    constrained: ConstrainedLimits = ConstrainedLimits()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineFix:
+    """Positions from one set of ranges, T epochs."""
+
+    point: SinglePoint  #: 3-D position without the map.
+    section: Section  #: Best-fitting vertex of the trajectory.
+    constrained: Constrained  #: Position on the line.
+
+
+def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimits | None = None) -> LineFix:
+    """Return section and position on the line (P1 2.2(2), (3)) of the epochs with `FixLimits.min_satellites`."""
+    limits, antennas = limits or FixLimits(), AntennaRows.on(line)
+    section = find_section(ranges, antennas, point, limits=limits.section)
+    vertex = np.where(ranges.n_used >= limits.min_satellites, section.vertex, -1)
+    return LineFix(
+        point=point, section=section,
+        constrained=position_on_line(ranges, antennas, vertex, limits=limits.constrained),
+    )  # fmt: skip
+
+
+def refit_epochs(ranges: Ranges, antennas: AntennaRows, fix: LineFix, epochs: Indices, limits: FixLimits) -> LineFix:
+    """Return positions with those of some rising epochs found again, from other ranges."""
+    for index, own in antennas.split(epochs):
+        part = ranges.take(own)
+        solved = fix_on_line(
+            part, index, point_position(part, fix.point.ecef_m[own], limits=limits.single_point), limits
+        )
+        fix = LineFix(
+            point=patch_rows(fix.point, own, solved.point), section=patch_rows(fix.section, own, solved.section),
+            constrained=patch_rows(fix.constrained, own, solved.constrained),
+        )  # fmt: skip
+    return fix

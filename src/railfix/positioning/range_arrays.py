@@ -1,0 +1,199 @@
+"""Pseudoranges ready to be fitted, each with its weight: the arrays that the stages of positioning take.
+
+Arguments are checked here, at the edge; the stages and the compiled functions trust them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Bits, Floats, Indices, Integers, Masks, RowArrays, Strings, kernel_array
+from railfix.core.constants import CLOCK_GROUP
+from railfix.gnss.orbits import SatelliteStates
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
+from railfix.ranges.corrected import ORBITS_M, is_orbit, is_pseudorange
+
+UNTIED_M: Final = 1e6  #: Sigma of an offset between clocks of which nothing is known [m].
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockTies(RowArrays):
+    """Known offsets between the receiver clocks of the constellations."""
+
+    #: Receiver clock of each group less a clock common to all; any finite value where unknown; shape (T, G).
+    offset_m: Floats
+    sigma_m: Floats  #: Its standard deviation; `UNTIED_M` where nothing is known; shape (T, G).
+
+
+class RangeArrays(NamedTuple):
+    """Arrays of `Ranges` as `kernel_array`: T epochs, M channels, G groups."""
+
+    sat_ecef_m: Floats  # (T, M, 3)
+    code_m: Floats  # (T, M)
+    weight: Floats  # (T, M)
+    starts: Indices  # (G,) first channel of each group
+    offset_m: Floats  # (T, G), of `ClockTies`; (0, G) without ties
+    sigma_m: Floats  # likewise
+
+    @property
+    def tied(self) -> bool:
+        """Whether anything is known of the offsets between the clocks."""
+        return len(self.offset_m) == len(self.code_m)
+
+    @property
+    def clock(self) -> Indices:
+        """Group of each channel."""
+        return self.starts.searchsorted(np.arange(self.code_m.shape[1]), side="right") - 1
+
+    def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
+        """Return the arrays of some epochs."""
+        ties = (self.offset_m[epochs], self.sigma_m[epochs]) if self.tied else (self.offset_m, self.sigma_m)
+        arrays = (self.sat_ecef_m[epochs], self.code_m[epochs], self.weight[epochs], *ties)
+        sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
+        return RangeArrays(sat_ecef_m, code_m, weight, self.starts, *known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranges:
+    """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels."""
+
+    sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; any finite value where the weight is 0; shape (T, M, 3).
+    code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
+    weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
+    groups: tuple[slice, ...]  #: Channels that share one receiver clock stand side by side; one slice a clock.
+    ties: ClockTies | None = None  #: Known offsets between these clocks; None: none.
+
+    def __len__(self) -> int:
+        return len(self.code_m)
+
+    def take(self, epochs: Masks | Indices) -> Ranges:
+        """Return the ranges of some epochs, by mask or index."""
+        return Ranges(
+            sat_ecef_m=self.sat_ecef_m[epochs], code_m=self.code_m[epochs], weight=self.weight[epochs],
+            groups=self.groups, ties=None if self.ties is None else self.ties.take(epochs),
+        )  # fmt: skip
+
+    @cached_property
+    def arrays(self) -> RangeArrays:
+        """The same as plain arrays."""
+        ties = np.empty((2, 0, len(self.groups))) if self.ties is None else (self.ties.offset_m, self.ties.sigma_m)
+        arrays = (self.sat_ecef_m, self.code_m, self.weight, *ties)
+        sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
+        return RangeArrays(sat_ecef_m, code_m, weight, self.starts, *known)
+
+    @cached_property
+    def n_used(self) -> Integers:
+        """Channels with weight, shape (T,)."""
+        return np.asarray((self.weight > 0).sum(axis=1), dtype=np.int64)
+
+    @cached_property
+    def starts(self) -> Indices:
+        """First channel of each group."""
+        return np.array([group.start for group in self.groups], dtype=np.intp)
+
+    @cached_property
+    def n_clocks(self) -> Integers:
+        """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
+        seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
+        if self.ties is None:
+            return np.asarray(seen.sum(axis=1), dtype=np.int64)
+        tied = self.ties.sigma_m < UNTIED_M
+        return np.asarray((seen & ~tied).sum(axis=1) + (seen & tied).any(axis=1), dtype=np.int64)
+
+    @property
+    def redundancy(self) -> Integers:
+        """Ranges beyond the clocks and the distance along the line, shape (T,)."""
+        return np.asarray(self.n_used - self.n_clocks - 1, dtype=np.int64)
+
+
+#: Satellite position of ranges without weight: any finite value will do [m].
+FILLER_SATELLITE_M: Final = (2.6e7, 0.0, 0.0)
+
+
+def weighted_ranges(
+    sat_ecef_m: ArrayLike, code_m: ArrayLike, sigma_m: ArrayLike, clock: Sequence[str] | Strings
+) -> Ranges:
+    """Return ranges to be fitted, each with the weight ``1/sigma^2`` (P1 2.2(3)); 0 where code or sigma is NaN.
+
+    Parameters
+    ----------
+    sat_ecef_m : array_like, shape (T, M, 3) [m]
+        Satellites at the times of transmission, Earth-fixed.
+    code_m, sigma_m : array_like, shape (T, M) [m]
+        Corrected pseudoranges and their standard deviations; NaN for what is not to be used.
+    clock : sequence of str, length M
+        Constellation, or letter of the receiver clock, of each channel; those of one clock side by side.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not match, arrays of other things than double precision numbers, a standard deviation that is
+        not positive, a satellite or a code at no satellite's distance, a letter of no constellation.
+    """
+    code = _check_floats("code_m", code_m, 2)
+    sigma = _check_floats("sigma_m", sigma_m, 2)
+    satellite = _check_floats("sat_ecef_m", sat_ecef_m, 3)
+    if sigma.shape != code.shape:
+        raise ValueError(f"sigma_m has shape {sigma.shape}, expected that of code_m, {code.shape}")
+    if satellite.shape != (*code.shape, 3):
+        raise ValueError(f"sat_ecef_m has shape {satellite.shape}, expected {(*code.shape, 3)}: x, y, z of each code")
+    if len(clock) != code.shape[1]:
+        raise ValueError(f"clock names {len(clock)} channels, code_m has {code.shape[1]}")
+    if unknown := [str(letter) for letter in clock if str(letter) not in CLOCK_GROUP]:
+        raise ValueError(f"clock names {unknown[0]!r}, which is no constellation; known are {', '.join(CLOCK_GROUP)}")
+    if (sigma <= 0.0).any():
+        raise ValueError(f"sigma_m has {np.nanmin(sigma):g} m; a standard deviation is positive, NaN where unknown")
+    used = np.isfinite(code) & np.isfinite(sigma) & np.isfinite(satellite).all(axis=-1)
+    if (wrong := used & ~is_pseudorange(code)).any():
+        raise ValueError(
+            f"code_m has {code[wrong][0]:.0f} m; a pseudorange lies between {PLAUSIBLE_CODE_M[0]:.0f} and "
+            f"{PLAUSIBLE_CODE_M[1]:.0f} m, NaN where there is none"
+        )
+    if (wrong := used & ~is_orbit(satellite)).any():
+        raise ValueError(
+            f"sat_ecef_m has a satellite {np.linalg.norm(satellite[wrong][0]):.0f} m from the centre of the Earth, "
+            f"expected {ORBITS_M[0]:.0f} to {ORBITS_M[1]:.0f} m; positions are Earth-fixed, in metres"
+        )
+    return Ranges(
+        sat_ecef_m=kernel_array(np.where(used[..., None], satellite, FILLER_SATELLITE_M)),
+        code_m=kernel_array(np.where(used, code, 0.0)),
+        weight=kernel_array(np.where(used, 1.0 / sigma**2, 0.0)),
+        groups=clock_groups(clock),
+    )
+
+
+def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
+    """Return an array of double precision numbers with so many axes; ValueError for another one."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 8):
+        raise ValueError(
+            f"{name} has elements of type {array.dtype}, expected float64: single precision rounds to metres"
+        )
+    if array.ndim != axes:
+        expected = "(T, M)" if axes == 2 else "(T, M, 3)"
+        raise ValueError(f"{name} has shape {array.shape}, expected {expected}: epochs by channels")
+    return np.asarray(array, dtype=np.float64)
+
+
+def usable_ranges(
+    states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
+) -> Ranges:
+    """Return ranges to be fitted: those with a reason, or without a number, have weight 0 and finite values."""
+    used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
+    return Ranges(
+        sat_ecef_m=kernel_array(np.where(used[..., None], states.position_ecef_m, FILLER_SATELLITE_M)),
+        code_m=kernel_array(np.where(used, code, 0.0)),
+        weight=kernel_array(np.where(used, weight, 0.0)),
+        groups=groups,
+    )
+
+
+def without(ranges: Ranges, dropped: Masks) -> Ranges:
+    """Return the ranges with weight 0 where `dropped`, shape (T, M)."""
+    return replace(ranges, weight=np.where(dropped, 0.0, ranges.weight))

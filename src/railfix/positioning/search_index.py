@@ -1,0 +1,62 @@
+"""Search structures of a trajectory: a k-d tree of its points, and stretches of rising length."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from railfix import kernels
+from railfix.core.arrays import Floats, Indices
+from railfix.core.constants import FAN_OUT
+from railfix.track.trajectory import Trajectory
+
+
+class SearchIndex:
+    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of its points, shape (3,).
+        self._clear_m = np.full(len(trajectory.length_m), np.nan)
+        points = trajectory.ecef_m
+        self.tree = cKDTree(points)  #: Of its points.
+        #: Stretches of each level: middle points, and the radii [m] that cover the rest.
+        self.levels: list[tuple[Indices, Floats]] = []
+        count, size = len(points), 1
+        while True:
+            starts = np.arange(0, count, size)
+            middle = np.minimum(starts + size // 2, count - 1)
+            away = np.linalg.norm(points - points[np.repeat(middle, size)[:count]], axis=1)
+            self.levels.append((middle, np.maximum.reduceat(away, starts)))
+            if len(starts) <= FAN_OUT:
+                break
+            size *= FAN_OUT
+
+    @cached_property
+    def stretches(self) -> tuple[Indices, Floats, Indices]:
+        """Middle points and radii [m] of the stretches of all levels, shape (S,), and the first of each level."""
+        middles, radii = zip(*self.levels, strict=True)
+        return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
+
+    @cached_property
+    def arc_of_points_m(self) -> Floats:
+        """Arc length of each point, the least of those that a line has there, shape (V,) [m]."""
+        return self.trajectory.nearest(self.trajectory.ecef_m)[0]
+
+    def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
+        """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
+
+        Along and across, without the height. The same for all positions on a section, and computed once for each; at
+        most `CLEAR_M`.
+        """
+        line = self.trajectory
+        section = line.segment_at(arc_m)[0]
+        unknown = np.isnan(self._clear_m[section])
+        if unknown.any():
+            new = np.unique(section[unknown])
+            self._clear_m[new] = kernels.search.clear_of_sections(
+                line.ecef_m, line.tangent, line.across, line.length_m, self.stretches, new
+            )
+        return np.asarray(self._clear_m[section])

@@ -1,0 +1,75 @@
+"""Standard deviations of corrected pseudoranges: receiver noise and multipath, satellites and atmosphere."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Floats
+from railfix.core.settings import Settings
+from railfix.ranges.atmosphere import thin_shell_obliquity
+
+#: A C/N0 above the cap counts as the cap.
+_CN0_REFERENCE_DBHZ: Final = 45.0
+_CN0_CAP_DBHZ: Final = 50.0
+
+
+class CodeNoise(Settings):
+    """Standard deviation of a corrected pseudorange from C/N0 and elevation.
+
+    ``sigma^2 = floor_sigma_m^2 + (zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(el))^2``
+    """
+
+    model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" leaves the C/N0 factor out.
+    #: At the zenith and the reference C/N0. Only ratios matter to the position: its value for a receiver is estimated
+    #: from the residuals (`pipeline.AntennaState`).
+    zenith_sigma_m: float = Field(default=1.0, gt=0)
+    #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
+    floor_sigma_m: float = Field(default=1.0, ge=0)
+
+
+def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
+    """Return the sigma of corrected pseudoranges (T, M) [m]; NaN C/N0 is the reference; NaN at or below the horizon."""
+    noise = noise or CodeNoise()
+    sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
+    sigma = noise.zenith_sigma_m / sine
+    if noise.model == "cn0_elevation":
+        cn0 = np.where(np.isnan(cn0_dbhz), _CN0_REFERENCE_DBHZ, np.minimum(cn0_dbhz, _CN0_CAP_DBHZ))
+        sigma = sigma * np.exp((_CN0_REFERENCE_DBHZ - cn0) * (np.log(10.0) / 20.0))
+    return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
+
+
+#: Accuracies of records (URA, SISA) up to this stand for `satellite_sigma_m`: 2 to 4.85 m are usual. A worse one is
+#: believed: it is added to the sigma of the satellite's ranges.
+_USUAL_ACCURACY_M: Final = 5.0
+
+
+class NominalErrors(Settings):
+    """Assumed standard deviations of the errors that a local error model does not cover, where SBAS gives none.
+
+    ``sigma^2 = satellite^2 + (ionosphere F(el))^2 + (troposphere m(el))^2`` with the mappings of DO-229D
+    (A.4.4.10.4 and A.4.2.4).
+    """
+
+    #: Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions promise 2 m and
+    #: 95 % of the time less.
+    satellite_sigma_m: float = Field(default=0.8, ge=0)
+    #: Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
+    ionosphere_sigma_m: float = Field(default=1.0, ge=0)
+    #: Added to it, and to the ranges, with typical coefficients: what the two models differ by.
+    typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
+    #: Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4).
+    troposphere_sigma_m: float = Field(default=0.12, ge=0)
+
+    def sigma_m(self, elevation_deg: Floats) -> Floats:
+        """Return the standard deviation at elevations, any shape [m]; NaN below the horizon."""
+        sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
+        wet = 1.001 / np.sqrt(0.002001 + sine**2)
+        parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
+        return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
+
+    def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:
+        """Accuracies of records, any shape, where they are worse than usual; 0 for the others and for unknown ones."""
+        return np.where(accuracy_m > _USUAL_ACCURACY_M, accuracy_m, 0.0)

@@ -1,0 +1,124 @@
+"""Codes of a second frequency of each satellite, corrected as those of the first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.gnss.orbits import SatelliteStates
+from railfix.gnss.orbits.prepared_records import group_delay_s, group_delay_sigma_m, unhealthy
+from railfix.ranges.atmosphere import Delays
+from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels
+from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class SecondCodes:
+    """Second codes of satellites: T epochs by K channels of the first."""
+
+    code_m: Floats  #: Corrected by the models; NaN where there is none; shape (T, K).
+    noise_m: Floats  #: Standard deviation of noise and multipath that the weights assume, shape (T, K).
+    cn0_dbhz: Floats  #: Shape (T, K).
+    group_delay_m: Floats  #: That has been subtracted, shape (T, K).
+    #: Of a group delay that is not broadcast in full, beside `TwoFrequencyLimits.delay_sigma_m`; shape (T, K).
+    delay_sigma_m: Floats
+    ratio: Floats  #: Square of the first frequency over the second, shape (T, K).
+    pair: Integers  #: Number of satellite and signals among the names of pairs, shape (T, K).
+    column: Integers  #: Channel of the observations, shape (T, K).
+
+
+def second_codes(
+    obs: Observations,
+    channels: Channels,
+    states: SatelliteStates,
+    navigation: Navigation,
+    elevation_deg: Floats,
+    delays: Delays,
+    noise: CodeNoise,
+) -> SecondCodes | None:
+    """Return the second code of each satellite, corrected as the first one; None where no channel has one.
+
+    The first signal of the order of preference that is observed, healthy and has a group delay. Satellite and clock
+    are those of the first code, and so is the record that the group delay belongs to; where that record lacks a part of
+    it and another message of the satellite has it, the other's.
+    """
+    second = channels.second
+    if not second.size:
+        return None
+    shape = states.record.shape
+    code, cn0, delay_m, delay_sigma = np.full((4, *shape), np.nan)
+    column, rank = np.full(shape, -1), np.zeros(shape, dtype=np.intp)
+    for choice in range(second.shape[1]):
+        at = second[:, choice]
+        observed = np.where(at >= 0, obs.code_m[:, at], np.nan)
+        delay, sigma, sick = _delays(navigation, channels, states, choice)
+        usable = (observed > PLAUSIBLE_CODE_M[0]) & (observed < PLAUSIBLE_CODE_M[1]) & np.isfinite(delay) & ~sick
+        here = usable & (column < 0)
+        code = np.where(here, observed - delay, code)
+        cn0 = np.where(here, obs.cn0_dbhz[:, at], cn0)
+        delay_m, delay_sigma = np.where(here, delay, delay_m), np.where(here, sigma, delay_sigma)
+        column, rank = np.where(here, at, column), np.where(here, choice, rank)
+    channel = np.arange(shape[1])
+    ratio = channels.second_ratio[channel, rank]
+    sigma = code_sigma_m(cn0, elevation_deg, noise=noise.replaced(floor_sigma_m=0.0))
+    return SecondCodes(
+        code_m=code + states.clock_m - ratio * delays.ionosphere_m - delays.troposphere_m,
+        noise_m=sigma * channels.second_noise[channel, rank],
+        cn0_dbhz=cn0,
+        group_delay_m=delay_m,
+        delay_sigma_m=delay_sigma,
+        ratio=ratio,
+        pair=channel * second.shape[1] + rank,
+        column=column,
+    )
+
+
+def _delays(
+    navigation: Navigation, channels: Channels, states: SatelliteStates, choice: int
+) -> tuple[Floats, Floats, Masks]:
+    """Return group delay and its sigma [m], and ill health of a choice of second signals, shapes (T, K)."""
+    shape = states.record.shape
+    delay, sigma = np.full(shape, np.nan), np.zeros(shape)
+    sick = np.zeros(shape, dtype=bool)
+    for signal in np.unique(channels.second_signal[:, choice]).tolist():
+        if not signal:
+            continue
+        here = channels.second_signal[:, choice] == signal
+        of_record = signal_delays(navigation, signal[1:])
+        row = states.record[:, here]
+        known = row >= 0
+        values = (np.where(known, each[row], fill) for each, fill in zip(of_record, (np.nan, 0.0, True), strict=True))
+        delay[:, here], sigma[:, here], sick[:, here] = values
+    return delay, sigma, sick.astype(bool)
+
+
+@lru_cache(maxsize=64)
+def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
+    """Return group delay, its standard deviation and ill health of a signal by record, shape (n,) [m].
+
+    GPS, QZSS and BeiDou: the clocks of all messages refer to the same signals, so that a delay which a record lacks is
+    that of the satellite's record of another message with the nearest reference time.
+    """
+    records = navigation.kepler
+    clock = "ionosphere_free" if navigation.precise is not None else "broadcast"
+    delay = SPEED_OF_LIGHT * group_delay_s(records, signal, clock=clock)  # type: ignore[arg-type]
+    sigma = group_delay_sigma_m(records, signal)
+    whole = np.isfinite(delay) & (sigma == 0.0)
+    lacking = (
+        ~whole & np.isin(records.satellite, records.satellite[whole]) & ~np.char.startswith(records.satellite, "E")
+    )
+    of_satellite: Mapping[str, Indices] = {
+        name: np.flatnonzero(whole & (records.satellite == name)) for name in np.unique(records.satellite[lacking])
+    }
+    for i in np.flatnonzero(lacking):
+        rows = of_satellite[records.satellite[i]]
+        nearest = rows[np.argmin(np.abs(records.toe[rows] - records.toe[i]))]
+        delay[i], sigma[i] = delay[nearest], 0.0
+    return delay, sigma, unhealthy(records, signal)

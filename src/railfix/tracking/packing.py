@@ -1,0 +1,131 @@
+"""State, settings and sensors of the filter as the recursion takes them, and the state back."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats
+from railfix.core.timescale import seconds, timedelta
+from railfix.kernels.tracking import layout
+from railfix.kernels.tracking.layout import Records
+from railfix.tracking import bank
+from railfix.tracking.epochs import SensorEpochs
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.line import Line
+from railfix.tracking.search import begin
+from railfix.tracking.state import CLOCKS, HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
+
+#: Least `map_branch_m` in standard deviations of the map across.
+_BRANCH_SIGMAS = 3.0
+
+
+@lru_cache(maxsize=8)
+def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
+    """Return the numbers among the settings, and the budget of the level; shape (1,)."""
+    budget = bank.budget(limits)
+    values = {name: value for name, value in dict(limits).items() if isinstance(value, (int, float))}
+    values["map_branch_m"] = max(limits.map_branch_m, _BRANCH_SIGMAS * sigma_plan_m)
+    values |= {"level_risk": budget.risk, "level_k": budget.k, "level_k_speed": budget.k_speed}
+    record = np.zeros(1, dtype=layout.record_of({name: type(value) for name, value in values.items()}))
+    for name, value in values.items():
+        record[name] = value
+    return record
+
+
+def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
+    """Return wheel, radar, force, place, balises and ranges by column, `layout.SENSOR`; shape (T, C)."""
+    ranges = sensors.ranges
+    columns = layout.RANGE_COLUMN + (0 if ranges is None else ranges.range_m.shape[1])
+    packed = np.zeros((len(time), columns), dtype=layout.SENSOR)
+    packed["value"], packed["sigma"] = np.nan, 1.0
+    packed["unsigned"][:, layout.WHEEL_COLUMN] = sensors.wheel_sign == "unknown"
+    for column, (value, sigma) in enumerate((
+        (sensors.wheel_m, sensors.wheel_sigma_m),
+        (sensors.radar_m, sensors.radar_sigma_m),
+        (sensors.force_mps2, sensors.force_sigma_mps2),
+        (sensors.place_m, sensors.place_sigma_m),
+    )):  # fmt: skip
+        if value is not None and sigma is not None:
+            packed["value"][:, column], packed["sigma"][:, column] = value, sigma
+    if sensors.balises is not None:
+        balises, own = sensors.balises, packed[:, layout.PLACE_COLUMN + 1 : layout.RANGE_COLUMN]
+        own["value"], own["sigma"] = balises.place_m, balises.sigma_m
+        own["age_s"] = np.where(np.isfinite(balises.place_m), seconds(time[:, None] - balises.time), 0.0)
+    if ranges is not None:
+        own = packed[:, layout.RANGE_COLUMN :]
+        own["value"], own["sigma"], own["age_s"] = ranges.range_m, ranges.sigma_m, ranges.age_s
+        own["unit_ecef_m"], own["lever_m"] = ranges.unit_ecef_m, ranges.lever_m
+    return packed
+
+
+def list_sources(state: TrackState) -> list[str]:
+    """Return the sources of sub-filters in the order of the recursion."""
+    return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
+
+
+def pack_state(state: TrackState, origin: np.datetime64, limits: TrackingLimits, *, levels: bool) -> layout.State:
+    """Return a copy of the state; `origin` is the first time of the chunk."""
+    names = list_sources(state) if levels else []
+    count, width = state.mean.shape
+    x, P = np.zeros((count + len(names), width)), np.zeros((count + len(names), width, width))
+    x[:count], P[:count] = state.mean, state.covariance
+    source = _pack_sources(names, limits)
+    if names and state.bank is not None:
+        kept = [k for k, name in enumerate(state.bank.without) if name in names]
+        at = np.array([names.index(state.bank.without[k]) for k in kept], dtype=np.intp)
+        source["running"][at], source["contradicted_s"][at] = True, state.bank.contradicted_s[kept]
+        x[count + at], P[count + at] = state.bank.mean[kept], state.bank.covariance[kept]
+    hypothesis, monitors = np.zeros(count, dtype=HYPOTHESIS), np.zeros(1, dtype=MONITORS)
+    for name in HYPOTHESIS.names or ():
+        hypothesis[name] = getattr(state, name)
+    for name, value in vars(state.monitors).items():
+        monitors[name] = value
+    monitors["hypotheses"] = count
+    monitors["measured_s"] = seconds(state.measured - origin)
+    monitors["coded_s"] = np.fmax(seconds(state.coded - origin), -np.inf)
+    return layout.State(x, P, hypothesis, monitors, state.code_bias.copy(), state.offset_known.copy(), source)
+
+
+def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
+    """Return the sources with their probabilities and factors, `layout.SOURCE`; shape (B,)."""
+    source = np.zeros(len(names), dtype=layout.SOURCE)
+    if names:
+        given, kinds = bank.budget(limits), [bank.classify_source(name) for name in names]
+        for field, values in (("prior", given.prior), ("k", given.k_fault), ("k_speed", given.k_speed_fault)):
+            source[field] = np.array(values)[kinds]
+        source["clock"] = [
+            CLOCKS.index(bank.get_clock(name)) if kind == bank.SourceKind.SATELLITE else 0
+            for name, kind in zip(names, kinds, strict=True)
+        ]
+    return source
+
+
+def compute_start_variance(state: TrackState, line: Line, limits: TrackingLimits) -> Floats:
+    """Return the variance of each unknown where nothing is known of it, shape (N,)."""
+    start = np.full(1, limits.expired_sigma_m)
+    _, covariance = begin(np.zeros(1), start, len(state.satellite), line, limits)
+    return np.diagonal(covariance[0]).copy()
+
+
+def unpack_state(state: TrackState, packed: layout.State, origin: Any) -> None:
+    """Put what the recursion leaves into the state; `origin` is the first time of the chunk."""
+    monitors: Any = packed.monitors[0]
+    first, count = len(packed.hypothesis), int(monitors["hypotheses"])
+    state.mean, state.covariance = packed.x[:count].copy(), packed.P[:count].copy()
+    for name in HYPOTHESIS.names or ():
+        setattr(state, name, packed.hypothesis[name][:count].copy())
+    state.monitors = Monitors(**{name: float(monitors[name]) for name in vars(state.monitors)})
+    state.measured = origin + timedelta(monitors["measured_s"].item())
+    state.coded = origin + timedelta(monitors["coded_s"].item())
+    state.code_bias, state.offset_known = packed.code_bias, packed.offset_known
+    if len(packed.source):
+        running, names = packed.source["running"].nonzero()[0], list_sources(state)
+        state.bank = Bank(
+            without=tuple(names[k] for k in running),
+            mean=packed.x[first + running],
+            covariance=packed.P[first + running],
+            contradicted_s=packed.source["contradicted_s"][running],
+        )
