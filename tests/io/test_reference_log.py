@@ -141,7 +141,7 @@ def test_a_truncated_truth_is_refused(tmp_path: Path) -> None:
     packed = (demo_inputs().track[0].parent / "truth.csv.gz").read_bytes()
     path = tmp_path / "truth.csv.gz"
     path.write_bytes(packed[: len(packed) // 2])
-    with pytest.raises(InputFileError, match="the gzip data end early"):
+    with pytest.raises(InputFileError, match="the packed data end early"):
         read_reference(path, ["front"])
 
 
