@@ -55,7 +55,7 @@ class TrackingLimits(Settings):
     acceleration_mps2: float = Field(default=1.0, gt=0)
     acceleration_s: float = Field(default=2.0, gt=0)
     #: Without a sensor the speed by fewer satellites is not used beyond this acceleration: one wall, or a station roof,
-    #: can leave reflections alone, and they then agree with each other (`kernels.tracking.prediction.possible`).
+    #: can leave reflections alone, and they then agree with each other (`kernels.tracking.model.narrow_speed_range`).
     service_acceleration_mps2: float = Field(default=1.5, gt=0)
     trusted_satellites: int = Field(default=7, ge=0)
     #: Of Student's t that measurement errors follow: 4 is the least integer with a finite kurtosis bound of the score,
