@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from attacked_line import run_sequence
+from changed_line import ChangedLine
 from ground_rules import take_out
 from railfix.core.errors import InputFileError
 from railfix.core.settings import load_settings
@@ -385,13 +386,26 @@ def test_no_sequence_leads_to_an_authority_into_a_train(seeds: Sequence[int]) ->
 
 
 @pytest.mark.parametrize(
+    "seeds",
+    [range(3), pytest.param(range(20_000), marks=pytest.mark.slow)],
+    ids=["3 sequences", "20,000 sequences"],
+)
+def test_no_sequence_with_changes_of_trains_leads_into_a_train_or_a_vehicle(seeds: Sequence[int]) -> None:
+    """Hauled, divided and joined trains, vehicles that report nothing, orders at any moment, older copies."""
+    violations = Counter[str]()
+    for seed in seeds:
+        violations += run_sequence(seed, steps=120, kind=ChangedLine).violations
+    assert violations == Counter()
+
+
+@pytest.mark.parametrize(
     ("rule", "seed", "kind"),
     [
         ("integrity", 52, "authority into another train"),
         ("length", 334, "authority into another train"),
         ("way", 305, "authority into another train"),
         ("roll-back", 75, "authority into another train"),
-        ("clock", 54, "impossible way believed"),
+        ("clock", 87, "impossible way believed"),
         ("place covered", 19855, "authority into another train"),
     ],
 )

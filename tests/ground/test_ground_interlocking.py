@@ -112,7 +112,9 @@ def test_a_route_by_hand(state: Interlocking, monkeypatch: pytest.MonkeyPatch) -
     assert "locked" in (route_requested(routed, 2, LAYOUT)[2] or "")
 
 
-def test_an_authority_ends_before_points_until_they_are_detected(state: Interlocking) -> None:
+def test_an_authority_ends_before_points_until_they_are_detected(
+    state: Interlocking, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Train 2 leaves track 2: both points move, then the authority passes them."""
     routed, moved, reason = route_requested(state, 2, LAYOUT)
     assert (set(moved), reason) == ({(1, -1), (0, 1)}, None)
@@ -121,6 +123,8 @@ def test_an_authority_ends_before_points_until_they_are_detected(state: Interloc
     assert near.trains[2].end_m == pytest.approx(400.0 + 20.0)
     through = extend_authorities(points_reported(near, (0, 1), 2, LAYOUT), LAYOUT, limits=LIMITS)
     assert through.trains[2].end_m == pytest.approx(50.0 + 20.0)
+    take_out(monkeypatch, "points detected")
+    assert extend_authorities(routed, LAYOUT, limits=LIMITS).trains[2].end_m == pytest.approx(50.0 + 20.0)
 
 
 def test_a_follower_ends_before_the_safe_rear_of_the_train_ahead(state: Interlocking) -> None:
@@ -210,7 +214,6 @@ def test_no_overlap_in_traffic_of_eight_trains(seeds: range, steps: int) -> None
         ("safe rear", 0, "train outside its interval"),
         ("sequence", 1, "intervals overlap"),
         ("points locked", 0, "points moved under a train"),
-        ("points detected", 56, "train on moving points"),
         ("persistence", 1, "train outside its interval"),
         ("supervision", 0, "train outside its interval"),
         ("freshness", 0, "runs without a fresh authority"),

@@ -30,7 +30,7 @@ from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import nmea_bytes, tpv_bytes
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
-from railfix.live.sources import _Chunks, check_source
+from railfix.live.sources import check_source
 from railfix.live.stream import Lag, ReceivedData, ReceiverState, receive_bytes, single_epochs
 from railfix.simulate.demonstration import demo_files
 
@@ -513,12 +513,9 @@ def test_what_is_wrong_is_one_sentence(words: list[str], code: int, says: str) -
     assert "Traceback" not in done.output
 
 
-def test_sources_and_chunks_by_hand() -> None:
+def test_sources_that_are_right_are_taken() -> None:
     for good in ("-", "a.ubx", "tcp://localhost:1", "ntrip://u:p@localhost:2101/MOUNT", "serial:/dev/ttyS0?baud=9600"):
         check_source(good)
-    chunks = _Chunks()
-    body: Any = b"".join(chunks.take(bytes([value])) for value in b"4\r\nWiki\r\n5;x=1\r\npedia\r\n0\r\n\r\n")
-    assert body == b"Wikipedia"
 
 
 def test_a_track_of_another_country_is_named_once(tmp_path: Path) -> None:

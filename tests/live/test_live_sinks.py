@@ -30,9 +30,10 @@ import railfix
 from railfix.cli import app
 from railfix.core.errors import OutputError, SettingsError
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
-from railfix.live.console import SessionLog
+from railfix.live.console import Metrics, SessionLog
 from railfix.live.engine import LiveOutput
 from railfix.live.forms import etcs_form, forms
+from railfix.live.session import Hooks, _Session
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import MqttTarget, Outlet, open_sink
 from railfix.simulate.demonstration import demo_files
@@ -413,6 +414,55 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
         assert message.status is not MessageStatus.POSITION or mine[0]["status"] == "tracking"
         checked += 1
     assert checked > 25
+
+
+@pytest.mark.requirement("A8")
+def test_a_sink_that_cannot_be_written_ends_alone_until_none_is_left() -> None:
+    class Target:
+        dropped = failed = 0
+
+        def __init__(self, name: str, most: int) -> None:
+            self.name, self.most, self.taken = name, most, 0
+
+        def send(self, _: LiveOutput) -> None:
+            if self.taken == self.most:
+                raise OutputError(f"{self.name}: cannot be written (No space left on device)")
+            self.taken += 1
+
+        def close(self) -> None:
+            """Nothing is held."""
+
+    small, large = Target("small", 1), Target("large", 3)
+    session = _Session(engine=None, sinks=[small, large], metrics=Metrics(), hooks=Hooks())  # type: ignore[arg-type]
+    for _ in range(3):
+        for sink in (small, large):
+            if sink.name not in session.ended:
+                session.send(sink, output(1))
+    assert (small.taken, large.taken) == (1, 3)
+    assert [str(error) for error in session.ended.values()] == ["small: cannot be written (No space left on device)"]
+    with pytest.raises(OutputError, match="large: cannot be written"):
+        session.send(large, output(1))
+
+
+@pytest.mark.slow
+@pytest.mark.requirement("A8")
+def test_an_output_on_a_full_disk_ends_alone(tmp_path: Path) -> None:
+    """The other output has every message; the exit code is that of outputs."""
+    files = demo_files()
+    part = tmp_path / "front.rnx"
+    railfix.write_observations(railfix.read_observations(files["front"])[:150], part)
+    words = ["live", "--front", str(part), "--track", str(files["track"]), "--nav", str(files["nav"]), "--overwrite"]
+    words += ["--set", "filter=off", "--live", "no_input=skip"]
+    good = tmp_path / "good"
+    done = RUNNER.invoke(app, [*words, "--send", "json@/dev/full", "--send", f"json@{good}"])
+    assert done.exit_code == 8, done.output
+    assert len(good.read_text().splitlines()) == 150
+    said = " ".join(done.output.split())
+    assert (
+        "json@/dev/full: cannot be written (No space left on device); this output has ended, the others go on" in said
+    )
+    alone = RUNNER.invoke(app, [*words, "--send", "json@/dev/full"])
+    assert alone.exit_code == 8
 
 
 def up_cm(value: float) -> int:

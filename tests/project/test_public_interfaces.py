@@ -14,8 +14,6 @@ SRC: Final = Path(__file__).resolve().parents[2] / "src" / "railfix"
 #: Files that may do what is forbidden, with the reason.
 EXCEPTIONS: Final[dict[str, str]] = {
     "ground/quic.py": "aioquic has no public setting by which a server asks a client for its certificate",
-    "kernels/tracking/algebra.py": "sums of rows in vectors of the processor, until the update of the filter is plain",
-    "kernels/tracking/references.py": "tuples by reference, until the kernels of the filter take arrays",
 }
 #: Names with an underscore that the standard library documents.
 DOCUMENTED: Final = frozenset({"_replace", "_fields", "_asdict", "_make", "_field_defaults", "_missing_"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,8 +24,8 @@ from railfix.core.tables import plain_table, plural
 from railfix.evaluate.inputs import TABLES, list_position_tables, read_run
 from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import round_floats
-from railfix.run.checks import examine_files
 from railfix.run.convert import write_mcap
+from railfix.run.doctor import examine_files
 from railfix.run.inputs import LogReading, input_path
 from railfix.run.locate import LocateInputs, locate_files
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files, write_last_place
@@ -212,6 +213,10 @@ def doctor(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Logs, navigation, track, vehicle, references.")
     ],
+    *,
+    as_json: Annotated[
+        bool, typer.Option("--json", rich_help_panel="Choices", help="Print the findings as one line of JSON.")
+    ] = False,
 ) -> None:
     """Examine files before a run: what each is, whether they fit together, and the command to run.
 
@@ -224,8 +229,11 @@ def doctor(
     Exit codes: 0 everything fits; 3 a file is missing; 5 something does not fit, is missing or of no known kind.
     """
     diagnosis = examine_files(files)
-    console = TableConsole()
     problems = diagnosis.problems
+    if as_json:
+        typer.echo(json.dumps(diagnosis.as_dict()))
+        raise typer.Exit(5 if problems else 0)
+    console = TableConsole()
     verdict = f"{plural(problems, 'thing')} to mend" if problems else "the files fit together"
     console.print(f"{len(diagnosis.findings)} files: {verdict}")
     for problem in problems:

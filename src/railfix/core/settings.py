@@ -59,6 +59,14 @@ class Settings(BaseModel):
                 raise ValueError("a number was expected")
         return value
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _one_word_for_a_list(cls, value: Any, info: ValidationInfo) -> Any:
+        """Take words with commas between them for a list: ``systems=G``."""
+        if isinstance(value, str) and get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
+            return tuple(word.strip() for word in value.split(",") if word.strip())
+        return value
+
     def replaced(self, **changes: Any) -> Self:
         """Return a copy with some settings changed; SettingsError where a value is out of range or a name unknown."""
         values = {name: getattr(self, name) for name in type(self).model_fields}

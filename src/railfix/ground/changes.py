@@ -154,7 +154,8 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
             locked = {lead if n == other else n: since for n, since in point.locked.items()}
             points[name] = replace(point, locked=locked)
     trains = {n: train for n, train in state.trains.items() if n != other}
-    return _refused_overlap(replace(state, trains=trains), joined, layout, points)
+    after, reason = _refused_overlap(replace(state, trains=trains), joined, layout, points)
+    return (after, None) if reason is None else (state, reason)
 
 
 def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:

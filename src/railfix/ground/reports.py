@@ -261,6 +261,7 @@ def _noted(report: PlacedReport) -> TrainInterval:
         reported_m=(low, high),
         claimed_m=None,
         contradiction=None,
+        held_end_m=None if message.authority_end_cm is None or report.turns else message.authority_end_cm / 100.0,
     )
 
 

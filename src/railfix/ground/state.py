@@ -60,6 +60,7 @@ class TrainInterval:
     #: that report contradicted.
     reported_m: tuple[float, float] | None = None
     contradiction: str | None = None
+    held_end_m: float | None = None  #: End of the authority that the train holds, by its newest report.
     stop: str | None = None  #: Why the train is stopped, until it is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is asked to agree to.
     asked_number: int = 0  #: Number of the first authority that asks for it.

@@ -72,6 +72,9 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
             "train {} was last reported at {:.0f} to {:.0f} m, outside its interval {:.0f} to {:.0f} m: see where it "
             "stands and correct its interval by order (correct-train) first"
         ).format(train, *known.reported_m, *known.span_m)
+    held = known.held_end_m
+    if held is not None and known.direction * (held - known.interval_m[1]) > ROUNDING_M:
+        return state, f"train {train} still holds an authority to {held:.0f} m: it gives it up where it stands by order"
     if (bar := bar_over(state, known, layout)) is not None:
         return state, f"the section where train {train} is or may run is {bar[1]}: {bar[0]}"
     under = [name for name in layout.points_between(*known.span_m) if known.overlaps(*layout.zone_m(name))]

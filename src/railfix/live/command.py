@@ -239,8 +239,12 @@ def _hooks(
         save = states.send
 
     def observe(output: LiveOutput) -> None:
-        for observer in observers:
-            observer(output)
+        for observer in tuple(observers):
+            try:
+                observer(output)
+            except OutputError as error:  # raised again when it is closed
+                observers.remove(observer)
+                log.say(f"{error}; this output has ended, the others go on")
 
     show = log.show if log.shows_status else None
     return Hooks(observe=observe, sensed=sensed, save=save, show=show), streams

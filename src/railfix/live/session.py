@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from railfix.core.errors import OutputError
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
@@ -88,7 +89,7 @@ async def run_session(
     InputFileError
         A source cannot be opened, or breaks and is not opened again; a sensor's stream begins with another table.
     OutputError
-        A sink of a replay cannot be written.
+        A sink of a replay cannot be written: raised at the end, when the others have everything, or when none is left.
     ChannelsDisagreeError
         Two channels differ.
     """
@@ -121,6 +122,8 @@ async def run_session(
             for pump in pending:
                 pump.cancel()
             await asyncio.wait(pending, timeout=1.0)
+    for error in session.ended.values():
+        raise error
     return session.metrics
 
 
@@ -144,6 +147,7 @@ class _Session:
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     reserved_from: int = 0
+    ended: dict[str, OutputError] = field(default_factory=dict)  #: Sinks that could not be written.
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
         """Process what the pumps bring until all have ended; a restart can continue from there."""
@@ -264,12 +268,26 @@ class _Session:
             if self.engine.settings.gga_s > 0.0:
                 self.place = gga_sentence(output) or self.place
             for sink in self.sinks:
-                sink.send(output)
+                if sink.name not in self.ended:
+                    self.send(sink, output)
             if self.hooks.observe is not None:
                 self.hooks.observe(output)
         while self.engine.reports:
             _LOG.warning("%s", self.engine.reports.popleft())
         return outputs
+
+    def send(self, sink: Sink, output: LiveOutput) -> None:
+        """Give an output to a sink; one that cannot be written has ended, the others go on.
+
+        OutputError: none is left.
+        """
+        try:
+            sink.send(output)
+        except OutputError as error:
+            self.ended[sink.name] = error
+            _LOG.warning("%s; this output has ended, the others go on", error)
+            if len(self.ended) == len(self.sinks):
+                raise
 
     def in_idle_time(self, outputs: Sequence[LiveOutput]) -> None:
         """Status and state, while no data wait."""

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from railfix.core.errors import InputFileError, SettingsError
@@ -42,6 +42,8 @@ _ONCE_MORE_S = 0.02
 _NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
+_TELLING_BYTES: Final = 16  #: First bytes of a content that tell what it is not.
+_OK: Final = 200  #: Status of an answer that is what was asked for.
 
 
 @dataclass(frozen=True)
@@ -201,23 +203,10 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
     With `LiveSettings.gga_s` it gets the train's position: in the request where that is known (NTRIP 2), and as lines
     from then on, for the virtual station that it makes there.
     """
-    parts = urlsplit(source)
     if settings.gga_s == 0.0:
         place = None
-    head = [
-        f"GET {parts.path} HTTP/1.1",
-        f"Host: {parts.hostname}:{parts.port}",
-        "Ntrip-Version: Ntrip/2.0",
-        "User-Agent: NTRIP railfix",
-        "Connection: close",
-    ]
-    if parts.username is not None:
-        login = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
-        head.append("Authorization: Basic " + base64.b64encode(login.encode()).decode())
-    if place is not None and (sentence := place()):
-        head.append("Ntrip-GGA: " + sentence.decode("ascii").strip())
-    request = ("\r\n".join(head) + "\r\n\r\n").encode()
-    answer, answered, body = b"", False, None
+    parts, answer = urlsplit(source), _Answer(source)
+    request = answer.request(b"" if place is None else place())
     open_to_lines = asyncio.Event()
 
     async def report(writer: asyncio.StreamWriter) -> None:
@@ -230,33 +219,129 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
     tls = _tls(source, settings.ntrip_certificates) if parts.scheme == "ntrips" else None
     send = None if place is None else report
     async for data in _tcp(source, request, settings.silence_s, tls=tls, send=send):
-        if answered:
-            if content := data if body is None else body.take(data):
-                yield content
-            continue
-        answer += data
-        first = answer.split(b"\r\n", 1)[0]
-        if first.startswith(b"ICY 200") and b"\r\n" in answer:
-            rest = answer.split(b"\r\n", 1)[1].removeprefix(b"\r\n")
-        elif first.startswith(b"HTTP/") and b"\r\n\r\n" in answer:
-            header, rest = answer.split(b"\r\n\r\n", 1)
-            if b" 200" not in first:
-                raise _refuse(source, first)
-            body = _Chunks() if b"transfer-encoding: chunked" in header.lower() else None
-        elif b"\r\n" in answer and not first.startswith((b"HTTP/", b"ICY 200")):
-            raise _refuse(source, first)
-        elif len(answer) > _HEADER_BYTES:
-            raise InputFileError(hidden(source), "the caster's answer has no end of its header")
-        else:
-            continue
-        answered = True
-        open_to_lines.set()
-        yield b""
-        if content := rest if body is None else body.take(rest):
+        content = answer.take(data)
+        if answer.begun and not open_to_lines.is_set():
+            open_to_lines.set()
+            yield b""
+        if content:
             yield content
-    if not answered:
+        answer.check()
+        if answer.ended:
+            return
+    if not answer.begun:
         hint = "" if tls is not None else "; does it expect TLS (ntrips://)?"
         raise InputFileError(hidden(source), f"the caster has closed the connection without an answer{hint}")
+
+
+class _Answer:
+    """Answer of a caster: HTTP 1.1 by h11 (NTRIP 2), or ``ICY 200 OK`` and bytes (NTRIP 1).
+
+    `begun`: it is a stream of a mount point; `ended`: the caster has ended it.
+    """
+
+    def __init__(self, source: str) -> None:
+        try:
+            import h11
+        except ModuleNotFoundError:
+            raise SettingsError(f"source {hidden(source)!r}: NTRIP needs h11; install railfix[live]") from None
+        self._h11, self._source = h11, source
+        self._client: Any = h11.Connection(our_role=h11.CLIENT, max_incomplete_event_size=_HEADER_BYTES)
+        self._first: bytes | None = b""  # up to the end of the first line; None once that is known
+        self._content = b""  # the first bytes of the content
+        self._broken: InputFileError | None = None
+        self._plain = self.begun = self.ended = False
+
+    def request(self, sentence: bytes) -> bytes:
+        """Return the request, with the position that the caster is told."""
+        parts = urlsplit(self._source)
+        head = [
+            ("Host", f"{parts.hostname}:{parts.port}"), ("Ntrip-Version", "Ntrip/2.0"),
+            ("User-Agent", "NTRIP railfix"), ("Connection", "close"),
+        ]  # fmt: skip
+        if parts.username is not None:
+            login = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
+            head.append(("Authorization", "Basic " + base64.b64encode(login.encode()).decode()))
+        if sentence:
+            head.append(("Ntrip-GGA", sentence.decode("ascii").strip()))
+        try:
+            request = self._h11.Request(method="GET", target=parts.path, headers=head)
+            return bytes(self._client.send(request) + self._client.send(self._h11.EndOfMessage()))
+        except self._h11.LocalProtocolError as error:
+            raise SettingsError(f"source {hidden(self._source)!r}: cannot be asked for ({error})") from None
+
+    def take(self, data: bytes) -> bytes:
+        """Return the content of some more bytes; InputFileError where it is no stream of a mount point."""
+        if self._first is not None:
+            self._first += data
+            if b"\n" not in self._first and len(self._first) < _HEADER_BYTES:
+                return b""
+            data, self._first = self._first, None
+            line = data.split(b"\n", 1)[0].strip()
+            if line.startswith(b"ICY 200"):
+                self._plain = self.begun = True
+                data = data.split(b"\n", 1)[1].removeprefix(b"\r\n")
+            elif not line.startswith(b"HTTP/"):
+                raise _refuse(self._source, line)
+        content = data if self._plain else self._decode(data)
+        if content and len(self._content) < _TELLING_BYTES:
+            self._content += content[:_TELLING_BYTES]
+            self._check_content(self._content)
+        return content
+
+    def _decode(self, data: bytes) -> bytes:
+        """Return the content of some bytes of HTTP."""
+        content = bytearray()
+        try:
+            self._client.receive_data(data)
+            while (event := self._client.next_event()) is not self._h11.NEED_DATA:
+                if isinstance(event, self._h11.Response):
+                    self._check_head(event)
+                    self.begun = True
+                elif isinstance(event, self._h11.Data):
+                    content += event.data
+                elif isinstance(event, self._h11.EndOfMessage):
+                    self.ended = True
+                    break
+        except self._h11.RemoteProtocolError as error:  # what came before it counts
+            self._broken = InputFileError(hidden(self._source), f"the caster's answer is no HTTP ({error})")
+        return bytes(content)
+
+    def check(self) -> None:
+        """Raise InputFileError where the last bytes taken were no HTTP."""
+        if self._broken is not None:
+            raise self._broken
+
+    def _check_head(self, response: Any) -> None:
+        """Raise InputFileError where an answer is no stream: refused, a source table, a page, or compressed."""
+        if response.status_code != _OK:
+            raise _refuse(self._source, f"{response.status_code} {response.reason.decode('latin-1')}".encode())
+        head = {bytes(name).lower(): bytes(value).lower().strip() for name, value in response.headers}
+        kind, coding = head.get(b"content-type", b""), head.get(b"content-encoding", b"identity")
+        if kind.startswith(b"gnss/sourcetable"):
+            raise InputFileError(
+                hidden(self._source), "the caster sends its source table, not a stream; is the mount point right?"
+            )
+        if kind.startswith(b"text/html"):
+            raise self._no_stream("a page of HTML")
+        if coding != b"identity":
+            raise self._no_stream(f"content coded as {coding.decode('latin-1')[:20]!r}, which was not asked for")
+
+    def _check_content(self, content: bytes) -> None:
+        """Raise InputFileError where the first bytes are none of a receiver."""
+        if content.startswith(b"\x1f\x8b"):
+            raise self._no_stream("compressed content (gzip), which was not asked for")
+        if content.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
+            raise self._no_stream("a page of HTML")
+        if content.startswith((b"STR;", b"CAS;", b"NET;", b"SOURCETABLE")):
+            raise InputFileError(
+                hidden(self._source), "the caster sends its source table, not a stream; is the mount point right?"
+            )
+
+    def _no_stream(self, what: str) -> InputFileError:
+        return InputFileError(
+            hidden(self._source),
+            f"the caster sends {what}, not a receiver's stream; are host and mount point right?",
+        )
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
@@ -276,34 +361,6 @@ def _refuse(source: str, first: bytes) -> InputFileError:
     hint = "; is the mount point right?" if "SOURCETABLE" in text else ""
     hint = "; are user and password right?" if "401" in text else hint
     return InputFileError(hidden(source), f"the caster answers {text!r}{hint}")
-
-
-class _Chunks:
-    """The body of an HTTP answer that comes in chunks (RFC 9112, 7.1)."""
-
-    def __init__(self) -> None:
-        self._buffer = b""
-        self._left = 0
-
-    def take(self, data: bytes) -> bytes:
-        """Content of some more bytes; InputFileError when what stands where the length of a chunk should be is none."""
-        self._buffer += data
-        content = b""
-        while self._buffer:
-            if self._left:
-                part = self._buffer[: self._left]
-                self._buffer, self._left = self._buffer[len(part) :], self._left - len(part)
-                content += part
-                continue
-            line, end, rest = self._buffer.removeprefix(b"\r\n").partition(b"\r\n")
-            if not end and len(line) < _BLOCK:
-                break
-            try:
-                self._left = int(line.split(b";")[0] or b"0", 16)
-            except ValueError:
-                raise InputFileError("the caster", f"sends {line[:20]!r} in place of the length of a chunk") from None
-            self._buffer = rest
-        return content
 
 
 def _baud(source: str) -> int:

@@ -13,7 +13,7 @@ from railfix.kernels.tracking.layout import CHANNEL, EPOCH, Records
 from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import CLOCKS, TrackState
-from railfix.tracking.velocity import compute_velocity, singer
+from railfix.tracking.velocity import Velocity, compute_velocity, singer
 
 #: Shortest interval between epochs [s].
 _SHORTEST_S: Final = 1e-3
@@ -76,28 +76,14 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     fresh[:, slot[used]] = any_kind[:, used]
     state.seen = seen[-1]
 
-    cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
-    weak = 10.0 ** ((45.0 - cn0) / 10.0)
-    variance = np.array(
-        [
-            (limits.code_white_share * epochs.code_sigma_m) ** 2,
-            limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
-            limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
-        ]
-    )
+    variance = _compute_variance(epochs, limits)
     near = np.full((len(epochs), 3), np.nan) if epochs.near_ecef_m is None else epochs.near_ecef_m
     velocity = compute_velocity(
         near, epochs.sat_ecef_m, epochs.sat_velocity_mps, before, measured, has, variance, interval
     )
-    epoch = np.zeros(len(epochs), dtype=EPOCH)
-    epoch["time_s"], epoch["interval_s"] = seconds(epochs.time - epochs.time[0]), interval
+    epoch = _pack_epochs(epochs, interval, velocity, limits)
     epoch["begins"] = apart | epochs.off_map
     epoch["motion_measured"] = has[1:].sum(axis=2).max(axis=0) >= _MOTION
-    epoch["velocity_mps"], epoch["velocity_age_s"] = velocity.velocity_mps, velocity.age_s
-    epoch["velocity_covariance"] = velocity.covariance
-    for dt in np.unique(interval).tolist():
-        step, noise = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
-        epoch["step"][interval == dt], epoch["noise"][interval == dt] = step, noise
     channel = np.zeros(epochs.code_m.shape, dtype=CHANNEL)
     channel["satellite"], channel["clock"] = slot, [_OFFSETS[letter] for letter in epochs.clock.tolist()]
     channel["sat_ecef_m"], channel["sat_velocity_mps"] = epochs.sat_ecef_m, epochs.sat_velocity_mps
@@ -108,6 +94,31 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
         time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, apart=apart, off_map=epochs.off_map,
         fresh=fresh & ~kept, within_memory=kept,
     )  # fmt: skip
+
+
+def _compute_variance(epochs: GnssEpochs, limits: TrackingLimits) -> Floats:
+    """Return the variances of the white errors of codes, phases and Dopplers, the last two by C/N0; shape (3, T, K)."""
+    cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
+    weak = 10.0 ** ((45.0 - cn0) / 10.0)
+    return np.array(
+        [
+            (limits.code_white_share * epochs.code_sigma_m) ** 2,
+            limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
+            limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
+        ]
+    )
+
+
+def _pack_epochs(epochs: GnssEpochs, interval: Floats, velocity: Velocity, limits: TrackingLimits) -> Records:
+    """Return the records of epochs with their intervals, Singer's steps and velocities without the line."""
+    epoch = np.zeros(len(epochs), dtype=EPOCH)
+    epoch["time_s"], epoch["interval_s"] = seconds(epochs.time - epochs.time[0]), interval
+    epoch["velocity_mps"], epoch["velocity_age_s"] = velocity.velocity_mps, velocity.age_s
+    epoch["velocity_covariance"] = velocity.covariance
+    for dt in np.unique(interval).tolist():
+        step, noise = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
+        epoch["step"][interval == dt], epoch["noise"][interval == dt] = step, noise
+    return epoch
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:
