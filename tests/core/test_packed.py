@@ -6,6 +6,7 @@ import bz2
 import gzip
 import io
 import lzma
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ import ncompress
 import pytest
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import ending, read_bytes, unpacked_file
+from railfix.core.files import ending, read_bytes, read_text, unpacked_file
 
 pytestmark = pytest.mark.requirement("G5")
 
@@ -63,3 +64,17 @@ def test_an_archive_of_several_files_names_them(tmp_path: Path) -> None:
         archive.writestr("b.obs", TEXT)
     with pytest.raises(InputFileError, match=r"zip archive of 2 files \(a.obs, b.obs\); unpack it"):
         read_bytes(path)
+
+
+def test_a_packed_file_that_would_fill_the_memory_is_refused_early(tmp_path: Path) -> None:
+    """A gzip that becomes 200 MB of equal lines, hundreds of times its size."""
+    path = tmp_path / "map.csv.gz"
+    with gzip.open(path, "wb") as file:
+        for _ in range(200):
+            file.write(b"1.5,2.5,3.5\n" * 84_000)
+    assert path.stat().st_size < 640_000
+    tracemalloc.start()
+    with pytest.raises(InputFileError, match="unpacks to more than 64 MB"):
+        read_text(path)
+    assert tracemalloc.get_traced_memory()[1] < 160e6
+    tracemalloc.stop()

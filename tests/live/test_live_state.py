@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 import subprocess
@@ -107,7 +108,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
         "damaged": (kept[:-1], [], None, "is damaged or cut off"),
         "changed": (kept[:-1] + bytes([kept[-1] ^ 1]), [], None, "is damaged or cut off"),
         "empty": (b"", [], None, "is no state file of this version"),
-        "older": (kept.replace(b"live state 3", b"live state 2", 1), [], None, "is no state file of this version"),
+        "older": (kept.replace(b"live state 4", b"live state 3", 1), [], None, "is no state file of this version"),
     }
     for name, (content, words, track, says) in cases.items():
         path.write_bytes(content)
@@ -178,21 +179,53 @@ class Evil:
         return os.system, ("echo evil",)
 
 
-def test_only_values_of_the_package_are_read(tmp_path: Path) -> None:
-    """A file with a valid head whose content would run a program."""
+def archive(tree: object, **arrays: np.ndarray) -> bytes:
+    """A NumPy archive as a state has it, of any content."""
+    file = io.BytesIO()
+    np.savez(file, tree=np.frombuffer(json.dumps(tree).encode(), dtype=np.uint8), **arrays)
+    return file.getvalue()
+
+
+def objects() -> bytes:
+    """An archive whose array is one of objects, pickled by NumPy: the way into a program."""
+    file = io.BytesIO()
+    np.savez(file, tree=np.frombuffer(b'{"array": 0}', dtype=np.uint8), a0=np.array([Evil()], dtype=object))
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pickle.dumps(Evil()),
+        objects(),
+        archive({"of": "os:system", "fields": {}}),
+        archive({"of": "railfix.live.state:os.system", "fields": {}}),
+        archive({"of": "railfix.live.state:Path", "fields": {}}),
+        archive({"of": "railfix.run.output:OutputFolder", "fields": {"path": "/tmp/x"}}),
+        archive({"tuple of": "railfix.live.state:json", "values": []}),
+        archive({"enum": "railfix.core.reasons:Reason", "value": "a"}),
+        archive({"of": "railfix.live.state:SavedSession", "fields": {"nothing": 1}}),
+        archive({"code": "1"}),
+        archive("text"),
+        b"",
+    ],
+)
+def test_only_values_of_the_package_are_read(tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]) -> None:
+    """A file with a valid head whose content would run a program, or is of something else."""
     import hashlib
 
     path, under = tmp_path / "state", {"settings": "x"}
     saved = SavedSession(engine=EngineState(state=State(), done_ns=1, last_tag={}, sequence=1), streams={})
     write_state(path, saved, under)
     assert load_state(path, under).session == saved
-    content = pickle.dumps(Evil())
-    head = {"form": "railfix live state 3", **under, "bytes": len(content)}
+    head = {"form": "railfix live state 4", **under, "bytes": len(content)}
     head["sha256"] = hashlib.sha256(content).hexdigest()
     path.write_bytes(json.dumps(head).encode() + b"\n" + content)
     loaded = load_state(path, under)
     assert loaded.session is None
-    assert "is no part of a state" in loaded.outcome
+    assert "holds no state" in loaded.outcome
+    assert "evil" not in capfd.readouterr().out
+    assert sorted(tmp_path.iterdir()) == [path]
 
 
 def test_everything_that_positions_depend_on_is_in_the_hash(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_the_first_example_reaches_the_error_beside_it(page: str) -> None:
     assert len(both) == 2000
     error = float((both["chainage_m"] - both["chainage_m_true"]).abs().median())
     # the same example stands on three pages, beside what it reaches
-    assert f"median error of these positions is {int(100 * error) / 100:.2f} m" in " ".join(text.split())
+    assert f"median error of these positions is {error:.2f} m" in " ".join(text.split())
     # what a notebook shows of them: the filter first, then single epochs
     shown_table = names["result"]._repr_html_()
     assert shown_table.index("filter along the track") < shown_table.index("single epochs")

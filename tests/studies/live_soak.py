@@ -3,14 +3,13 @@
     python tests/studies/live_soak.py [--hours 24] [--rate 0.2] [--sbas] [--channels 2]
 
 Two antennas of a simulated train that runs to and fro on a line of 36 km, with the filter along the track; ephemerides
-come when they are sent, messages go into a file, the state is pickled every 360 epochs. Prints memory hour by hour.
+come when they are sent, messages go into a file, the state is encoded every 360 epochs. Prints memory hour by hour.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import pickle
 import resource
 import sys
 import tempfile
@@ -32,6 +31,7 @@ from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink
 from railfix.live.state import SavedSession
+from railfix.live.state_values import encode
 from railfix.live.stream import ReceivedData, ReceiverState, single_epochs
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.simulate import LineSettings, RunSettings, Scenario, write_run
@@ -79,7 +79,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False, chan
         counts["outputs"] += 1
         if counts["outputs"] % 360 == 0:
             saved = engine.export_state()
-            counts["saved"] = len(pickle.dumps(SavedSession(engine=saved, streams={})))
+            counts["saved"] = len(encode(SavedSession(engine=saved, streams={})))
         if counts["outputs"] % max(1, round(3600 * rate_hz)) == 0:
             memory.append(resident_mb())
             print(f"{len(memory):3d} h  {memory[-1]:7.1f} MB  state {counts['saved'] / 1e3:.0f} kB", flush=True)

@@ -46,6 +46,9 @@ _SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")  #: Endings of packed fi
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
+#: Whole files: text is packed to a twentieth or a fiftieth; more is no text, and could fill the memory.
+_LARGEST_RATIO: Final = 100
+_LARGEST_BYTES: Final = 64_000_000
 
 
 class ByteStream(io.BufferedIOBase):
@@ -200,9 +203,20 @@ def _is_document(path: FilePath) -> bool:
 
 
 def read_bytes(path: FilePath) -> bytes:
-    """Read the decompressed content of a small file (navigation, SP3); errors as `open_stream`."""
+    """Read the decompressed content of a small file (navigation, SP3, map); errors as `open_stream`.
+
+    InputFileError: packed data that become more than `_LARGEST_RATIO` times their size, and more than `_LARGEST_BYTES`.
+    """
+    content = bytearray()
     with open_stream(path) as stream:
-        return stream.read()
+        most = max(_LARGEST_BYTES, _LARGEST_RATIO * Path(path).stat().st_size)
+        while block := stream.read(_COPY_BYTES):
+            content += block
+            if len(content) > most:
+                raise InputFileError(
+                    path, f"unpacks to more than {most / 1e6:,.0f} MB, which no map or navigation file of its size does"
+                )
+    return bytes(content)
 
 
 def read_text(path: FilePath) -> str:

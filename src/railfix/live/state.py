@@ -2,16 +2,14 @@
 
 A line of JSON says what the state belongs to: versions, hashes of map, vehicle and settings, length and SHA-256 of
 what follows, the state itself. It is read back only if all of these are the same, and holds plain values, arrays and
-data classes of this package alone: other classes are refused while reading.
+data classes of this package alone (`railfix.live.state_values`): nothing in it is executed.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
-import pickle
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,25 +23,10 @@ from railfix.core.errors import OutputError
 from railfix.core.files import file_sha256, source_commit
 from railfix.core.settings import Settings
 from railfix.live.engine import EngineState
+from railfix.live.state_values import StateFormatError, decode, encode
 from railfix.live.stream import ReceiverState
 
-_FORM: Final = "railfix live state 3"
-#: Classes beside those of this package that a state consists of.
-_PLAIN: Final = {
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    ("numpy", "datetime64"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-    ("builtins", "set"),
-    ("builtins", "frozenset"),
-    ("builtins", "slice"),
-    ("collections", "Counter"),
-    ("collections", "deque"),
-    ("collections", "OrderedDict"),
-    ("types", "MappingProxyType"),
-}
+_FORM: Final = "railfix live state 4"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +63,7 @@ def belongs_to(
 
 def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
     """Write a state file whole, or leave the one before and raise OutputError."""
-    content = pickle.dumps(session, protocol=5)
+    content = encode(session)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     part = path.with_name(f".{path.name}.part")
     try:
@@ -122,8 +105,8 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     if len(content) != head.get("bytes") or hashlib.sha256(content).hexdigest() != head.get("sha256"):
         return _refuse(path, "is damaged or cut off")
     try:
-        session = _Plain(io.BytesIO(content)).load()
-    except (pickle.UnpicklingError, AttributeError, ImportError, TypeError, ValueError, EOFError) as error:
+        session = decode(content)
+    except StateFormatError as error:
         return _refuse(path, f"holds no state ({error})")
     if not isinstance(session, SavedSession):
         return _refuse(path, "holds no state of a session")
@@ -132,15 +115,3 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
 
 def _refuse(path: Path, why: str) -> Loaded:
     return Loaded(session=None, outcome=f"state file {path}: not used, because it {why}; positioning restarts")
-
-
-class _Plain(pickle.Unpickler):
-    """Reads values, arrays and classes of this package; nothing else is imported or called."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return a class of this package or one of `_PLAIN`."""
-        if (module.split(".")[0] == "railfix" and "." not in name) or (module, name) in _PLAIN:
-            found = super().find_class(module, name)
-            if isinstance(found, type) or (module, name) in _PLAIN:
-                return found
-        raise pickle.UnpicklingError(f"{module}.{name} is no part of a state")

@@ -71,6 +71,7 @@ def along_track(
 ) -> tuple[AlongTrack, FilterState]:
     """Return the filtered positions of one antenna after all screens and exclusions, and the state to pass on.
 
+    The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
     Samples are those of the sensors on board since the chunk before; they meet features of the line, ground units and
     balises of `references`.
     """
@@ -187,7 +188,9 @@ def _run_filter(
     references: LineReferences | None,
     alone: tuple[Floats, Floats],
 ) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
-    """Return the places of the filter, motion by the sensors, and the state to pass on.
+    """Return the places of the filter, motion by the sensors, what the smoother starts from, and the state to pass on.
+
+    `alone`: arc lengths by single epochs and their standard deviations, shape (T,) each [m].
 
     With sensors the epochs are taken in stretches of `_BLOCK_NS` of GPS time, however the log is cut: the place by
     the wheel, for the gradient there, begins each from the place of the filter.
@@ -314,6 +317,9 @@ def gnss_epochs(
     slips: Slips | None = None,
 ) -> tuple[GnssEpochs, CycleSlipState | None]:
     """Return the measurements of the filter, and the state of the slip detection.
+
+    A code is the corrected pseudorange, NaN where there is a reason against it that the filter does not weigh itself;
+    its standard deviation is that of the range times `noise_scale`, shape (T,).
 
     The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in
     the Dopplers; the change of the carrier phase has both taken off.

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending, file_sha256, open_stream, read_bytes
+from railfix.core.files import FilePath, ending, file_sha256, read_bytes
 from railfix.track.crs import choose_crs
 from railfix.track.landxml_file import finite_number, read_landxml_segments
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
@@ -192,8 +192,7 @@ def _parse(path: str, _: str) -> Graph:
         from rdflib import Graph
     except ImportError:
         raise InputFileError(path, f"reading RDF needs rdflib; {INSTALL}") from None
-    with open_stream(path, content="bytes") as stream:
-        data = stream.read()
+    data = read_bytes(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of rdflib's own classes

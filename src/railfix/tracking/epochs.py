@@ -36,12 +36,14 @@ class GnssEpochs:
     #: Satellites at transmission; shape (T, K, 3).
     sat_ecef_m: Floats
     sat_velocity_mps: Floats
-    #: Corrected pseudorange and its standard deviation, the receiver's noise scale included; shape (T, K).
+    #: Pseudorange with satellite clock, group delay and atmosphere applied, and its standard deviation, the receiver's
+    #: noise scale included; shape (T, K).
     code_m: Floats
     code_sigma_m: Floats
-    phase_m: Floats  #: Corrected carrier phase; shape (T, K).
+    phase_m: Floats  #: Carrier phase with satellite clock and troposphere applied; shape (T, K).
     phase_joined: Masks  #: Whether the phase continues that of the epoch before without a cycle slip; shape (T, K).
-    #: Range rate by the Doppler with the satellite clock and the troposphere's change taken off; shape (T, K).
+    #: Range rate by the Doppler, + where the range grows. The drift of the satellite's clock and the change of the
+    #: troposphere, some millimetres a second, may be left in it; shape (T, K).
     rate_mps: Floats
     cn0_dbhz: Floats  #: Shape (T, K).
     #: Epochs at which the train is known to be away from the line: places are forgotten, nothing is used; shape (T,).

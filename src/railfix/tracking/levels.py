@@ -236,11 +236,12 @@ def carried_levels(
     arc, speed, level, ground, noise, of_speed, separation, amount, status = values[number].T
     tau = _since(times[number], tracked.time)
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
-    since_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
+    # What the place may have gone wrong by since then: V tau + a tau^2 / 2.
+    growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
     known = np.isfinite(tracked.arc_m)
 
     def widened(bound_m: Floats, change_m: Floats) -> Floats:
-        total = bound_m + change_m + since_m
+        total = bound_m + change_m + growth_m
         return np.where(known, np.where(np.isfinite(total), total, np.inf), np.nan)
 
     both = known & np.isfinite(carried)

@@ -58,7 +58,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
         Local maxima of the likelihood with Student's t errors, the best first; empty with fewer than `REDUNDANT`
         codes beyond the unknowns.
     sigma_m : ndarray, shape (C,) [m]
-        Half of the stretch that is about as likely, at least `start_sigma_m`.
+        `start_sigma_m` for each.
     """
     channel = chunk.channel[epoch]
     has = channel["has"][:, CODE] != 0

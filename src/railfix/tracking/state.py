@@ -67,7 +67,8 @@ class Monitors:
 class Bank:
     """Sub-filters of the most probable hypothesis, each without one source: B Gaussians over the same unknowns."""
 
-    #: A satellite ("G05"), a constellation by the letter of its clock ("G"), or a sensor ("wheel").
+    #: A satellite ("G05"), a constellation by the letter of its clock ("G"), a sensor ("wheel"), or one of
+    #: `railfix.tracking.bank.OTHERS` ("doppler").
     without: tuple[str, ...]
     mean: Floats  #: Shape (B, N).
     covariance: Floats  #: Shape (B, N, N).

@@ -124,8 +124,9 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
     Parameters
     ----------
     covariance : ndarray, shape (Q, Q)
-        Of the quantities.
+        H P H' of the quantities before the measurements; the codes are the first ones.
     weight : ndarray, shape (M,)
+        First weights; those above 1 count as 1.
     """
     codes = rows.code.stop
     if codes < MISFIT_CODES:

@@ -5,14 +5,15 @@ With u the unit vector from receiver to satellite, e the tangent, c and h the ax
     code    P = range(s + z) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
     Doppler r = A + slope (v + w) - u.(c q_c + h q_h) / dt + d + noise
     phase   change L = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
-    wheel   W (1 + k) = s - s', radar alike;  force f = (v - v') / dt + g sin(gradient) + beta;  place = s
+    wheel   W (1 + k) = s - s' + q_a, radar alike;  force f = (v - v') / dt + g sin(gradient) + beta;  place = s
     balise  place = s - age v + age^2 a / 2;  range R = |unit - antenna(s - age v, m_c, m_h)|
 
 s' and v' are those of the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
 of its constellation's code clock, w the time-correlated error of Dopplers, z the slow error of the codes, m the map's
-error, q the error of the map's displacement over the epoch. The gradient g of the phase's change is one for both ends:
-the direction of the chord. With a gradient for each end the phases would measure absolute place from the bend of the
-line, more sharply than the line is known.
+error, q the error of the map's displacement over the epoch (along, right, up: q_a, q_c, q_h), A the satellite's part of
+the range rate, slope what the speed adds to it, W the distance by the wheel, k its scale-factor error, beta the offset
+of the accelerometer. The phase's change has one direction g for both ends, that of the chord. With a direction
+for each end the phases would measure absolute place from the bend of the line, more sharply than the line is known.
 """
 
 from __future__ import annotations
@@ -92,7 +93,8 @@ def linearise(
 ) -> None:
     """Write the equations of an epoch about the arc lengths `at`: now and at the epoch before [m].
 
-    `direction` is the sign of the last speed with one.
+    The innovations are those of the mean x: what x is away from `at` is added to first order. `direction` is the sign
+    of the last speed with one.
     """
     vertex, line = given.vertex, given.line[0]
     point, axes, before, unused = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
@@ -110,7 +112,11 @@ def linearise(
 
 @inner
 def _compute_sights(given: Given, t: int, point: Floats, axes: Floats) -> Floats:
-    """Return range [m], unit vector to the satellite and its components on the axes of each channel, shape (K, 7)."""
+    """Return range, unit vector to the satellite and its components on the axes of each channel.
+
+    Shape (K, 7): column 0 the range [m], 1 to 3 the unit vector (ECEF), 4 to 6 its components along the tangent, to the
+    right and up. Rows of channels without a measurement are not written.
+    """
     channels = given.channel.shape[1]
     seen = np.empty((channels, 7))
     for k in range(channels):
@@ -151,7 +157,10 @@ def _write_motion_quantities(first: int, equations: Equations) -> None:
 
 @inner
 def _write_codes(given: Given, t: int, rows: Rows, x: Floats, seen: Floats, moved: float, equations: Equations) -> None:
-    """Write the codes; `moved` is the mean's arc length less that of the point [m]."""
+    """Write the codes, each a row and a quantity of the same index.
+
+    `seen` is that of `_compute_sights`; `moved` is the mean's arc length less that of the point [m].
+    """
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
@@ -182,6 +191,7 @@ def _write_phases(
 ) -> None:
     """Write the changes of the phases.
 
+    `seen` is that of `_compute_sights`; `before` the point at the epoch before [m], shape (3,);
     `moved`: the mean's displacement less that of the points [m], and the direction of the chord between these.
     """
     displacement, cx, cy, cz = moved

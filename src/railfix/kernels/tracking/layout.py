@@ -116,15 +116,15 @@ CHANNEL: Final = record_of({
     "sat_ecef_m": (float, (3,)),  # at transmission [m]
     "sat_velocity_mps": (float, (3,)),  # [m/s]
     "before_ecef_m": (float, (3,)),  # at the epoch before [m]
-    "measured": (float, (3,)),  # code [m], change of the phase since the epoch before [m], range rate [m/s]
+    "measured": (float, (3,)),  # corrected code [m], change of the phase since the epoch before [m], range rate [m/s]
     "has": (np.int8, (3,)),  # 1 where `measured` is a number that may be used
-    "variance": (float, (3,)),  # of white errors, before the scales learnt from residuals; of codes over a second
-    "code_sigma_m": float,  # of the satellite's correlated code error [m]
+    "variance": (float, (3,)),  # of white errors before the learnt scales, of codes over a second [m2, m2, m2/s2]
+    "code_sigma_m": float,  # standard deviation of the correlated code error; the unknown is in units of it [m]
 })  # fmt: skip
 #: One sensor at one epoch.
 SENSOR: Final = record_of({
     "value": float,  # distance [m], force [m/s2], place [m] or range [m]; NaN without
-    "sigma": float,  # its standard deviation
+    "sigma": float,  # its standard deviation, in the same unit
     "age_s": float,  # how long before the epoch it was measured [s]; places, balises, ranges
     "unsigned": bool,  # a distance without a sign, which takes that of the speed
     "unit_ecef_m": (float, (3,)),  # ground unit of a range [m]
@@ -176,11 +176,11 @@ class Given(NamedTuple):
 class State(NamedTuple):
     """What the recursion reads and writes: H hypotheses and B sub-filters, Gaussians side by side."""
 
-    x: Floats  #: Means, hypotheses first; shape (H + B, N).
-    P: Floats  #: Covariances; shape (H + B, N, N).
+    x: Floats  #: Means, hypotheses first, units of `StateIndex`; shape (H + B, N).
+    P: Floats  #: Covariances, products of these units; shape (H + B, N, N).
     hypothesis: Records  #: `railfix.tracking.state.HYPOTHESIS`; shape (H,).
     monitors: Records  #: `railfix.tracking.state.Monitors`; shape (1,).
-    code_bias: Floats  #: Mean innovation of each satellite's codes over their sigma; shape (S,).
+    code_bias: Floats  #: Mean innovation of each satellite's codes over its standard deviation, no unit; shape (S,).
     offset_known: Masks  #: Clocks that have had an observation; shape (CLOCK_COUNT,).
     source: Records  #: `SOURCE`: satellites, clocks, sensors, others; shape (B,), 0 where levels are off.
 
@@ -197,8 +197,8 @@ class Trace(NamedTuple):
 
     prior: Floats  #: Covariances before the measurements; shape (H, N, N).
     row: Floats  #: Measurement matrix, 0 for what was not used; shape (H, M, N).
-    value: Floats  #: Innovations; shape (H, M).
-    variance: Floats  #: Over the weights; infinite for what was not used; shape (H, M).
+    value: Floats  #: Innovations, units of the measurements; shape (H, M).
+    variance: Floats  #: Their white variances over the weights; infinite for what was not used; shape (H, M).
     restarted: Masks  #: Unknowns that have restarted; shape (H, N).
     kept: Indices  #: Earlier index of each hypothesis after the epoch; shape (H,).
 
@@ -212,6 +212,7 @@ class Rows(NamedTuple):
     doppler: slice
     sensor: slice
     channel: Indices  #: Channel of each row, of a sensor its column; shape (M,).
-    variance: Floats  #: Of white errors; shape (M,).
+    #: Of white errors, the learnt scales included [m2, (m/s)2, squared units of the sensors]; shape (M,).
+    variance: Floats
     left_out: Masks  #: Codes of a satellite that is left out as faulty; shape (M,).
     code_s: float  #: Time that the codes stand for [s]; 0 where they are not used.

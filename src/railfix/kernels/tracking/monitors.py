@@ -38,7 +38,7 @@ from railfix.kernels.tracking.subfilters import find_others
 
 @inner
 def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
-    """Return the square of the velocity against that of the place over its variance; NaN without a velocity.
+    """Return the squared difference of the measured velocity from that along the line, over its variance; NaN without.
 
     Along the line and across it, at the best of three places that the place's standard deviation allows.
     """

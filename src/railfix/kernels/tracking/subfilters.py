@@ -188,7 +188,11 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
 
 @inner
 def _downdate(given: Given, t: int, rows: Rows, state: State, b: int, equations: Equations) -> Floats:
-    """Return the variances of the measurements for a sub-filter, infinite for those of its source, shape (M,)."""
+    """Return the variances of the measurements for a sub-filter, infinite for those of its source, shape (M,).
+
+    Nothing is taken out of the Gaussian: a measurement of infinite variance is not used. `equations` are those of the
+    leading hypothesis; their coefficients of the arc length tell which satellites are ahead.
+    """
     satellites, others, variance = len(state.code_bias), find_others(state), rows.variance.copy()
     if b < satellites + CLOCK_COUNT:
         for j in range(rows.code.start, rows.doppler.stop):

@@ -42,9 +42,10 @@ class Equations(NamedTuple):
 class Fit(NamedTuple):
     """What an epoch's measurements say of one Gaussian; shapes (M,), the last (2,)."""
 
-    weight: Floats  #: Of Student's t, 1 at an error of one standard deviation; no unit.
-    residual: Floats  #: Innovation less what the corrected quantities explain.
-    fitted: Floats  #: Variance of the corrected quantity.
+    #: Of Student's t, no unit; 1 at an error of one standard deviation, but less for a code that is late.
+    weight: Floats
+    residual: Floats  #: Innovation less what the corrected quantities explain, in its unit.
+    fitted: Floats  #: Variance of what they explain, in its unit squared.
     #: ``log det(I + R^-1 H P H')`` and ``q' (H P H')^-1 q`` of the corrected mean of the quantities.
     summary: Floats
 
@@ -194,7 +195,7 @@ def write_first_weights(
     degrees: tuple[float, float],
     weight: Floats,
 ) -> None:
-    """Write the weights of the innovations, each less the median of its kind, by their variance without the clock.
+    """Write the weights of the innovations, of GNSS less the median of their kind, by their variance without the clock.
 
     The clocks begin at every epoch nearly unknown: with their prior in it the variance of an innovation would hide
     every outlier.
@@ -297,7 +298,10 @@ def reweight(
     rounds: int,
     found: Fit,
 ) -> None:
-    """Fit and reweight in turn, a number of fits beginning with the weights of `found`."""
+    """Fit and reweight in turn, a number of fits beginning with the weights of `found`.
+
+    `found` keeps the weights of the last fit, and the residuals that it left.
+    """
     fit(rows, equations, covariance, variance, found)
     for _ in range(rounds - 1):
         write_weights(rows, variance, degrees, found)
