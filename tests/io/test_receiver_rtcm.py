@@ -123,18 +123,25 @@ def test_ephemeris_at_the_end_of_a_week(number: int, received_s: int, week: int,
 
 
 def test_satellites_without_a_date_are_named(tmp_path: Path) -> None:
-    """GPS and GLONASS carry no full date; Galileo does."""
+    """GLONASS carries no date; Galileo has the full week, GPS that modulo 1024, and they date a log."""
     chosen = {"number": 7, "toc_s": 5400, "toe_sow_s": 5400, "eccentricity": 2**23}
     gps = message(1019, 0, {**chosen, "week": WEEKS[1019], "sqrt_a": int(5153.7 * 2**19)})
     galileo = message(1046, 0, {**chosen, "week": WEEKS[1046], "sqrt_a": int(5440.6 * 2**19)})
     path = tmp_path / "caster.rtcm3"
     path.write_bytes(gps + galileo)
     navigation = railfix.read_navigation(path)
-    assert navigation.kepler.satellite.tolist() == ["E07"]
-    assert navigation.notes == (f"{path}: left out: the ephemerides of G07 carry no full date (--date gives one)",)
-    assert railfix.read_navigation(path, date="2023-08-17").kepler.satellite.tolist() == ["G07", "E07"]
-    path.write_bytes(gps)
-    with pytest.raises(InputFileError, match=r"the ephemerides of G07 carry no full date \(--date gives one\)"):
+    dated = railfix.read_navigation(path, date="2023-08-17")
+    for found in (navigation, dated):
+        assert found.kepler.satellite.tolist() == ["G07", "E07"]
+        assert not found.notes
+        assert ((found.kepler.toe - WEEK) / np.timedelta64(1, "s")).tolist() == [5400 * UNIT_S[k] for k in (1019, 1046)]
+    path.write_bytes(gps)  # the latest week of its number that is not to come
+    assert railfix.read_navigation(path).kepler.toe.tolist() == navigation.kepler.toe[:1].tolist()
+    place = {name: km * 2**11 for name, km in (("x", 15_000), ("y", 12_000), ("z", 17_000))}
+    path.write_bytes(
+        message(1020, 0, {"number": 5, "channel": 4, "p": 0, "hour": 4, "minute": 15, "tb_s": 18, **place})
+    )
+    with pytest.raises(InputFileError, match=r"the ephemerides of R05 carry no full date \(--date gives one\)"):
         railfix.read_navigation(path)
 
 
