@@ -83,6 +83,8 @@ def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(good: Desk, name:
     finally:
         for file in files:
             (good.folder / file).unlink()
+        # a command that should have failed leaves its results: they must not fail the next one
+        shutil.rmtree(good.folder / "out", ignore_errors=True)
     assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
     assert result.exit_code == code, result.output
     if code == 2:  # the usage and a box

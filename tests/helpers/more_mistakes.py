@@ -96,7 +96,6 @@ MORE: Final[dict[str, Mistake]] = {
     "end_before_start": (
         {}, _RUN + " --start 2024-03-05T03:10:10 --end 2024-03-05T03:10:05", 4, "give an earlier start",
     ),
-    "start_in_utc": ({}, _RUN + " --start 2024-03-05T03:10:00Z", 2, "GPS time has no time zone"),
     "start_yesterday": ({}, _RUN + " --start yesterday", 2, "is no GPS time such as 2026-05-12"),
     "chunk_of_nothing": ({}, _RUN + " --chunk 0", 4, "--chunk: Input should be greater than or equal to 1"),
     "preset_misspelt": ({}, _RUN + " --preset strikt", 4, "known are default, strict, p1"),

@@ -92,7 +92,8 @@ def test_size_and_keys_of_a_message() -> None:
     assert KEYS["authority_end_cm"] == 22
     assert KEYS["interference"] == 23
     assert [KEYS[name] for name in ("safe_front_cm", "safe_rear_cm", "unknown")] == [24, 25, 26]
-    assert len(KEYS) == 26
+    assert [KEYS[name] for name in ("session", "brake_order")] == [27, 28]
+    assert len(KEYS) == 28
 
 
 @pytest.mark.requirement("B8")

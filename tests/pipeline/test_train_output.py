@@ -112,7 +112,9 @@ def test_reflections_of_some_tenths_of_a_second_move_the_train_nowhere(tmp_path:
     both = train.join(true, on=["time_gpst", "antenna"], suffix="_true")
     assert len(both) == 1040
     assert (both["chainage_m"] - both["chainage_m_true"]).abs().max() < 3.0  # type: ignore[operator]
-    assert set(train["status"].unique()) == {"tracking", "coasting"}
+    # the first seconds of a run are doubtful until the antennas agree
+    later = train.filter(pl.col("time_gpst") >= pl.datetime(2024, 3, 5, 3, 11, 42, time_unit="ns"))
+    assert set(later["status"].unique()) == {"tracking", "coasting"}
 
 
 def test_smoothing_needs_the_filter(tmp_path: Path) -> None:

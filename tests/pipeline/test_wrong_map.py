@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline_cases import clean_trajectories, demo_observations
+from railfix.core.errors import NoPositionError
 from railfix.core.reasons import Status
 from railfix.integrity.protection import LevelStatus
 from railfix.io.rinex import read_navigation
@@ -141,13 +142,13 @@ def test_a_map_that_is_not_found_wrong_is_within_the_level(right: AntennaResult)
 
 @pytest.mark.requirement("C4")
 def test_a_run_on_a_map_without_the_geoid_says_so(tmp_path: Path) -> None:
-    """``railfix run`` with every height 37 m too low: a note with the size and the likely cause."""
+    """``railfix run`` with every height 37 m too low: an error with the size and the likely cause."""
     files = demo_files()
     track = read_track(files["track"])
     lower = track.ecef_m - 37.0 * (track.ecef_m / np.linalg.norm(track.ecef_m, axis=1, keepdims=True))
     write_track_csv(Track.from_ecef(lower, name="without geoid"), tmp_path / "low.csv")
     inputs = RunInputs(front=(files["front"],), nav=(files["nav"],), track=(tmp_path / "low.csv",))
-    summary = run_files(inputs, out=tmp_path / "results")
-    notes = [note for note in summary.notes if "the map" in note]
-    assert any("contradicts the positions" in note and "geoid" in note for note in notes), summary.notes
-    assert any("m in height cannot be detected" in note for note in notes), summary.notes
+    # no antenna has a position that is promised: the run ends with its cause, and nothing is written
+    with pytest.raises(NoPositionError, match=r"contradicts the positions.*geoid"):
+        run_files(inputs, out=tmp_path / "results")
+    assert not (tmp_path / "results" / "run.json").exists()

@@ -128,6 +128,8 @@ def find_satellites(
     correction = states.clock_m - states.group_delay_m
     if found.fast_m is not None:
         correction = correction + found.fast_m
+    # a signal whose group delay is not broadcast has a satellite, but no correction
+    reason = np.where((reason == 0) & ~np.isfinite(correction), int(Reason.NO_CORRECTION), reason)
     impossible = (reason == 0) & ~(is_orbit(states.position_ecef_m) & is_pseudorange(code + correction))
     return SatelliteRanges(found, correction, np.where(impossible, int(Reason.NO_EPHEMERIS), reason))
 

@@ -129,7 +129,8 @@ def run_files(
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
         verdict = judge_run(record)
         if not any(antenna.leading.positions for antenna in verdict.antennas):
-            raise NoPositionError(f"not one position is promised: {'; '.join(verdict.lines())}")
+            of_map = [note for note in notes if ": the map " in note]
+            raise NoPositionError(f"not one position is promised: {'; '.join([*verdict.lines(), *of_map])}")
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
