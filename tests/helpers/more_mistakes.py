@@ -33,10 +33,6 @@ def feet(match: re.Match[str]) -> str:
     return f"{match[1]}{float(match[2]) / 0.3048:.4f}{match[3]}"
 
 
-def _epochs_backwards(match: re.Match[str]) -> str:
-    return f"{match[1]}{19 - int(match[2]):02d}"
-
-
 _LOG: Final = "--front {desk}/front.obs --nav {desk}/brdc.nav"
 _RUN: Final = f"run {_LOG} --track {{desk}}/line.csv --out {{out}}"
 _TRACK: Final = f"run {_LOG} --track {{desk}}/s.csv --out {{out}}"
@@ -169,9 +165,6 @@ MORE: Final[dict[str, Mistake]] = {
         "its tracks are 'Track A'",
     ),
     # -- a log
-    "epochs_backwards": (
-        {"s.obs": Edit("front.obs", r"^(> 2024 03 05 03 10 )(\d\d)", _epochs_backwards)}, _OBS, 3, "is not later than",
-    ),
     "an_hour_off": (
         {"s.obs": Edit("front.obs", "^> 2024 03 05 03", "> 2024 03 05 04")}, _OBS, 7,
         "with time tags 1 h earlier its positions lie on the line",
