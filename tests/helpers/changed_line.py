@@ -30,13 +30,13 @@ FRONT_M = 30.0
 class ChangedLine(AttackedLine):
     """Line with more kinds of events."""
 
-    copies: list[dict[str, str | None]] = field(default_factory=list)
+    copies: list[Interlocking] = field(default_factory=list)
     vehicles: dict[str, list[Piece]] = field(default_factory=dict)
     parts: dict[int, int] = field(default_factory=dict)  #: Number of the rear part, by that of the divided train.
 
     def step(self) -> None:
         """Run a step of `attacked_line`, and one of the other events before it."""
-        self.copies = [*self.copies[-3:], to_documents(self.centre.state)]
+        self.copies = [*self.copies[-3:], self.centre.state]
         events: list[Callable[[], None]] = [
             self.haul, self.divide, self.join, self.enter_vehicle, self.clear_vehicle, self.move_points, self.order,
             self.correct,
@@ -193,7 +193,7 @@ class ChangedLine(AttackedLine):
 
     def restart_older(self) -> None:
         """Go on from a copy of the database of up to four steps ago; the field answers where its points lie."""
-        state = from_documents(self.rng.choice(self.copies))
+        state = from_documents(to_documents(self.rng.choice(self.copies)))
         if set(state.trains) != set(self.centre.state.trains):
             return  # trains were divided or joined since: that is assumed away with what was ordered
         bars, restrictions = self.centre.state.bars, self.centre.state.restrictions

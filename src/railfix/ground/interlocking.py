@@ -10,11 +10,11 @@ hand.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-
-import numpy as np
 
 from railfix.ground.layout import Layout, Piece, PointName, along, shares
 from railfix.ground.state import HEAD as HEAD
@@ -52,19 +52,19 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
     found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
     if not found:
         return {}
-    numbers = list(state.trains)
-    low, high = np.array([train.span_m for train in state.trains.values()]).T
-    free = np.array([number not in found for number in numbers])
-    for k in np.flatnonzero(~free):
-        number, first, last = numbers[k], low[k], high[k]
+    by_low = sorted((*train.span_m, number) for number, train in state.trains.items())
+    by_high = sorted((high, low) for low, high, _ in by_low)
+    free = [span for span in by_low if span[2] not in found]
+    for number in list(found):
         # those beside it, the nearest on either side, and those beside the nearest: on other tracks of its station
-        above, below = low >= last, high <= first
-        above[k] = below[k] = False
-        reach_high = np.max(high[above & (low == np.min(low, where=above, initial=np.inf))], initial=last)
-        reach_low = np.min(low[below & (high == np.max(high, where=below, initial=-np.inf))], initial=first)
-        beside = np.flatnonzero(free & (low <= reach_high) & (high >= reach_low))
-        free[beside] = False
-        found.update((numbers[k], f"train {number} is stopped beside it") for k in beside)
+        low, high = state.trains[number].span_m
+        if (k := bisect_left(by_low, (high,))) < len(by_low):
+            high = by_low[bisect_right(by_low, (by_low[k][0], math.inf)) - 1][1]
+        if k := bisect_right(by_high, (low, math.inf)):
+            low = by_high[bisect_left(by_high, (by_high[k - 1][0],))][1]
+        beside = [span for span in free if span[0] <= high and span[1] >= low]
+        found.update((span[2], f"train {number} is stopped beside it") for span in beside)
+        free = [span for span in free if span not in beside] if beside else free
     return found
 
 
