@@ -405,7 +405,7 @@ def test_no_sequence_with_changes_of_trains_leads_into_a_train_or_a_vehicle(seed
         ("length", 334, "authority into another train"),
         ("way", 305, "authority into another train"),
         ("roll-back", 75, "authority into another train"),
-        ("clock", 87, "impossible way believed"),
+        ("clock", 351, "impossible way believed"),
         ("place covered", 19855, "authority into another train"),
     ],
 )

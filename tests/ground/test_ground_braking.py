@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -198,6 +199,19 @@ def test_an_order_to_brake_counts_until_a_later_authority_ends_it() -> None:
     assert not train.receive(Authority(**{**values, "number": 7, "end_cm": 30_000}))
     assert train.receive(Authority(**{**values, "number": 8, "end_cm": 30_000}))
     assert train.brake_reason(0.0) is None
+
+
+def test_an_order_to_stop_gives_nothing_to_a_train_that_has_started_on_board() -> None:
+    """Its interval is corrected meanwhile: at its release it has the end of then, not one that came with an order."""
+    train = OnBoard(direction=1, end_m=100.0)
+    train.note_report(1, 0.0)
+    values: dict[str, Any] = {"train": 1, "report": 1, "direction": 1}
+    assert train.receive(Authority(**values, number=1, end_cm=100_000, stopped=True))
+    assert (train.end_m, train.brake_reason(0.0)) == (100.0, "ordered to stop")
+    assert train.receive(Authority(**values, number=2, end_cm=30_000, stopped=False))
+    assert train.end_m == 300.0
+    assert train.receive(Authority(**values, number=3, end_cm=50_000, stopped=True))
+    assert train.end_m == 300.0
 
 
 def replace_order(order: BrakeOrder, number: int) -> BrakeOrder:

@@ -165,6 +165,22 @@ def test_a_detection_from_before_the_last_command_counts_for_nothing() -> None:
     assert centre.state.trains[1].stop == "points of its route have lost their detection"
 
 
+def test_points_that_are_on_their_way_are_detected_nowhere() -> None:
+    """Commanded to track 2, wanted on track 1 before they have answered: commanded again once they are there."""
+    commands: list[tuple[Any, int]] = []
+    centre = Supervision(layout=LINE, state=at_start(LINE, [down_train(1, 2100.0, 1)]), routes="by hand")
+    centre.command = lambda point, track: commands.append((point, track))
+    assert centre.set_route(1) is None
+    centre.advance(0.0)
+    assert commands == [((0, 1), 2), ((1, -1), 2)]
+    assert {centre.state.points[point].detected for point, _ in commands} == {None}
+    points = {name: replace(point, wanted=1, commanded=False, locked={}) for name, point in centre.state.points.items()}
+    centre.state = replace(centre.state, points=points)
+    centre.command_points(centre.state)
+    assert len(commands) == 2
+    assert not centre.state.points[0, 1].lies
+
+
 def test_a_train_that_has_rolled_back_over_points_is_not_released(monkeypatch: pytest.MonkeyPatch) -> None:
     """From track 2 of B over the points, which are set for track 1: its authority would lead there."""
     train = replace(down_train(1, 2100.0, 1), stop="the train has rolled back", rear_m=2460.0)

@@ -52,7 +52,11 @@ class AttackedTrain:
 
     def receive(self, authority: Authority) -> None:
         if self.on_board.receive(authority) and not isinstance(authority, BrakeOrder):
-            self.held_m = self.on_board.end_m
+            self.note_held()
+
+    def note_held(self) -> None:
+        """Note the end of what the train may run by: nothing before the first authority of a start or of a release."""
+        self.held_m = self.on_board.end_m if self.on_board._granted else None
 
     @property
     def rear_m(self) -> float:
@@ -67,7 +71,7 @@ class AttackedTrain:
         self.on_board.note_report(self.sequence, now_s)
         self.on_board.note_position(place + self.on_board.direction * BOUND_M, abs(values["speed_cmps"]) / 100.0)
         if self.on_board.order is not None and values["standstill"]:
-            self.held_m = self.on_board.end_m  # a train that stands by order gives its authority up
+            self.note_held()  # a train that stands by order gives its authority up
         return TrainMessage(**values, **taken)
 
 

@@ -225,7 +225,7 @@ def due_commands(
         if point.lies:
             points[name] = replace(point, commanded=True)
         elif not under_interval(state, name, layout, nearby):
-            points[name] = replace(point, commanded=True)
+            points[name] = replace(point, commanded=True, detected=None)  # until the field answers
             given[name] = point.wanted
     return replace(state, points=points), given
 

@@ -148,12 +148,10 @@ class OnBoard:
         agrees = self.stops_at_m is not None and self.direction * self.stops_at_m <= end
         if not self._may_take(authority, agrees=agrees):
             return False
-        if self._begins():
-            self.end_m, self._granted = self.direction * end, True
-        elif not authority.shortens:
-            self.end_m = self.direction * max(end, held)
-        elif agrees:
-            self.end_m = self.direction * min(end, held)
+        if authority.shortens and (self._granted or authority.stopped):
+            self.end_m = self.direction * min(end, held) if agrees else self.end_m
+        elif not authority.stopped:  # an order to stop gives nothing
+            self.end_m, self._granted = self.direction * (end if self._begins() else max(end, held)), True
         self.number, self.stopped, self.authority = authority.number, authority.stopped, authority
         self.order = None
         if (sent_s := self._sent.get(authority.report)) is not None:

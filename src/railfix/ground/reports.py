@@ -61,6 +61,7 @@ class PlacedReport:
     layout: Layout
     limits: InterlockingLimits
     granted: int  #: Number of the last authorities.
+    skipped: tuple[int, int]  #: `Interlocking.skipped`.
     #: Time since the place before, at most [s]: negative where the report's clock is behind that of the one before,
     #: None where it is not known, as at the first report.
     elapsed_s: float | None
@@ -139,10 +140,10 @@ def moving_standstill(report: PlacedReport) -> str | None:
 
 def unknown_authority(report: PlacedReport) -> str | None:
     """Return the reason of an authority that the centre has not given, as far as its database knows."""
-    held = report.message.authority or 0
-    if held <= report.granted:
+    held, (last, first) = report.message.authority or 0, report.skipped
+    if held <= report.granted and not last < held < first:
         return None
-    return f"the train holds authority {held}, the centre's database ends at {report.granted}"
+    return f"the train holds authority {held}, the centre's database ends at {last if held < first else report.granted}"
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
@@ -305,6 +306,7 @@ def report_received(
         layout=layout,
         limits=limits or InterlockingLimits(),
         granted=state.granted,
+        skipped=state.skipped,
         elapsed_s=_elapsed_s(before, message, elapsed_s),
     )
     contradiction = compute_contradiction(report)

@@ -133,6 +133,8 @@ class Interlocking:
     points: Mapping[PointName, PointState]
     stopped: bool = False  #: True while no authority is extended and no route set: satellite positioning is suspended.
     granted: int = 0  #: Number of the last authorities that were sent.
+    #: Last number before this start by the database, and first of this start: those between are of a newer database.
+    skipped: tuple[int, int] = (0, 0)
     #: Sections (`Layout.sections`) that no authority reaches into, each with why: `railfix.ground.stops.BARS`.
     bars: frozenset[tuple[str, str]] = frozenset()
     restrictions: Mapping[str, Restriction] = field(default_factory=dict)  #: By name.

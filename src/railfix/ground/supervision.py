@@ -41,6 +41,8 @@ from railfix.io.train_message import TrainMessage
 ROUTE_AHEAD_M = 700.0
 #: A train is sent an authority at its report, at a stop, and otherwise this often [s].
 AUTHORITY_S = 1.0
+#: Numbers of authorities that are skipped at a start: more than an older copy of the database can be behind.
+SKIPPED: Final = 1 << 32
 #: Largest drift between clocks of a train and of the centre.
 CLOCK_DRIFT: Final = 1e-4
 
@@ -81,13 +83,14 @@ class Supervision:
         before = self.records.get(number, TrainRecord(train=number))
         self.records[number], reason = record_received(before, message, now_s, limits=self.centre)
         if counts(reason):
+            if self.state.skipped[1] <= max(message.authority or 0, message.brake_order or 0) <= self.state.granted:
+                self.awaited.discard(number)
             elapsed_s, clock = self._read_clock(message, before, now_s)
             self.state = report_received(self.state, message, self.layout, limits=self.limits, elapsed_s=elapsed_s)
             if self.state.trains[number].contradiction is None:
                 self._clocks[number] = clock  # that of a contradicted report would make ways possible later
             self.state = answer_received(self.state, message)
             self.heard.add(number)
-            self.awaited.discard(number)
         if reason not in (Rejection.REPEATED, Rejection.EARLIER_START, Rejection.FAR_AHEAD):
             self._take_answer(message)
         return reason
@@ -134,12 +137,14 @@ class Supervision:
     def begin_again(self, now_s: float) -> tuple[PointName, ...]:
         """Begin with a stored state, which may be an older copy; return the points that the field has to be asked of.
 
-        Nothing is granted until every train has been heard: what it holds more than is known comes with its report.
-        What points were detected at is forgotten.
+        Nothing is granted until every train has been heard, by a report that names an order of this start: what it
+        holds more than is known comes with it, and it takes no late authority of the centre before any more. What
+        points were detected at is forgotten.
         """
-        self.awaited = set(self.state.trains)
+        self.awaited, last = set(self.state.trains), self.state.granted
         points = {name: replace(p, detected=None, commanded=False) for name, p in self.state.points.items()}
-        self.state, self._asked_s = replace(self.state, points=points), dict.fromkeys(points, now_s)
+        self.state = replace(self.state, points=points, granted=last + SKIPPED, skipped=(last, last + SKIPPED))
+        self._asked_s = dict.fromkeys(points, now_s)
         return tuple(points)
 
     def set_section_detected(self, section: str, occupied: bool | None) -> None:
