@@ -21,6 +21,7 @@ from railfix.io.positions import position_kind, read_positions
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
 from railfix.run.checks import RECORD_REACH, Span, navigation_span, spans_apart
+from railfix.track.quality import check_track, error_note
 from railfix.track.read import read_track
 from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
@@ -228,6 +229,7 @@ def _track(path: Path) -> FileFinding:
             f"{path}: does not say above what its heights are; give --height-datum ellipsoidal, as in the command, "
             "or orthometric with --geoid",
         )
+    problems += tuple(f"{path}: {note}" for note in error_note(check_track(track)))
     length = float(track.chainage_m[-1] - track.chainage_m[0])
     low, high = float(np.min(track.height_m)), float(np.max(track.height_m))
     facts = (
@@ -243,13 +245,14 @@ def _track(path: Path) -> FileFinding:
 
 
 def _positions(path: Path) -> FileFinding:
-    log = read_positions(path, broken_lines="count", heights="optional")
+    log = read_positions(path, broken_lines="count", heights="optional", antennas="several")
     known = log.time[~np.isnat(log.time)]
     if not len(known):
         raise InputFileError(path, "its positions have no time")
     span = (known.min(), known.max())
     place = np.nanmedian(log.ecef_m, axis=0)
-    facts = (f"{len(log.time):,} positions", *_place_facts(place), *(f"note: {n}" for n in log.notes[:_MOST_NOTES]))
+    of = f" of {' and '.join(log.antennas)}" if log.antennas else ""
+    facts = (f"{len(log.time):,} positions{of}", *_place_facts(place), *(f"note: {n}" for n in log.notes[:_MOST_NOTES]))
     return FileFinding(path=path, kind="positions", facts=facts, span=span, place_ecef_m=place)
 
 
