@@ -161,7 +161,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             raise InputFileError(path, "is empty")
         if content == "text" and head.startswith(_UTF16):
             source = _as_utf8(path, source, held)
-        elif content == "text" and b"\0" in head:
+        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # at the end a power cut leaves them
             raise InputFileError(path, "is binary, a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)

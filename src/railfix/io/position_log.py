@@ -64,6 +64,8 @@ class PositionLog:
         return bool((self.quality >= 0).any())
 
 
+#: Broken lines of a log after which it is none.
+_MOST_BROKEN: Final = 200
 Parsed = TypeVar("Parsed")
 
 
@@ -88,6 +90,8 @@ def skip_broken(
                 raise
             if broken_lines == "stop" and error.line != cut:
                 raise InputFileError(path, f"{error.message}; {LENIENT}", line=error.line) from None
+            if len(notes) == _MOST_BROKEN:
+                raise InputFileError(path, f"over {_MOST_BROKEN} lines are broken; the last one: {error}") from None
             notes.append(f"{error}; the line was skipped")
             lines[error.line - 1] = ""
 
@@ -206,6 +210,8 @@ def positions_times(table: NamedColumns) -> Datetimes:
 def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
     """Parse a column of dates with times: ISO 8601, or the same with slashes; UTC may end in Z."""
     cells = [cell.replace("/", "-") for cell in table.cells[name].to_list()]
+    if table.separator != ",":
+        cells = [cell.replace(",", ".") for cell in cells]
     if name == "time_utc":
         cells = [cell.removesuffix("Z").removesuffix("+00:00").strip() for cell in cells]
     for row, cell in enumerate(cells):

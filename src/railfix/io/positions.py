@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
@@ -110,6 +111,13 @@ _GPX: Final = re.compile(rb"<(?:\w+:)?gpx[\s>]")
 _RTKLIB: Final = re.compile(rb"^%.*(?:latitude|ecef|baseline|program|GPST|UTC|JST)", re.MULTILINE)
 
 
+def header_line(head: bytes) -> str:
+    """Return the first line of the beginning of a text that is neither blank nor a comment; "" without any."""
+    coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    lines = head.decode(coding, "replace").splitlines()
+    return next((line for line in lines if line.strip() and not line.startswith("#")), "")
+
+
 def position_kind(path: FilePath) -> str:
     """Return the kind of a log of positions by its content: csv, rtklib, nmea, gpx, novatel, receiver; "" of none."""
     head = read_head(path)
@@ -118,8 +126,7 @@ def position_kind(path: FilePath) -> str:
     for kind, pattern in (("gpx", _GPX), ("nmea", _NMEA), ("novatel", _NOVATEL), ("rtklib", _RTKLIB)):
         if pattern.search(head):
             return kind
-    lines = (line for line in head.decode("utf-8", "replace").lstrip("\ufeff").splitlines() if line.strip())
-    first = next((line for line in lines if not line.startswith("#")), "")
+    first = header_line(head)
     is_table = any(mark in first for mark in ",;\t|") and any(letter.isalpha() for letter in first)
     if ending(path) == ".csv" or (is_table and not first.lstrip().startswith(("{", "<", "["))):
         return "csv"
