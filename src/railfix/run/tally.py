@@ -14,6 +14,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES
+from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antennas import AntennaOrder
 from railfix.pipeline.balises import balise_notes
@@ -98,7 +99,7 @@ class AntennaTally:
 
     first: np.datetime64 | None = None
     last: np.datetime64 | None = None
-    conventional: int = 0  #: Epochs with a conventional position.
+    conventional: int = 0  #: Epochs with a valid conventional position.
     #: Least distance of a conventional position from the trajectory; NaN when there was none.
     conventional_nearest_m: float = float("nan")
     #: Epochs by status of the protection level; empty where levels are off.
@@ -134,10 +135,7 @@ class AntennaTally:
         self.status_positioned.update({s.text: int(positioned[s]) for s in Status if positioned[s]})
         self._add_reasons(result)
         self._add_short(result)
-        offset = result.conventional_offset_m
-        self.conventional += int(np.count_nonzero(np.isfinite(offset)))
-        if np.isfinite(offset).any():
-            self.conventional_nearest_m = float(np.fmin(self.conventional_nearest_m, np.nanmin(offset)))
+        self.add_conventional(result)
         self._add_map_offset(result)
         lasting = (result.reason & int(Reason.LASTING_ERROR)) != 0
         _count_left_out(self.lasting, lasting, result.satellite, result.time)
@@ -148,6 +146,13 @@ class AntennaTally:
             levels = np.bincount(result.protection.status, minlength=len(LevelStatus))
             self.level_status.update({s.name.lower(): int(levels[s]) for s in LevelStatus})
             self.without_budget += int(np.count_nonzero(result.protection.level.cause == Cause.BUDGET))
+
+    def add_conventional(self, result: AntennaResult) -> None:
+        """Count the valid conventional positions: ranges that contradict each other place an antenna anywhere."""
+        offset = result.conventional_offset_m[result.conventional_status == PointStatus.VALID]
+        self.conventional += len(offset)
+        if len(offset):
+            self.conventional_nearest_m = float(np.fmin(self.conventional_nearest_m, offset.min()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
         """Keep the window that contradicts the map most."""
