@@ -83,21 +83,21 @@ class _Tails(NamedTuple):
 class _Work(NamedTuple):
     """What one base of hypotheses needs: whether each channel belongs to it, and what is left without it.
 
-    `others` has priors of the rest (n,), `gone` what the base takes with it (4,), `own` work space (n,).
+    `others` has priors of the rest (n,), `removed` what the base takes with it (4,), `own` work space (n,).
     By depth, for sets of channels left out one after the other: the system `reduced` (2, n + 4, n), what has been
-    `taken` (3, 4), whether nothing bounds a fault (`blind`), the next channel (`start`), where its sets are written
-    (`place`), and the product of the priors; shape (3,).
+    `taken` (3, 4), whether nothing bounds a fault (`undetectable`), the next channel (`start`), where its sets are
+    written (`place`), and the product of the priors; shape (3,).
     """
 
     member: Masks
     single: Masks
     others: Floats
-    gone: Floats
+    removed: Floats
     own: Floats
     rows: Floats
     reduced: Floats
     taken: Floats
-    blind: Masks
+    undetectable: Masks
     start: Indices
     place: Indices
     product: Floats
@@ -139,24 +139,24 @@ def _separate(
 
 
 @inner
-def _leave_out(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, gone: Floats) -> bool:
+def _downdate(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, removed: Floats) -> bool:
     """Leave out channels one after the other; return whether nothing bounds a fault of them.
 
-    `gone` becomes what they take with them; `work` the rows of what is left, for all channels where `every` says so.
+    `removed` becomes what they take with them; `work` the rows of what is left, for all channels where `every` says so.
     """
-    n, blind = rows.shape[1], False
+    n, undetectable = rows.shape[1], False
     for i in range(n + 4):
         for k in range(n):
             work[i, k] = rows[i, k]
     for c in range(4):
-        gone[c] = 0.0
+        removed[c] = 0.0
     for k in range(n):
         if not member[k]:
             continue
         share = work[k, k]
         if share > LEAST_REDUNDANCY:
             for c in range(4):
-                gone[c] += work[n, k] * work[n + c, k] / share
+                removed[c] += work[n, k] * work[n + c, k] / share
             for i in range(n + 4):
                 if i != k and (every or i >= n or (i > k and member[i])):
                     ratio = work[i, k] / share
@@ -165,32 +165,32 @@ def _leave_out(rows: Floats, member: Masks, every: bool, limit: float, work: Flo
             for j in range(n):
                 work[k, j] = 0.0
         elif abs(work[n, k]) > limit:
-            blind = True
-    return blind
+            undetectable = True
+    return undetectable
 
 
 @inner
 def _with_each_later(
     rows: Floats,
     i: int,
-    gone: Floats,
-    blind: bool,
+    removed: Floats,
+    undetectable: bool,
     common: Floats,
     ranges: _RangeErrors,
     sets: _Sets,
 ) -> None:
     """Write the sets of channel i and one after it, left out together from the system `rows`.
 
-    `gone` and `blind` are of what has been left out of it before.
+    `removed` and `undetectable` are of what has been left out of it before.
     """
     n, own, limit = rows.shape[1], ranges.own, common[_LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
     share, of_first = rows[i, i], rows[n, i]
     inverse = 1.0 / share if share > LEAST_REDUNDANCY else 0.0
     weight = inverse * of_first
-    blind = blind or (inverse == 0.0 and abs(of_first) > limit)
-    square, distance = gone[0] + weight * of_first, gone[1] + weight * rows[n + 1, i]
-    across, up = gone[2] + weight * rows[n + 2, i], gone[3] + weight * rows[n + 3, i]
+    undetectable = undetectable or (inverse == 0.0 and abs(of_first) > limit)
+    square, distance = removed[0] + weight * of_first, removed[1] + weight * rows[n + 1, i]
+    across, up = removed[2] + weight * rows[n + 2, i], removed[3] + weight * rows[n + 3, i]
     residual, map_across, map_up = rows[n + 1, i], rows[n + 2, i], rows[n + 3, i]
     first, gains, residuals = rows[i, i + 1 :], rows[n, i + 1 :], rows[n + 1, i + 1 :]
     of_across, of_up = rows[n + 2, i + 1 :], rows[n + 3, i + 1 :]
@@ -212,7 +212,7 @@ def _with_each_later(
             (0.0, 0.0, 0.0),
             common,
         )
-    if not (ranges.any or blind or lost):
+    if not (ranges.any or undetectable or lost):
         return
     for at in range(n - 1 - i):
         j = i + 1 + at
@@ -231,7 +231,7 @@ def _with_each_later(
                 _of_ranges(own, ranges),
                 common,
             )
-        if blind or (not rest > LEAST_REDUNDANCY and abs(of_gain) > limit):
+        if undetectable or (not rest > LEAST_REDUNDANCY and abs(of_gain) > limit):
             offset[at], sigma[at], ratio[at] = 0.0, np.inf, 0.0
 
 
@@ -270,9 +270,9 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
             if asked.order[t, base] < 0:
                 continue
             mapped = asked.wrong_map[base]
-            system, blind = without_map if mapped else with_map, mapped and not determined
+            system, undetectable = without_map if mapped else with_map, mapped and not determined
             ranges = _RangeErrors(by_range, system.rows[n], side_by_side.bias, side_by_side.beyond, work.own)
-            _write_base(asked, (t, base), side_by_side, system, ranges, blind, work, tails)
+            _write_base(asked, (t, base), side_by_side, system, ranges, undetectable, work, tails)
         for m in range(width):
             if not tails.weight[t, m] > 0.0:
                 tails.offset[t, m], tails.sigma[t, m] = 0.0, 1.0
@@ -447,7 +447,7 @@ def _write_base(
     channels: _Channels,
     system: _System,
     ranges: _RangeErrors,
-    blind: bool,
+    undetectable: bool,
     work: _Work,
     tails: _Tails,
 ) -> None:
@@ -459,41 +459,49 @@ def _write_base(
         work.member[i] = channels.root[i] > 0.0 and asked.members[t, base, channels.number[i]]
         work.others[i] = 0.0 if work.member[i] else channels.prior[i]
         some |= work.member[i]
-    work.gone[:] = 0.0
+    work.removed[:] = 0.0
     if some:
-        blind |= _leave_out(rows, work.member, ranges.any or order > 0, system.common[_LIMIT], work.rows, work.gone)
+        undetectable |= _downdate(
+            rows, work.member, ranges.any or order > 0, system.common[_LIMIT], work.rows, work.removed
+        )
         rows = work.rows
     more = _of_ranges(rows[n], ranges) if ranges.any else (0.0, 0.0, 0.0)
-    _write_one(t, first[0], work.gone, more, blind, system.common, tails)
+    _write_one(t, first[0], work.removed, more, undetectable, system.common, tails)
     tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # noise passes on either side
     if order > 0:
-        _write_singles(t, first[1], _System(rows, system.common), ranges, blind, work, tails)
+        _write_singles(t, first[1], _System(rows, system.common), ranges, undetectable, work, tails)
         for i in range(n):
             tails.weight[t, first[1] + i] = prior * work.others[i]
     if order > 1:
-        work.start[0], work.product[0], work.blind[0] = 0, prior, blind
-        work.taken[0], work.place[:] = work.gone, first[2:5]
+        work.start[0], work.product[0], work.undetectable[0] = 0, prior, undetectable
+        work.taken[0], work.place[:] = work.removed, first[2:5]
         _write_together(t, order, _System(rows, system.common), ranges, work, tails)
 
 
 @inner
 def _write_one(
-    t: int, at: int, gone: Floats, more: tuple[float, float, float], blind: bool, common: Floats, tails: _Tails
+    t: int,
+    at: int,
+    removed: Floats,
+    more: tuple[float, float, float],
+    undetectable: bool,
+    common: Floats,
+    tails: _Tails,
 ) -> None:
     """Write a hypothesis by what it takes with it; without a bound where nothing shows it."""
     tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = _separate(
-        gone[0], gone[1], gone[2], gone[3], more, common
+        removed[0], removed[1], removed[2], removed[3], more, common
     )
-    if blind:
+    if undetectable:
         tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = 0.0, np.inf, 0.0
 
 
 @inner
 def _write_singles(
-    t: int, at: int, system: _System, ranges: _RangeErrors, blind: bool, work: _Work, tails: _Tails
+    t: int, at: int, system: _System, ranges: _RangeErrors, undetectable: bool, work: _Work, tails: _Tails
 ) -> None:
     """Write the hypotheses of each channel left out of the system, from `at` on."""
-    rows, n, limit, gone, whole = system.rows, len(work.own), system.common[_LIMIT], np.empty(4), (0.0, 0.0, 0.0)
+    rows, n, limit, removed, whole = system.rows, len(work.own), system.common[_LIMIT], np.empty(4), (0.0, 0.0, 0.0)
     if ranges.any:
         whole = _of_ranges(rows[n], ranges)
     for i in range(n):
@@ -504,8 +512,10 @@ def _write_singles(
                 work.own[m] = rows[n, m] - gain * rows[i, m]
             more = _of_ranges(work.own, ranges)
         for c in range(4):
-            gone[c] = work.gone[c] + gain * rows[n + c, i]
-        _write_one(t, at + i, gone, more, blind or (not checked and abs(rows[n, i]) > limit), system.common, tails)
+            removed[c] = work.removed[c] + gain * rows[n + c, i]
+        _write_one(
+            t, at + i, removed, more, undetectable or (not checked and abs(rows[n, i]) > limit), system.common, tails
+        )
 
 
 @inner
@@ -521,18 +531,18 @@ def _write_together(t: int, order: int, system: _System, ranges: _RangeErrors, w
         rows = system.rows if depth == 0 else work.reduced[depth - 1]
         begin, end = work.place[depth], work.place[depth] + n - 1 - i
         sets = _Sets(tails.offset[t, begin:end], tails.sigma[t, begin:end], tails.ratio[begin:end])
-        _with_each_later(rows, i, work.taken[depth], work.blind[depth], system.common, ranges, sets)
+        _with_each_later(rows, i, work.taken[depth], work.undetectable[depth], system.common, ranges, sets)
         with_first = work.product[depth] * work.others[i]
         for j in range(i + 1, n):
             tails.weight[t, begin + j - i - 1] = with_first * work.others[j]
         work.place[depth] = end
         if order > depth + 2:
             work.single[i] = True
-            blind = _leave_out(rows, work.single, True, limit, work.reduced[depth], work.taken[depth + 1])
+            undetectable = _downdate(rows, work.single, True, limit, work.reduced[depth], work.taken[depth + 1])
             work.single[i] = False
             work.taken[depth + 1] += work.taken[depth]
             work.start[depth + 1], work.product[depth + 1] = i + 1, with_first
-            work.blind[depth + 1] = blind or work.blind[depth]
+            work.undetectable[depth + 1] = undetectable or work.undetectable[depth]
             depth += 1
 
 
