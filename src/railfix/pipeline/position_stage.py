@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, expit
+import scipy
 
 from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
@@ -340,14 +340,14 @@ def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, 
         line, vertex = index.trajectory, section.other_vertex[rows]
         other = position_on_line(ranges.take(rows), line, vertex, limits=config.constrained)
         apart = line.at_arc(other.arc_m) - line.at_arc(arc[rows])
-        square[rows] = np.nan_to_num((apart**2).sum(axis=1)) * expit(-section.excess[rows] / 2.0)
+        square[rows] = np.nan_to_num((apart**2).sum(axis=1)) * scipy.special.expit(-section.excess[rows] / 2.0)
     return square
 
 
 @lru_cache
 def _chi_square_limit(risk: float, freedom: int) -> float:
     """Return the chi-square value that noise exceeds with a probability of `risk`."""
-    return float(chdtri(freedom, risk))
+    return float(scipy.special.chdtri(freedom, risk))
 
 
 def _off_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Masks:
