@@ -105,6 +105,8 @@ def _examine(path: Path) -> FileFinding:
             return _READERS[kind](path)
         except RailfixError as error:
             errors.append(str(error))
+            if "--date" in str(error):  # the kind is known, the date is not
+                return FileFinding(path=path, kind=kind, facts=(), problems=(errors[-1],))
     if len(kinds) == 1:
         return FileFinding(path=path, kind=kinds[0], facts=(), problems=(errors[0],))
     return FileFinding(path=path, kind="unknown", facts=tuple(errors))
