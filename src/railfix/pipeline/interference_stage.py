@@ -31,7 +31,7 @@ from railfix.integrity.interference import (
 )
 from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.range_arrays import ClockTies
+from railfix.positioning.range_arrays import InterSystemBiases
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Reasons given because ranges contradict others: those of a spoofer do.
@@ -101,7 +101,7 @@ class PositionEpochs(NamedTuple):
     point_ecef_m: Floats
     consistent_ecef_m: Floats
     noise_scale: Floats  #: Shape (T,).
-    ties: ClockTies  #: Inter-system biases known before each epoch.
+    ties: InterSystemBiases  #: Inter-system biases known before each epoch.
     status: Codes  #: `Status`, before causes are known; shape (T,).
 
 

@@ -29,7 +29,7 @@ from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.normal_equations import Constrained, SinglePoint
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory
 
@@ -313,7 +313,7 @@ def tie_clocks(
     *,
     parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
-) -> tuple[ClockTies, list[OffsetState]]:
+) -> tuple[InterSystemBiases, list[OffsetState]]:
     """Return the offsets known at each epoch from the epochs before it, and the new states of the receivers.
 
     `ranges`: without ties, those that agree with each other alone, with the letter of each of its groups in `clocks`;
@@ -350,4 +350,4 @@ def tie_clocks(
     offset[:, others] = np.where(has, of_moment / safe, 0.0)
     spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
     sigma[:, others] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
-    return ClockTies(offset_m=offset, sigma_m=sigma), after
+    return InterSystemBiases(offset_m=offset, sigma_m=sigma), after
