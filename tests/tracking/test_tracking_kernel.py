@@ -190,6 +190,34 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
     assert evidence[0] - evidence[1] == pytest.approx(density[0] - density[1], abs=1e-4)
 
 
+@pytest.mark.requirement("E5", "C2")
+def test_an_innovation_falls_by_what_its_row_gives_to_a_change_of_the_mean() -> None:
+    """All measurements, the error of a length of the map among the unknowns: a map aside turns into it in a bend."""
+    epochs, line, sensors = _case("sensors")
+    before, cut, limits = slice(0, 55), slice(55, 56), TrackingLimits()
+    _, state = track(part(epochs, before), line, sensors=_sensors_of(sensors, before))
+    own = _sensors_of(sensors, cut)
+    assert own is not None
+    chunk = prepare_chunk(part(epochs, cut), state, limits)
+    given = Recursion(chunk, line, own, limits, state, levels=False).given
+    packed = pack_state(state, chunk.time[0], limits, levels=False)
+    plain("tracking.recursion")._predict_all(given, 0, packed)
+    rows, module = plain("tracking.measurements").choose_measurements(given, 0, packed), plain("tracking.equations")
+    assert rows.sensor.stop > rows.sensor.start
+    x, step = packed.x[0], 0.01
+    at, found = (x[StateIndex.ARC], x[StateIndex.PREVIOUS_ARC]), module.new_equations(rows)
+    module.linearise(given, 0, rows, x, at, 1.0, found)
+    design = _design(rows, found, len(x))
+    for unknown in range(len(x)):
+        moved, other, shifted = x.copy(), module.new_equations(rows), module.new_equations(rows)
+        moved[unknown] += step
+        module.linearise(given, 0, rows, moved, at, 1.0, other)
+        change = -step * design[:, unknown]
+        np.testing.assert_allclose(other.value - found.value, change, rtol=1e-4, atol=2e-8, err_msg=str(unknown))
+        module.shift_sensors(rows, moved, x, found, shifted)
+        np.testing.assert_allclose((shifted.value - found.value)[rows.sensor], change[rows.sensor], atol=1e-12)
+
+
 def _ranged(case: Ride, *, kept: float) -> SensorEpochs:
     """Ranges to two units beside the line, a share of them there."""
     random, size = np.random.default_rng(4), len(case.epochs)

@@ -25,8 +25,8 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, CLOCKS, OFFSETS, SATELLITES, StateIndex, TrackState
 
-#: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between, and codes
-#: count with the error that a place between two points makes [m].
+#: The line is searched at points this far apart at most; a Gaussian of `start_sigma_m` covers what lies between, and
+#: codes count with the error that a place between two points makes [m].
 _SPACING_M: Final = 15.0
 #: Codes beyond place and clocks that places are sought with: with one alone a wrong place fits as well.
 REDUNDANT: Final = 2
@@ -66,8 +66,9 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
         return np.empty(0), np.empty(0)
-    keep = _thin(line)
-    arc, points = line.arc_m[keep], line.ecef_m[keep]
+    # between the vertices too: a map with few of them would be searched with gaps
+    arc = np.linspace(line.arc_m[0], line.arc_m[-1], 1 + int(np.ceil((line.arc_m[-1] - line.arc_m[0]) / _SPACING_M)))
+    points, _ = line.at(arc)
     likelihood = np.zeros(len(arc))
     tails = limits.tails
     for group in groups:
@@ -92,12 +93,6 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
             break
     sigma = np.full(len(chosen), limits.start_sigma_m)
     return arc[chosen], sigma
-
-
-def _thin(line: Line) -> Indices:
-    """Return the vertices about `_SPACING_M` apart."""
-    marks = np.arange(line.arc_m[0], line.arc_m[-1] + _SPACING_M, _SPACING_M)
-    return np.unique(np.minimum(np.searchsorted(line.arc_m, marks), len(line.arc_m) - 1))
 
 
 def begin(
