@@ -17,6 +17,8 @@ from railfix.kernels.tracking.constants import (
     FORCE_WALK_MPS2,
     FREEDOM_PLACE_M2,
     FREEDOM_SPEED_M2PS2,
+    OFFSET_WALK_M,
+    PASSES,
     RADAR_WALK,
     WHEEL_WALK,
 )
@@ -185,7 +187,7 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
         np.testing.assert_allclose(one.fit.residual, value - design @ gain @ value, atol=1e-5)
         np.testing.assert_allclose(one.fit.fitted, np.diagonal(design @ after @ design.T), rtol=1e-4)
         density.append(-0.5 * (value @ np.linalg.solve(innovation, value) + np.linalg.slogdet(innovation)[1]))
-        evidence.append(sum(recursion.compute_evidence(rows, (1e9, 1e9), limits.passes, one)))
+        evidence.append(sum(recursion.compute_evidence(rows, (1e9, 1e9), PASSES, one)))
     assert abs(density[0] - density[1]) > 0.3
     assert evidence[0] - evidence[1] == pytest.approx(density[0] - density[1], abs=1e-4)
 
@@ -371,13 +373,13 @@ def test_the_median_is_that_of_numpy(size: int) -> None:
 @pytest.mark.requirement("E5")
 def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
     """Clocks without a satellite and sensors that are not on board: their variances grow as those in use would."""
-    case, limits = ride(60), TrackingLimits()
+    case = ride(60)
     _, before = track(part(case.epochs, slice(0, 30)), case.line)
     _, after = track(part(case.epochs, slice(30, 60)), case.line, before)
     growth = np.diagonal(after.covariance[0] - before.covariance[0])
     walks = {
         StateIndex.WHEEL: WHEEL_WALK, StateIndex.RADAR: RADAR_WALK, StateIndex.FORCE_OFFSET: FORCE_WALK_MPS2,
-    } | {OFFSETS + CLOCKS.index(letter): limits.offset_walk_m for letter in "CRI"}  # fmt: skip
+    } | {OFFSETS + CLOCKS.index(letter): OFFSET_WALK_M for letter in "CRI"}  # fmt: skip
     for unknown, walk in walks.items():
         assert growth[unknown] == pytest.approx(30.0 * walk**2, rel=1e-6)
 

@@ -54,9 +54,9 @@ def before_measurements(
 
 
 @kernel
-def transition_matrix(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Floats:
+def transition_matrix(speed: float, epoch: Record, unknowns: int) -> Floats:
     """Return F as a matrix, shape (N, N)."""
-    F, matrix = compute_transition(speed, epoch, parameters, unknowns), np.zeros((unknowns, unknowns))
+    F, matrix = compute_transition(speed, epoch, unknowns), np.zeros((unknowns, unknowns))
     for i in range(unknowns):
         for k in range(3):
             matrix[i, F.unknown[i, k]] += F.coefficient[i, k]

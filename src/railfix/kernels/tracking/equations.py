@@ -26,7 +26,7 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import GRAVITY_MPS2, SPEED_OF_LIGHT
 from railfix.kernels.compiling import inner
 from railfix.kernels.sight import TURN, sight
-from railfix.kernels.tracking.constants import CHORD_M, DIRECTION_MPS
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     ARC,
@@ -129,7 +129,7 @@ def _compute_chord(point: Floats, before: Floats, axes: Floats, at: tuple[float,
     """Return the direction of the displacement since the epoch before; that of the tangent near rest."""
     cx, cy, cz = point[0] - before[0], point[1] - before[1], point[2] - before[2]
     length = math.sqrt(cx * cx + cy * cy + cz * cz)
-    if length > CHORD_M:
+    if length > constants.CHORD_M:
         sign = (1.0 if at[0] >= at[1] else -1.0) / length
         return sign * cx, sign * cy, sign * cz
     return axes[0, 0], axes[0, 1], axes[0, 2]
@@ -233,7 +233,7 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, direction: float
         measured, age = sensor.value, sensor.age_s
         if column in (WHEEL_COLUMN, RADAR_COLUMN):
             if sensor.unsigned:
-                measured *= math.copysign(1.0, x[SPEED]) if abs(x[SPEED]) > DIRECTION_MPS else direction
+                measured *= math.copysign(1.0, x[SPEED]) if abs(x[SPEED]) > constants.DIRECTION_MPS else direction
             unknown[:3], coefficient[:3] = DISTANCE, (1.0, -1.0, 1.0)
             unknown[3], coefficient[3] = WHEEL if column == WHEEL_COLUMN else RADAR, -measured
             value[j] = measured * (1.0 + x[unknown[3]]) - (x[ARC] - x[PREVIOUS_ARC] + x[MAP_LENGTH_ERROR])

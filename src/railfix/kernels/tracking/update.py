@@ -24,7 +24,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import LEAST_PIVOT
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import CLOCK_TERM, M_CLOCK, M_DRIFT, MOTION, TERMS, Rows
 
 
@@ -151,7 +151,7 @@ def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats,
     for a in range(MOTION):
         diagonal[a] = T[a, a]
     for a in range(MOTION):
-        if T[a, a] <= LEAST_PIVOT * diagonal[a]:
+        if T[a, a] <= constants.LEAST_PIVOT * diagonal[a]:
             z[a], T[a] = 0.0, 0.0
             continue
         scale = 1.0 / math.sqrt(T[a, a])
