@@ -30,6 +30,7 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     ARC,
+    CLOCK_TERM,
     CODE,
     CODE_CLOCK,
     DOPPLER,
@@ -158,13 +159,19 @@ def _write_codes(given: Given, t: int, rows: Rows, x: Floats, seen: Floats, move
 
     `seen` is that of `_compute_sights`; `moved` is the mean's arc length less that of the point [m].
     """
+    unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
         along, right, up, sigma = -seen[k, 4], -seen[k, 5], -seen[k, 6], channel.code_sigma_m
         offset, satellite = OFFSETS + channel.clock, SATELLITES + channel.satellite
-        equations.unknown[j] = ARC, SLOW_CODE, MAP_RIGHT, MAP_UP, offset, satellite, CODE_CLOCK
-        equations.coefficient[j] = along, along, right, up, 1.0, sigma, 1.0
+        unknown[j, 0], coefficient[j, 0] = ARC, along
+        unknown[j, 1], coefficient[j, 1] = SLOW_CODE, along
+        unknown[j, 2], coefficient[j, 2] = MAP_RIGHT, right
+        unknown[j, 3], coefficient[j, 3] = MAP_UP, up
+        unknown[j, 4], coefficient[j, 4] = offset, 1.0
+        unknown[j, 5], coefficient[j, 5] = satellite, sigma
+        unknown[j, CLOCK_TERM], coefficient[j, CLOCK_TERM] = CODE_CLOCK, 1.0
         predicted = along * (moved + x[SLOW_CODE]) + right * x[MAP_RIGHT] + up * x[MAP_UP]
         predicted += x[offset] + x[CODE_CLOCK] + sigma * x[satellite]
         equations.value[j] = channel.measured[CODE] - seen[k, 0] - predicted
@@ -194,14 +201,15 @@ def _write_phases(
     `motion` is that of `_write_motion_quantities`, `seen` that of `_compute_sights`, `before` the point at the epoch
     before [m], shape (3,), `chord` the direction from there.
     """
-    cx, cy, cz = chord
+    design, (cx, cy, cz) = equations.design, chord
     for j in range(rows.phase.start, rows.phase.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
         sat = channel.before_ecef_m
         distance = sight(sat[0], sat[1], sat[2], before[0], before[1], before[2])[0]
         gradient = -(seen[k, 1] * cx + seen[k, 2] * cy + seen[k, 3] * cz)
-        equations.design[j] = gradient, 1.0, -seen[k, 5], -seen[k, 6], 0.0, 0.0
+        design[j, M_DISTANCE], design[j, M_CLOCK] = gradient, 1.0
+        design[j, M_RIGHT], design[j, M_UP] = -seen[k, 5], -seen[k, 6]
         _write_motion_value(channel.measured[PHASE] - (seen[k, 0] - distance), j, motion, equations)
 
 
@@ -210,7 +218,7 @@ def _write_dopplers(
     given: Given, t: int, rows: Rows, motion: Floats, seen: Floats, point: Floats, axes: Floats, equations: Equations
 ) -> None:
     """Write the range rates by Doppler, with the turning of the earth and the signal's stretching."""
-    dt = given.epoch[t].interval_s
+    dt, design = given.epoch[t].interval_s, equations.design
     for j in range(rows.doppler.start, rows.doppler.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
@@ -219,7 +227,8 @@ def _write_dopplers(
         moving += TURN * (velocity[0] * point[1] - velocity[1] * point[0])
         stretch = 1.0 + moving / SPEED_OF_LIGHT
         slope = (-seen[k, 4] + TURN * (sat[0] * axes[0, 1] - sat[1] * axes[0, 0])) / stretch
-        equations.design[j] = 0.0, 0.0, -seen[k, 5] / dt, -seen[k, 6] / dt, slope, 1.0
+        design[j, M_RIGHT], design[j, M_UP] = -seen[k, 5] / dt, -seen[k, 6] / dt
+        design[j, M_SPEED], design[j, M_DRIFT] = slope, 1.0
         _write_motion_value(channel.measured[DOPPLER] - moving / stretch, j, motion, equations)
 
 

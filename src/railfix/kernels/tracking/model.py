@@ -54,7 +54,7 @@ from railfix.kernels.tracking.layout import (
     Rows,
 )
 from railfix.kernels.tracking.line import write_point
-from railfix.kernels.tracking.update import add_scaled
+from railfix.kernels.tracking.update import add_row
 
 #: Least variance of displacements and clocks that begin at an epoch [m2]: it keeps them from being exactly known.
 _LEAST_M2 = 1e-8
@@ -99,7 +99,7 @@ def _multiply(F: Transition, matrix: Floats, product: Floats) -> None:
         row[:] = 0.0
         for k in range(3):
             if F.coefficient[i, k] != 0.0:
-                add_scaled(row, F.coefficient[i, k], matrix[F.unknown[i, k]])
+                add_row(row, F.coefficient[i, k], matrix, F.unknown[i, k])
         for j in range(len(row)):
             product[j, i] = row[j]
 
