@@ -18,7 +18,7 @@ from railfix.tracking.line import Line
 from railfix.tracking.search import begin
 from railfix.tracking.state import CLOCKS, HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
 
-#: Least `map_branch_m` in standard deviations of the map across.
+#: Least `MAP_BRANCH_M` in standard deviations of the map across.
 _BRANCH_SIGMAS = 3.0
 
 

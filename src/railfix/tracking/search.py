@@ -17,7 +17,7 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, CLOCKS, OFFSETS, SATELLITES, StateIndex, TrackState
 
-#: The line is searched at points this far apart at most; a Gaussian of `start_sigma_m` covers what lies between, and
+#: The line is searched at points this far apart at most; a Gaussian of `START_SIGMA_M` covers what lies between, and
 #: codes count with the error that a place between two points makes [m].
 _SPACING_M: Final = 15.0
 #: Codes beyond place and clocks that places are sought with: with one alone a wrong place fits as well.
@@ -32,7 +32,7 @@ _ANY_DRIFT_MPS: Final = 1e3
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
-#: Places beside in `bend_m`, how many, standard deviation of their speed [m/s], and share of probability that they get.
+#: Places beside in `BEND_M`, how many, standard deviation of their speed [m/s], and share of probability that they get.
 _BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])
 _BESIDE: Final = len(_BESIDE_STEPS)
 _BEND_SPEED_MPS: Final = 10.0
@@ -50,7 +50,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
         Local maxima of the likelihood with Student's t errors, the best first; empty with fewer than `REDUNDANT`
         codes beyond the unknowns.
     sigma_m : ndarray, shape (C,) [m]
-        `start_sigma_m` for each.
+        `START_SIGMA_M` for each.
     """
     channel = chunk.channel[epoch]
     has = channel["has"][:, CODE] != 0

@@ -195,7 +195,8 @@ TAKEOVER_AFTER_S: Final = 15.0
 MOTION_SATELLITES: Final = 4
 #: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
 MOTION_M: Final = 3.0
-#: Places beside are tried once motion has been contradicted for so long [s]: shorter it is a reflection, at any rate.
+#: Places beside are tried, and beyond an open end the track is lost, once motion has been contradicted for so long [s]:
+#: shorter it is a reflection, at any rate.
 BESIDE_AFTER_S: Final = 0.9
 
 # Monitors of the place.
@@ -207,8 +208,6 @@ LEVEL_DOUBT_CODE_S: Final = 8.0
 #: track was lost.
 LEVEL_START_S: Final = 15.0
 LEVEL_HOLD_S: Final = 5.0  #: A level comes back so long after the last contradiction.
-#: Beyond an open end with motion in doubt for so long, the track is lost.
-END_DOUBT_S: Final = 0.9
 #: The velocity is compared with the line at the place and so many of its standard deviations, or metres, beside it.
 REACH_SIGMAS: Final = 2.0
 REACH_M: Final = 3.0

@@ -2,14 +2,14 @@ r"""Measurement equations of one epoch, linearised at one Gaussian: the rows of 
 
 With u the unit vector from receiver to satellite, e the tangent, c and h the axes to the right and up::
 
-    code    P = range(s + z) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
-    Doppler r = A + slope (v + w) - u.(c q_c + h q_h) / dt + d + noise
-    phase   change L = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
-    wheel   W (1 + k) = s - s' + q_a, radar alike;  force f = (v - v') / dt + g sin(gradient) + beta;  place = s
-    balise  place = s - age v + age^2 a / 2;  range R = |unit - antenna(s - age v, m_c, m_h)|
+    code    rho = range(s + n) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
+    Doppler rate = A + slope (v + w) - u.(c q_c + h q_h) / dt + f + noise
+    phase   change = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
+    wheel   W (1 + k) = s - s' + q_a, radar alike;  force F = (v - v') / dt + g sin(gradient) + beta;  place = s
+    balise  place = s - age v + age^2 a / 2;  range = |unit - antenna(s - age v, m_c, m_h)|
 
 s' and v' are those of the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
-of its constellation's code clock, w the time-correlated error of Dopplers, z the slow error of the codes, m the map's
+of its constellation's code clock, w the time-correlated error of Dopplers, n the slow error of the codes, m the map's
 error, q the error of the map's displacement over the epoch (along, right, up: q_a, q_c, q_h), A the satellite's part of
 the range rate, slope what the speed adds to it, W the distance by the wheel, k its scale-factor error, beta the offset
 of the accelerometer. The phase's change has one direction g for both ends, that of the chord. With a direction

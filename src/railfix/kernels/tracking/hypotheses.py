@@ -43,9 +43,9 @@ def reweigh(
     nor than one for `MOTION_M` of travel.
 
     Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
-    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, n being 1 and one more in
-    `code_common_s` or `code_common_travel_m`; between branches that are closer than `branch_floor_m` now never below
-    `branch_floor`, whatever was gained while they were apart.
+    ``n d^2 / (2 CODE_COMMON_M^2)``, what n independent epochs with such an error can say, n being 1 and one more in
+    `CODE_COMMON_S` or `CODE_COMMON_TRAVEL_M`; between branches that are closer than `BRANCH_FLOOR_M` now never below
+    `BRANCH_FLOOR`, whatever was gained while they were apart.
 
     Between laps within `ALIKE` times map_branch_m what codes say now is kept as `log_recent`, for `find_leading` alone.
 

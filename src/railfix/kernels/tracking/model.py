@@ -1,18 +1,18 @@
 r"""Process model: transition F and noise Q of all unknowns from one epoch to the next, for filter, bank and smoother.
 
-With dt the interval, v the speed and ``d = |v| dt`` the travel::
+With dt the interval, v the speed and ``D = |v| dt`` the travel::
 
-    s, v, a             Singer's model: the acceleration is correlated over `acceleration_s`
+    s, v, a             Singer's model: the acceleration is correlated over `TrackingLimits.acceleration_s`
     s', v'              arc length and speed before: copies
-    phase clock, drift  B = dt d', d = d' + walk
+    phase clock, drift  B = dt f', f = f' + walk
     code clock          new at every epoch
-    map right, up       Gauss-Markov over `map_absolute_m` of travel
-    map displacement    new at every epoch: right, up with `map_roughness_m` over `map_correlation_m`, along with
-                        `map_scale_m` a square root of a metre; the bend of the line where the place is uncertain
-    Doppler speed error Gauss-Markov over `doppler_correlation_s`
-    slow code           Gauss-Markov over `slow_code_s`
+    map right, up       Gauss-Markov over `MAP_ABSOLUTE_M` of travel
+    map displacement    new at every epoch: right, up with `MAP_ROUGHNESS_M` over `MAP_CORRELATION_M`, along with
+                        `MAP_SCALE_M` a square root of a metre; the bend of the line where the place is uncertain
+    Doppler speed error Gauss-Markov over `DOPPLER_CORRELATION_S`
+    slow code           Gauss-Markov over `SLOW_CODE_S`
     clock offsets, sensors' scales and offset    random walks
-    satellite's code error    Gauss-Markov over `code_correlation_s` and `code_correlation_m`, of variance 1
+    satellite's code error    Gauss-Markov over `CODE_CORRELATION_S` and `CODE_CORRELATION_M`, of variance 1
 
 The prediction's own standard deviation of the speed grows with every epoch without redundancy, so that reflections off
 one wall, which agree with each other, can give a wrong speed; `narrow_speed_range` follows what a train can do.

@@ -61,7 +61,7 @@ def update_monitors(state: State, square: float, shift: float, beyond_m: float, 
     if not math.isnan(square):
         gained = (min(square, constants.LARGEST_SQUARE) - constants.ALLOWED_SQUARE) * min(dt, 1.0)
         monitors.across = max(monitors.across + gained, 0.0)
-    if beyond_m > 0.0 and monitors.weak_motion_s >= constants.END_DOUBT_S:
+    if beyond_m > 0.0 and monitors.weak_motion_s >= constants.BESIDE_AFTER_S:
         monitors.across = constants.ACROSS_LOST
     if code_s > 0.0 and abs(shift) > constants.STEP_SIGMAS:
         monitors.step_s += code_s

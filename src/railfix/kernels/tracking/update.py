@@ -3,7 +3,7 @@ r"""Correction of Gaussians by the measurements of an epoch, one after the other
 A Gaussian x ~ N(x, P) sees an epoch through Q quantities ``q = H x``: each code, six of the motion that all phases and
 Dopplers share, each sensor. A code or a sensor measures its quantity, a phase or a Doppler a sum of the six::
 
-    code, sensor      v_j = q_j + e_j                phase, Doppler    v_j = design_j q_motion + e_j
+    code, sensor      y_j = q_j + e_j                phase, Doppler    y_j = design_j q_motion + e_j
 
 with e_j ~ N(0, r_j / w_j). The weights w of Student's t follow from the residuals and the weights in turn: rounds of
 reweighting. Three things keep that cheap without an inverse of any matrix:
@@ -36,7 +36,7 @@ class Equations(NamedTuple):
     coefficient: Floats
     #: Coefficients of phases and Dopplers over the six quantities of the motion; 0 for others; shape (M, MOTION).
     design: Floats
-    value: Floats  #: Innovations v [m, m/s, units of the sensors]; shape (M,).
+    value: Floats  #: Innovations y [m, m/s, units of the sensors]; shape (M,).
 
 
 class Fit(NamedTuple):
