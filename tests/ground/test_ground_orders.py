@@ -205,6 +205,67 @@ def test_after_a_start_nothing_is_commanded_under_a_train(desk: Desk) -> None:
     assert desk.state.trains[1].stop == "points of its route lie otherwise"
 
 
+def test_an_older_copy_moves_no_points_of_a_route_that_it_does_not_know(tmp_path: Path) -> None:
+    """Points that the copy knows locked on track 2 lie on track 1 for a later route: train 1 runs by it, unheard."""
+    made = Desk(tmp_path, train(1, 400.0, 0), train(3, 5200.0, 2, direction=-1, track=2))
+    made.steps(0.2)
+    assert made.orders["route"]({"train": 3}) is None
+    made.steps(0.4)
+    assert sorted(made.commands) == [((1, 1), 2), ((2, -1), 2)]
+    made.kill()
+    made.start()
+    made.commands.clear()
+    for name in LINE.points():
+        made.centre.supervision.set_detected(name, 1)
+    made.report(3, 4000.0, facing=-1, authority=900, authority_end_cm=400_000)
+    made.steps(5.0)
+    assert made.centre.supervision.awaited == {1}
+    assert made.commands == []
+    made.report(1, 1500.0, authority=900, authority_end_cm=420_000, speed_cmps=1000, direction=1, standstill=False)
+    made.steps(5.0)
+    assert made.state.trains[1].interval_m[1] == 4200.0
+    assert ((1, 1), 2) not in made.commands
+    made.store.close()
+
+
+def test_after_a_start_points_that_nothing_locks_are_wanted_as_they_lie(desk: Desk) -> None:
+    """A train on points that an older copy of the database wants otherwise can be released."""
+    desk.steps(0.2)
+    desk.kill()
+    desk.start()
+    for name in LINE.points():
+        desk.centre.supervision.set_detected(name, 2)
+    desk.report(1, 400.0)
+    desk.report(2, 2900.0)
+    desk.steps(1.0)
+    assert desk.commands == []
+    assert {point.wanted for point in desk.state.points.values()} == {2}
+
+
+def test_a_train_that_has_turned_holds_what_an_older_copy_does_not_know(desk: Desk) -> None:
+    """Train 1 has turned since the copy, and holds an authority; train 2's report makes its number a known one."""
+    desk.steps(0.2)
+    desk.kill()
+    desk.start()
+    desk.report(2, 2900.0, facing=-1, authority=900, authority_end_cm=120_000)
+    assert desk.state.granted == 900
+    assert "the train holds authority 900" in (desk.state.trains[2].stop or "")
+    assert min(desk.state.trains[2].interval_m) == 1200.0
+    desk.report(1, 205.0, facing=-1, authority=899, authority_end_cm=5_000)
+    assert desk.state.trains[1].stop == "the train holds an authority beyond its interval, to 50 m"
+    assert desk.state.trains[1].rear_m == 50.0
+    assert desk.state.trains[1].direction == 1
+
+
+def test_a_wrong_change_of_ends_frees_no_authority(desk: Desk) -> None:
+    """The report says that train 2 looks down in Mid, and names the authority to the end of its track that it holds."""
+    desk.steps(0.2)
+    end = desk.state.trains[2].end_m
+    desk.report(2, 2700.0, facing=-1, authority=desk.state.granted, authority_end_cm=round(100 * end))
+    assert desk.state.trains[2].direction == -1
+    assert desk.state.trains[2].rear_m == end == 3020.0
+
+
 def test_a_field_that_does_not_answer_stops_the_trains_on_its_points(desk: Desk) -> None:
     assert desk.orders["route"]({"train": 2}) is None
     desk.steps(0.2)
@@ -234,6 +295,7 @@ def test_nothing_is_granted_after_a_start_until_every_train_is_heard(desk: Desk)
     assert any("nothing is granted until heard" in alarm for alarm in desk.centre.alarms)
     desk.report(1, 1500.0, authority=900, authority_end_cm=245_000, speed_cmps=1000, direction=1, standstill=False)
     assert "the centre's database ends at" in (desk.state.trains[1].stop or "")
+    assert desk.state.trains[1].interval_m[1] == 2450.0  # what it may still run to is occupied
     assert desk.state.granted >= 900
     assert desk.centre.alarms == []
     desk.steps(0.2)

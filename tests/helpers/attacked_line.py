@@ -52,9 +52,7 @@ class AttackedTrain:
 
     def receive(self, authority: Authority) -> None:
         if self.on_board.receive(authority) and not isinstance(authority, BrakeOrder):
-            ends = [authority.end_cm / 100.0, *([] if self.held_m is None else [self.held_m])]
-            direction = self.on_board.direction
-            self.held_m = self.on_board.end_m if authority.shortens else max(ends, key=lambda end: end * direction)
+            self.held_m = self.on_board.end_m
 
     @property
     def rear_m(self) -> float:
@@ -107,13 +105,19 @@ class AttackedLine:
         self.points: dict[PointName, int] = dict.fromkeys(LINE.points(), 1)
         self.moving: dict[PointName, int] = {}
         self.centre = Supervision(
-            layout=LINE, state=at_start(LINE, supervised), command=self.moving.__setitem__,
+            layout=LINE, state=at_start(LINE, supervised), command=self.move,
             limits=InterlockingLimits(release_s=0.0),
         )  # fmt: skip
         self.mail: list[tuple[float, int, Callable[[], Any]]] = []
         self.posted = 0
         self.taken = {n: Taken(place_m=train.front_m, sent_s=None) for n, train in self.trains.items()}
         self.broken = False
+
+    def move(self, point: PointName, track: int) -> None:
+        """Take a command to points."""
+        self.moving[point] = track
+        if any(overlap([(0, *LINE.zone_m(point))], self.pieces(number)) for number in self.trains):
+            self.violations["points moved under a train"] += 1
 
     def post(self, deliver: Callable[[], Any], *, certain: bool = False) -> None:
         if not certain and self.rng.random() < 0.15:

@@ -15,7 +15,7 @@ from railfix.cli import app
 from railfix.simulate.demonstration import demo_files
 from railfix.tracking import GnssEpochs, SensorEpochs, Tracked, TrackingLimits, TrackState, TrackStatus, track
 from railfix.tracking import levels as levels_of
-from railfix.tracking.levels import AccumulatedIncrement, LevelState, carried_levels, thin_epochs, track_with_levels
+from railfix.tracking.levels import AccumulatedIncrement, LevelState, carried_levels, decimate_epochs, track_with_levels
 from tracking_cases import Ride, part, ride, wheel
 
 LIMITS = TrackingLimits()
@@ -104,7 +104,7 @@ def test_thinned_epochs_have_what_was_measured_between() -> None:
     sigma = np.full(40, 0.5)
     sensors = SensorEpochs(wheel_m=way, wheel_sigma_m=sigma, force_mps2=force, force_sigma_mps2=sigma)
     epochs = replace(case.epochs, phase_joined=joined, phase_m=phase)
-    taken, some, sensed, since = thin_epochs(epochs, sensors, AccumulatedIncrement(), 1.0)
+    taken, some, sensed, since = decimate_epochs(epochs, sensors, AccumulatedIncrement(), 1.0)
     np.testing.assert_array_equal(taken, [0, 5, 15, 25, 35])
     np.testing.assert_array_equal(some.time, case.epochs.time[taken])
     assert sensed.wheel_m is not None

@@ -72,10 +72,13 @@ def points_reported(state: Interlocking, point: PointName, detected: int | None,
     """Return the state after a detection of points.
 
     Where they lose it under a route, or the field answers after a start that they lie otherwise under an interval, the
-    trains that have them are stopped.
+    trains that have them are stopped. After a start, points that no train locks are wanted as they lie.
     """
     before = state.points[point]
-    state = replace(state, points={**state.points, point: replace(before, detected=detected)})
+    after = replace(before, detected=detected)
+    if detected is not None and not before.commanded and not before.locked:
+        after = replace(after, wanted=detected, commanded=True)
+    state = replace(state, points={**state.points, point: after})
     lost = before.lies and not state.points[point].lies
     answered = before.detected is None and detected is not None and not state.points[point].lies
     if lost:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from railfix.ground.layout import Layout
-from railfix.ground.state import Interlocking, InterlockingLimits, TrainInterval, with_train
+from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Difference of a reported length from the configured one that is rounding [m].
@@ -28,8 +28,6 @@ SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
 WIDEST_M: Final = 1000.0
 #: Instants of places are so uncertain for what an interval covers: as old as a place may be when it is sent [s].
 INSTANT_S: Final = 5.0
-#: Beginning of the reason where a train holds an authority beyond the end of its interval.
-HOLDS_MORE: Final = "the train holds an authority beyond its interval,"
 
 
 def is_placed(message: TrainMessage) -> bool:
@@ -98,6 +96,12 @@ class PlacedReport:
         return self.front_m + self.message.facing * self.under_m
 
     @property
+    def held_m(self) -> float | None:
+        """End of the authority that the train holds, at most that of the line; None where it names none [m]."""
+        end_cm, stations = self.message.authority_end_cm, self.layout.stations
+        return None if end_cm is None else min(max(end_cm / 100.0, stations[0].begin_m), stations[-1].end_m)
+
+    @property
     def turns(self) -> bool:
         """Whether the train looks the other way than before."""
         return self.message.facing != self.known.direction
@@ -156,11 +160,15 @@ def wrong_turn(report: PlacedReport) -> str | None:
 
 
 def holds_more(report: PlacedReport) -> str | None:
-    """Return the reason of an authority that reaches beyond the interval."""
-    end_cm = report.message.authority_end_cm
-    if report.turns or end_cm is None or report.known.direction * (end_cm / 100.0 - report.known.end_m) <= 0.02:
+    """Return the reason of an authority that reaches beyond the interval; after a change of ends beyond the place."""
+    held, facing = report.held_m, report.message.facing
+    if held is None:
         return None
-    return f"{HOLDS_MORE} to {end_cm / 100.0:.0f} m"
+    known_m, allowed_m = report.known.end_m, ROUNDING_M
+    if report.turns:
+        known_m, allowed_m = report.ahead_m, report.over_m + report.under_m
+    beyond = facing * (held - known_m) > allowed_m
+    return f"the train holds an authority beyond its interval, to {held:.0f} m" if beyond else None
 
 
 def too_fast(report: PlacedReport) -> str | None:
@@ -261,16 +269,15 @@ def _noted(report: PlacedReport) -> TrainInterval:
         reported_m=(low, high),
         claimed_m=None,
         contradiction=None,
-        held_end_m=None if message.authority_end_cm is None or report.turns else message.authority_end_cm / 100.0,
+        held_end_m=report.held_m,
     )
 
 
 def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:
-    """Return a train that is stopped, its interval grown to the reported place."""
-    rear, front = covered_m(report)
-    noted = _noted(report)
-    end_cm = report.message.authority_end_cm
-    end = end_cm / 100.0 if reason.startswith(HOLDS_MORE) and end_cm is not None else noted.end_m
+    """Return a train that is stopped, its interval grown to the reported place and to the authority it holds."""
+    (rear, front), d, noted = covered_m(report), report.known.direction, _noted(report)
+    held = noted.end_m if report.held_m is None else report.held_m
+    end, rear = d * max(d * noted.end_m, d * held), d * min(d * rear, d * held) if report.turns else rear
     return replace(noted, stop=noted.stop or reason, contradiction=reason, end_m=end, rear_m=rear, front_m=front)
 
 
@@ -348,16 +355,17 @@ def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
 
 
 def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
-    """Return a train that has changed ends: no authority beyond its front, and where it stood is still occupied."""
+    """Return a train that has changed ends: no new authority; where it stood, and what it holds, is still occupied."""
+    held = ahead if known.held_end_m is None else known.held_end_m
     covered = facing * max(facing * ahead, facing * known.rear_m)
-    back = facing * min(facing * rear, facing * known.front_m)
+    back = facing * min(facing * rear, facing * known.front_m, facing * held)
     under = {known.station, *layout.stations_between(*sorted((back, covered)))}
     return replace(
         known,
         direction=facing,
         rear_m=back,
         front_m=covered,
-        end_m=ahead,
+        end_m=facing * max(facing * ahead, facing * held),
         tracks={station: track for station, track in known.tracks.items() if station in under},
         asked_m=None,
     )

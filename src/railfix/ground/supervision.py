@@ -169,7 +169,9 @@ class Supervision:
         return reason
 
     def command_points(self, stored: Interlocking) -> None:
-        """Give the commands to points that are due, of a state that is stored."""
+        """Give the commands to points that are due, of a state that is stored; none before every train is heard."""
+        if self.awaited:
+            return
         self.state, commands = due_commands(self.state, self.layout, stored)
         for point, track in commands.items():
             self.command(point, track)

@@ -398,11 +398,7 @@ class PlaceWatch:
         if self._done or output.result is None:
             return
         for name, antenna in output.result.antennas.items():
-            counts = self._tally.antennas.setdefault(name, AntennaTally())
-            offset_m = antenna.conventional_offset_m[-1]
-            if np.isfinite(offset_m):
-                counts.conventional += 1
-                counts.conventional_nearest_m = float(np.fmin(counts.conventional_nearest_m, offset_m))
+            self._tally.antennas.setdefault(name, AntennaTally()).add_conventional(antenna)
         if any(counts.conventional >= ENOUGH_TO_STOP for counts in self._tally.antennas.values()):
             self._done = True
             try:

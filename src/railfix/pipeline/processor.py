@@ -281,6 +281,7 @@ class EpochProcessor:
             slips=screening.slips, pair=pair, sensors=sensors,
             notes=(
                 *missing_notes(received, self.config, corrected.second), *received.notes, *self._lacking,
+                *screening.notes,
                 *self._curve_notes(headers),
                 *(self._support.notes(obs.time) if self._support is not None else ()),
             ),
@@ -298,7 +299,9 @@ class EpochProcessor:
         corrected, solution, own_states = position_stage(
             chunk.corrected, chunk.slips, antennas, self.config, own_states
         )
-        single = PositionEpochs(solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties)
+        single = PositionEpochs(
+            solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties, solution.status
+        )
         interference, signs = judge_interference(
             corrected, single, antennas, [own.interference for own in own_states], self.config.interference
         )

@@ -304,7 +304,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference",
-            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has another",
+            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has another; or what "
+            "explains the signs: `time_tags`, `left_map`, `contradicted`",
             "interference.suspicion",
             words=tuple(s.name.lower() for s in Suspicion),
         ),

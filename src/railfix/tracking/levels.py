@@ -47,7 +47,7 @@ class AccumulatedIncrement:
     balises: BaliseEpochs | None = None  #: Balises read since then, as one epoch.
 
 
-def thin_epochs(
+def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
     """Return which epochs are taken, these with what was measured since the one before, and what is left after them.
@@ -188,7 +188,7 @@ def track_with_levels(
 
     Where the filter with sub-filters takes every epoch its places are those of the filter, which then does not run.
     """
-    taken, some, sensed, since = thin_epochs(epochs, sensors, state.since, limits.level_period_s)
+    taken, some, sensed, since = decimate_epochs(epochs, sensors, state.since, limits.level_period_s)
     place, after = None, state.track
     if some is not None:
         place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
