@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
+from random import Random
 
 import pytest
 from typer.testing import CliRunner
@@ -32,6 +34,26 @@ def test_each_file_is_known_by_its_content(desk: Path) -> None:
     front, rear = found.command.split().index("--front"), found.command.split().index("--rear")
     assert found.command.split()[front + 1].endswith("front.obs")
     assert found.command.split()[rear + 1].endswith("rear.obs")
+
+
+@pytest.mark.requirement("A6")
+def test_the_ground_truth_of_two_antennas_is_known_packed_as_plain(desk: Path, tmp_path: Path) -> None:
+    packed = tmp_path / "truth.csv.gz"
+    packed.write_bytes(gzip.compress((desk / "truth.csv").read_bytes()))
+    for path in (desk / "truth.csv", packed):
+        (finding,) = examine_files([path]).findings
+        assert finding.kind == "positions"
+        assert finding.facts[0] == "400 positions of front and rear"
+
+
+@pytest.mark.requirement("A6")
+def test_a_map_with_errors_is_named_as_map_check_names_it(desk: Path, tmp_path: Path) -> None:
+    head, *rows = (line for line in (desk / "line.csv").read_text().splitlines() if not line.startswith("#"))
+    Random(1).shuffle(rows)
+    (tmp_path / "shuffled.csv").write_text("\n".join([head, *rows]) + "\n")
+    result = RUNNER.invoke(app, ["doctor", str(tmp_path / "shuffled.csv")])
+    assert result.exit_code == 5
+    assert "shuffled.csv: map check: " in " ".join(result.output.split())
 
 
 def test_what_is_missing_or_does_not_fit_is_named(desk: Path, tmp_path: Path) -> None:

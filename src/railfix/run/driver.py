@@ -25,7 +25,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.state import State
-from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
+from railfix.run.checks import check_base, check_each_file, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
@@ -169,6 +169,8 @@ def open_inputs(
         log=positions,
     )  # fmt: skip
     logs = {name: open_log(paths) for name, paths in inputs.logs.items()}
+    for log in logs.values():
+        check_each_file(navigation, log)
     return navigation, line, logs
 
 

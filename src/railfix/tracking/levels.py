@@ -158,6 +158,8 @@ def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats
 #: The standard deviation explains a sub-filter up to so many of it away: where a place has no level, where it has one.
 #: One without the faulty satellite lies further away.
 _EXPLAINED: Final = (3.0, 4.0)
+#: Larger levels are none [m]: they are those of a sub-filter that is left without measurements.
+LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
     "status",
@@ -258,12 +260,17 @@ def carried_levels(
     apart = np.where(np.isnan(separation), 0.0, separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
     tracked = copy_with(
-        tracked, status=reported, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=level,
-        ground_level_m=widened(ground, straight), level_noise_m=np.where(known, noise, np.nan),
+        tracked, status=reported, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=_useful(level),
+        ground_level_m=_useful(widened(ground, straight)), level_noise_m=np.where(known, noise, np.nan),
         level_speed_mps=np.where(known, of_speed, np.nan), separation_m=np.where(known, separation, np.nan),
-        amount_m=np.where(known, amount, np.nan),
+        amount_m=_useful(np.where(known, amount, np.nan)),
     )  # fmt: skip
     return tracked, copy_with(state, time=times[-1], values=values[-1])
+
+
+def _useful(level_m: Floats) -> Floats:
+    """Return levels, those beyond `LARGEST_LEVEL_M` infinite: a sub-filter without data diverges."""
+    return np.where(level_m > LARGEST_LEVEL_M, np.inf, level_m)
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
