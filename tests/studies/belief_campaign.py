@@ -733,6 +733,11 @@ def calibration(found: Judged) -> list[str]:
     return lines
 
 
+def soon(found: Judged) -> bool:
+    """Return whether a start has a level on the ground within its first minute."""
+    return bool(np.isfinite(found.ground_level_m[found.time_s <= found.time_s[0] + 60.0]).any())
+
+
 def show_starts(case: Case, args: argparse.Namespace) -> None:
     """Print a row for each mask, and the calibration of the branches."""
     for mask in args.mask:
@@ -746,6 +751,7 @@ def show_starts(case: Case, args: argparse.Namespace) -> None:
             if args.verbose and (bad | found.sure_and_wrong).any():
                 print(f"    start {begin:.0f} s: {first_of(found, bad | found.sure_and_wrong)}", flush=True)
         print(counts(f"{case.name} {mask:g}", joined(parts), trials=len(parts), failed=failed), flush=True)
+        print(f"    first level on the ground within 60 s: {sum(map(soon, parts))} of {len(parts)} starts", flush=True)
         if args.calibration:
             print("\n".join(calibration(joined(parts))), flush=True)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, copy_with
 from railfix.core.timescale import seconds
-from railfix.kernels.tracking.constants import SCALE_BOUND
+from railfix.kernels.tracking import constants
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs
 from railfix.tracking.filter import track
 from railfix.tracking.limits import TrackingLimits
@@ -251,7 +251,7 @@ def carried_levels(
     straight = np.where(both, np.linalg.norm(points[0] - points[1], axis=1), np.nan)
     bounded = is_bounded(tracked.status)
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
-    amount = np.fmax(level, amount + SCALE_BOUND * np.abs(speed) * tau)
+    amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
     # In doubt the sub-filter furthest off may be the one that is right; else one that the standard deviation does not
     # explain.
