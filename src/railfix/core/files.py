@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import cache
 from os import PathLike
@@ -29,7 +29,7 @@ from typing import IO, Any, Final, Literal, cast
 
 import ncompress
 
-from railfix.core.errors import InputFileError, OutputError
+from railfix.core.errors import InputFileError, OutputError, SettingsError
 from railfix.core.packed import COMPRESS, STREAMS, ZIP, damage_errors, open_zip, zip_member
 
 FilePath = str | PathLike[str]
@@ -121,10 +121,12 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of texts; ValueError where there is none."""
-    names = [paths] if isinstance(paths, str | PathLike) else list(paths)
+    """Return one or several paths as a list of texts; ValueError where there is none, SettingsError: it is no path."""
+    names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise ValueError("no file was given")
+    if wrong := [name for name in names if not isinstance(name, str | PathLike)]:
+        raise SettingsError(f"a path, or several, were expected, got {type(wrong[0]).__name__}")
     return [str(name) for name in names]
 
 

@@ -52,8 +52,8 @@ _CARRY_SIGMA_MPS: Final = 0.1
 #: Standard deviations in one metre of distance: swings of the body of 1 mrad, and of its heading [1/m].
 _GRADIENT_NOISE: Final = 1e-3
 _CURVATURE_NOISE_1PM: Final = 1e-4
-#: Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`) [m]: a map of 0.3 m places no
-#: feature better than some metres, one of 0.05 m to half a metre.
+#: Length over which the errors of the map change (as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`) [m]: a map
+#: of 0.3 m places no feature better than some metres, one of 0.05 m to half a metre.
 _MAP_LENGTH_M: Final = 50.0
 #: Least standard deviation of the place of a feature: the map's, and that of the body on its bogies [m].
 _FEATURE_SIGMA_M: Final = 0.5

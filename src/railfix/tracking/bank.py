@@ -12,6 +12,7 @@ from typing import Final
 
 import scipy
 
+from railfix.kernels.tracking import constants
 from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits
@@ -76,7 +77,7 @@ def budget(limits: TrackingLimits) -> Budget:
     fault that lasts for one independent error, or `CONSTELLATION_FAULT_S` for one of a constellation.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
-    remembered_s = FORGOTTEN * limits.code_correlation_s
+    remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S
     local = 1.0 + remembered_s * limits.level_samples_per_hour / 3600.0
     exposed = [
         min(local * limits.level_fault_prior, 1.0),

@@ -295,7 +295,7 @@ def _median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats
     The standard deviation is the median one of the epochs, or that of their spread where it is larger. NaN for fewer
     than `_TAG_LEAST` epochs.
     """
-    tags = TagErrors(*(np.concatenate([a, b]) for a, b in zip(before, now, strict=True)))
+    tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
     lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))
     time, error, sigma = (
         np.lib.stride_tricks.sliding_window_view(np.concatenate([a, b]), _TAG_EPOCHS)[len(before.time) :]
@@ -306,7 +306,11 @@ def _median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats
     median = masked_median(error, known)
     spread = 1.4826 * masked_median(np.abs(error - median[:, None]), known)
     typical = masked_median(sigma, known)
-    return median, np.abs(median) / np.maximum(typical, spread), TagErrors(*(each[1 - _TAG_EPOCHS :] for each in tags))
+    return (
+        median,
+        np.abs(median) / np.maximum(typical, spread),
+        TagErrors._make(each[1 - _TAG_EPOCHS :] for each in tags),
+    )
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
