@@ -14,6 +14,8 @@ from conftest import ROOT
 from railfix import __version__
 from railfix.cli import app, version_text
 from railfix.core import errors
+from railfix.core.errors import SettingsError
+from railfix.run.inputs import RunOptions
 
 RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
 COMMANDS = [
@@ -116,6 +118,30 @@ def test_a_defect_shows_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     result = RUNNER.invoke(app, arguments)
     assert result.exit_code == 1
     assert isinstance(result.exception, RuntimeError)
+
+
+@pytest.mark.requirement("A6")
+@pytest.mark.parametrize(
+    ("text", "gps"),
+    [
+        ("2024-03-05T03:10:00Z", "2024-03-05 03:10:18"),
+        ("2024-03-05T04:10:00+01:00", "2024-03-05 03:10:18"),
+        ("2024-03-05T03:10", "2024-03-05 03:10:00"),
+        ("2012-07-01T00:00:00Z", "2012-07-01 00:00:16"),
+    ],
+)
+def test_a_time_with_a_zone_is_converted_to_gps_time(monkeypatch: pytest.MonkeyPatch, text: str, gps: str) -> None:
+    given = []
+
+    def take(*_: object, options: RunOptions, **__: object) -> None:
+        given.append(options.start)
+        raise SettingsError("enough")
+
+    monkeypatch.setattr("railfix.cli.run.run_files", take)
+    monkeypatch.setattr("railfix.cli.run.prepare_kernels", lambda: None)
+    words = ["run", "--front", "a.obs", "--nav", "b.nav", "--track", "c.csv", "--out", "d", "--start", text]
+    assert CliRunner().invoke(app, words).exit_code == 4
+    assert [str(start) for start in given] == [gps]
 
 
 def test_an_error_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

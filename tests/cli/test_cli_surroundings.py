@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import subprocess
@@ -232,3 +233,32 @@ def test_tables_are_whole_in_a_log_of_80_columns(
         return [line for line in kept if "epochs/s" not in line]
 
     assert lines(narrow.stdout) == lines(wide.stdout)
+
+
+def test_ctrl_c_is_one_sentence(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("railfix.cli.logs.locate_files", interrupt)
+    command = f"locate --log {{desk}}/front.obs --nav {{desk}}/brdc.nav --out {tmp_path}/p.pos"
+    result = CliRunner().invoke(app, desk.words(command))
+    assert result.exit_code == 130
+    assert result.stderr == "railfix: interrupted; what was unfinished is removed, finished files are kept\n"
+
+
+@pytest.mark.parametrize(
+    ("number", "hint"),
+    [(errno.ENOSPC, "free some space on the disk"), (errno.EACCES, "name a folder that can be written to")],
+)
+def test_a_full_disk_asks_for_space(
+    desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, hint: str
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "write_text", fail)
+    command = f"locate --log {{desk}}/front.obs --nav {{desk}}/brdc.nav --out {tmp_path}/p.pos"
+    result = CliRunner().invoke(app, desk.words(command))
+    assert result.exit_code == 8
+    assert os.strerror(number) in result.stderr
+    assert hint in result.stderr

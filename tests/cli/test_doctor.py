@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
+from random import Random
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from bad_inputs import Desk
 from railfix.cli import app
+from railfix.io.receiver.framing import find_frames
 from railfix.run.doctor import examine_files
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
@@ -32,6 +36,40 @@ def test_each_file_is_known_by_its_content(desk: Path) -> None:
     front, rear = found.command.split().index("--front"), found.command.split().index("--rear")
     assert found.command.split()[front + 1].endswith("front.obs")
     assert found.command.split()[rear + 1].endswith("rear.obs")
+
+
+@pytest.mark.requirement("A6")
+def test_the_ground_truth_of_two_antennas_is_known_packed_as_plain(desk: Path, tmp_path: Path) -> None:
+    packed = tmp_path / "truth.csv.gz"
+    packed.write_bytes(gzip.compress((desk / "truth.csv").read_bytes()))
+    for path in (desk / "truth.csv", packed):
+        (finding,) = examine_files([path]).findings
+        assert finding.kind == "positions"
+        assert finding.facts[0] == "400 positions of front and rear"
+
+
+@pytest.mark.requirement("A6")
+def test_a_log_without_a_date_is_a_log_that_needs_one(recordings: Path, tmp_path: Path) -> None:
+    """The observations alone of a log in RTCM 3, without its ephemerides."""
+    path = tmp_path / "msm.rtcm3"
+    content = (recordings / "cases" / "reports" / "three-epochs.rtcm3").read_bytes()
+    frames = find_frames(np.frombuffer(content, dtype=np.uint8), at_end=True)
+    spans = [(a - 3, b + 3) for a, b in zip(frames.start.tolist(), frames.end.tolist(), strict=True)]
+    numbers = [int.from_bytes(content[a + 3 : a + 5], "big") >> 4 for a, _ in spans]
+    path.write_bytes(b"".join(content[a:b] for (a, b), n in zip(spans, numbers, strict=True) if 1070 < n < 1140))
+    (finding,) = examine_files([path]).findings
+    assert finding.kind == "observations"
+    assert "its observations (RTCM 3) carry no date; give one with --date" in finding.problems[0]
+
+
+@pytest.mark.requirement("A6")
+def test_a_map_with_errors_is_named_as_map_check_names_it(desk: Path, tmp_path: Path) -> None:
+    head, *rows = (line for line in (desk / "line.csv").read_text().splitlines() if not line.startswith("#"))
+    Random(1).shuffle(rows)
+    (tmp_path / "shuffled.csv").write_text("\n".join([head, *rows]) + "\n")
+    result = RUNNER.invoke(app, ["doctor", str(tmp_path / "shuffled.csv")])
+    assert result.exit_code == 5
+    assert "shuffled.csv: map check: " in " ".join(result.output.split())
 
 
 def test_what_is_missing_or_does_not_fit_is_named(desk: Path, tmp_path: Path) -> None:

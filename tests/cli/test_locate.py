@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from bad_inputs import Desk
 from helpers.pipeline_cases import clean_navigation, clean_observations
 from railfix.cli import app
 from railfix.core.errors import InputFileError
@@ -106,3 +107,35 @@ def test_novatel_logs_are_those_of_their_manual(tmp_path: Path) -> None:
     path.write_text("nothing\n")
     with pytest.raises(InputFileError, match="no log of positions"):
         read_positions(path)
+
+
+def test_each_file_of_a_joined_log_needs_navigation(good: Desk, tmp_path: Path) -> None:
+    """The second file is of six days later; `brdc.nav` reaches the first alone."""
+    text = (good.folder / "front.obs").read_text()
+    (tmp_path / "later.obs").write_text(text.replace("> 2024 03 05", "> 2024 03 11"))
+    words = ["--nav", str(good.folder / "brdc.nav"), "--out"]
+    logs = [str(good.folder / "front.obs"), str(tmp_path / "later.obs")]
+    for command in (
+        ["locate", "--log", logs[0], "--log", logs[1], *words, str(tmp_path / "a.pos")],
+        [
+            "run",
+            "--front",
+            logs[0],
+            "--front",
+            logs[1],
+            "--track",
+            str(good.folder / "line.csv"),
+            *words,
+            f"{tmp_path}/r",
+        ],
+    ):
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 5, result.output
+        assert "later.obs: begins at 2024-03-11T03:10 (GPS time), more than a day from every" in result.stderr
+
+
+def test_a_receiver_log_needs_no_navigation_file_where_it_has_ephemerides(good: Desk, tmp_path: Path) -> None:
+    words = ["locate", "--log", str(good.folder / "front.obs"), "--out", str(tmp_path / "a.pos")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 4
+    assert "--nav is missing; name the navigation file, which RINEX observations need" in result.stderr

@@ -130,3 +130,26 @@ def test_a_sigma_that_is_too_small_is_said(desk: Desk) -> None:
     assert len(lines) == 5
     assert "too small for the errors" in lines[0]
     assert re.fullmatch(r"and \d+ better ones, in the tables below", lines[3])
+
+
+# -- for scripts ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "path", "value"),
+    [
+        (RUN.replace("{desk}/new", "{out}"), ("antennas", 0, "filter", "epochs"), 200),
+        ("locate --log {desk}/front.obs --nav {desk}/brdc.nav --out {desk}/p.pos --overwrite", ("positions",), 200),
+        ("evaluate {desk}/results --reference {desk}/truth.csv", ("antennas", 0, "position"), "constrained"),
+        ("doctor {desk}/front.obs {desk}/brdc.nav {desk}/line.csv", ("files", 1, "kind"), "navigation"),
+    ],
+)
+def test_json_is_one_line_with_the_verdict(
+    desk: Desk, command: str, path: tuple[str | int, ...], value: object
+) -> None:
+    lines = printed(desk, f"{command} --json")
+    assert len(lines) == 1
+    found = json.loads(lines[0])
+    for key in path:
+        found = found[key]
+    assert found == value

@@ -277,6 +277,46 @@ def test_a_satellite_clock_step_in_the_logs(triangle_logs: tuple[list[Path], Pat
     assert done.output.index("suspend") < done.output.index("stop:")
 
 
+@pytest.mark.requirement("E1")
+def test_fixes_computed_elsewhere_are_judged_with_limits_of_their_grade(tmp_path: Path) -> None:
+    """P3 3: CLAS-grade fixes of 3 cm; one receiver that drifts by 0.1 m/s is found within 6 s."""
+    points, random, seconds = points_ecef_m(), np.random.default_rng(3), np.arange(60)
+    start, logs, known = np.datetime64("2024-03-05T02:00:00", "ms"), [], []
+    for k, point in enumerate(points):
+        known += ["--point", ",".join(f"{value:.9f}" for value in geodetic_from_ecef(point))]
+        east = np.cross([0.0, 0.0, 1.0], point)
+        drift = 0.1 * np.maximum(seconds - 20, 0) * (k == 1)
+        place = point + random.normal(0.0, 0.03, (60, 3)) + drift[:, None] * (east / np.linalg.norm(east))
+        latitude, longitude, height = geodetic_from_ecef(place)
+        table = pl.DataFrame({"time_gpst": start + seconds.astype("timedelta64[s]"), "latitude_deg": latitude})
+        table = table.with_columns(longitude_deg=pl.Series(longitude), height_m=pl.Series(height))
+        logs.append(tmp_path / f"{k}.csv")
+        table.write_csv(logs[-1])
+    words = [
+        "monitor",
+        "--fixes",
+        *map(str, logs),
+        "--radius",
+        "0.32",
+        "--side",
+        "0.22",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    done = CliRunner().invoke(app, [*words, *known])
+    assert done.exit_code == 0, done.output
+    first = next(line for line in done.output.splitlines() if "suspend satellite positioning" in line)
+    assert first.endswith("one_receiver, receiver 1"), done.output
+    assert "2024-03-05T02:00:21" < first[:19] <= "2024-03-05T02:00:26"
+    for more, sentence in (
+        ([], "--point is missing"),
+        ([*known, "--nav", str(logs[0])], "--nav has no use with --fixes"),
+    ):
+        refused = CliRunner().invoke(app, [*words, "--overwrite", *more])
+        assert refused.exit_code == 4
+        assert sentence in refused.output
+
+
 @pytest.mark.slow
 def test_streams_are_judged_as_their_logs_are(triangle_logs: tuple[list[Path], Path], tmp_path: Path) -> None:
     """The same verdicts and errors as from the logs; a clock step in the streams stops the trains at once."""

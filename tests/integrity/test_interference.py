@@ -276,3 +276,11 @@ def test_causes_have_words_and_spoofing_outranks_jamming() -> None:
     causes = np.array([0, int(Sign.CN0_FALL), int(Sign.CN0_FALL | Sign.EQUAL_CN0)])
     assert cause_text(causes).tolist() == ["", "cn0_fall", "cn0_fall+equal_cn0"]
     assert suspicion(causes).tolist() == [Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.SPOOFING_SUSPECTED]
+
+
+@pytest.mark.requirement("B8")
+def test_causes_are_decided_in_their_order() -> None:
+    jumped, left, tags, failed = Sign.POSITION_JUMP, Sign.LEFT_MAP, Sign.TIME_TAGS, Sign.CONTRADICTED
+    causes = np.array([int(s) for s in (jumped | tags, jumped | left, left | failed, failed | Sign.CN0_FALL)])
+    expected = [Suspicion.TIME_TAGS, Suspicion.SPOOFING_SUSPECTED, Suspicion.LEFT_MAP, Suspicion.CONTRADICTED]
+    assert suspicion(causes).tolist() == expected

@@ -15,7 +15,7 @@ from railfix import kernels
 from railfix.integrity.raim import linear_model
 from railfix.integrity.raim.model import _model, compact
 from railfix.positioning.normal_equations import point_position, position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases
 from raim_oracle import point_model
 
 pytestmark = pytest.mark.requirement("B6")
@@ -149,7 +149,7 @@ def test_ties_of_some_epochs_go_with_them():
     ranges = oracle.made(arc, "GGGEEE", seed=1)
     sigma = np.tile([0.0, 1.0], (6, 1))
     sigma[3:, 1] = UNTIED_M
-    tied = replace(ranges, ties=ClockTies(offset_m=np.zeros((6, 2)), sigma_m=sigma))
+    tied = replace(ranges, ties=InterSystemBiases(offset_m=np.zeros((6, 2)), sigma_m=sigma))
     got = position_on_line(tied, oracle.LINE, np.argmin(np.abs(oracle.LINE.arc_m - arc[:, None]), axis=1))
     model = linear_model(tied, oracle.LINE, got.arc_m)
     assert model.freedom.tolist() == [4, 4, 4, 3, 3, 3]

@@ -15,6 +15,7 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.io.positions import read_positions
+from railfix.io.reference_log import read_reference
 from railfix.track import ThinningLimits, from_position_log, from_positions, read_track, thin
 from railfix.track.from_positions import ANTENNA_PATH, usable_rows
 from railfix.track.trajectory import Trajectory
@@ -377,3 +378,41 @@ def test_notes_survive_the_file(tmp_path: Path) -> None:
     time, ecef = run_of(np.full(100, 10.0), 0.0)
     write_track_csv(from_positions(time, ecef), tmp_path / "map.csv")
     assert ANTENNA_PATH in read_track(tmp_path / "map.csv").provenance.notes
+
+
+# -- broken lines --------------------------------------------------------------------------------------------
+
+_CSV = "time_gpst,latitude_deg,longitude_deg,height_m\n" + "".join(
+    f"2024-01-01T10:00:0{k},48.0,11.00{k},500.0\n" for k in range(5)
+)
+_POS = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m) sdu(m)\n" + "".join(
+    f"2024/01/01 10:00:0{k}.000 48.0 11.00{k} 500.0 1 9 0.01 0.01 0.02\n" for k in range(5)
+)
+
+
+@pytest.mark.requirement("A6")
+@pytest.mark.parametrize("text", [_CSV, _POS], ids=["csv", "rtklib"])
+def test_a_cut_last_line_costs_itself_and_a_broken_one_needs_leave(tmp_path: Path, text: str) -> None:
+    path = tmp_path / ("log.pos" if text.startswith("%") else "log.csv")
+    path.write_text(text)
+    whole = read_positions(path)
+    path.write_text(text[:-17])
+    cut = read_positions(path)
+    assert len(cut) == len(whole) - 1 == 4
+    np.testing.assert_array_equal(cut.sigma_m, whole.sigma_m[:4])
+    assert any("line 6" in note and note.endswith("the line was skipped") for note in cut.notes)
+    lines = text.splitlines(keepends=True)
+    path.write_text("".join([*lines[:3], lines[3].replace("48.0", "4x.0"), *lines[4:]]))
+    with pytest.raises(InputFileError, match=r"line 4: .*--lenient"):
+        read_positions(path)
+    lenient = read_positions(path, broken_lines="count")
+    assert lenient.line.tolist() == [2, 3, 5, 6]
+
+
+@pytest.mark.requirement("A6")
+def test_a_reference_is_read_with_the_same_leave(tmp_path: Path) -> None:
+    path = tmp_path / "reference.csv"
+    path.write_text(_CSV.replace("02,48.0", "02,?"))
+    with pytest.raises(InputFileError, match="--lenient"):
+        read_reference(path, ["front"])
+    assert len(read_reference(path, ["front"], broken_lines="count")["front"]) == 4

@@ -135,8 +135,11 @@ def test_satellites_without_a_date_are_named(tmp_path: Path) -> None:
         assert found.kepler.satellite.tolist() == ["G07", "E07"]
         assert not found.notes
         assert ((found.kepler.toe - WEEK) / np.timedelta64(1, "s")).tolist() == [5400 * UNIT_S[k] for k in (1019, 1046)]
-    path.write_bytes(gps)  # the latest week of its number that is not to come
+    path.write_bytes(gps)  # the first week of its number since MSM were defined, whatever the clock says
     assert railfix.read_navigation(path).kepler.toe.tolist() == navigation.kepler.toe[:1].tolist()
+    later = np.datetime64("2023-08-17") + np.timedelta64(1024 * 7, "D")
+    of_later = railfix.read_navigation(path, date=later).kepler.toe[0]
+    assert (of_later - navigation.kepler.toe[0]) / np.timedelta64(7, "D") == 1024
     place = {name: km * 2**11 for name, km in (("x", 15_000), ("y", 12_000), ("z", 17_000))}
     path.write_bytes(
         message(1020, 0, {"number": 5, "channel": 4, "p": 0, "hour": 4, "minute": 15, "tb_s": 18, **place})

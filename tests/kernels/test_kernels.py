@@ -262,7 +262,8 @@ print(prepared, compiled, loaded, *[f.py_func.__name__ for f in COMPILED if f.si
         assert prepared == expected
         assert set(names) >= {name for _, name in NAMES}
         assert int(loaded) >= len(names)
-        assert int(compiled) == (0 if before else int(loaded))
+        # the recursion of the filter is compiled in another process meanwhile
+        assert int(compiled) == 0 if before else 0 < int(compiled) < int(loaded)
         before = int(loaded)
 
 

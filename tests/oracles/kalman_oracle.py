@@ -13,6 +13,23 @@ import numpy as np
 from filterpy.kalman import KalmanFilter, rts_smoother
 
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.kernels.tracking.constants import (
+    CLOCK_WALK_MPS,
+    CODE_CORRELATION_M,
+    CODE_CORRELATION_S,
+    DOPPLER_CORRELATION_S,
+    DOPPLER_ERROR_MPS,
+    DOPPLER_ERROR_SHARE,
+    MAP_ABSOLUTE_M,
+    MAP_CORRELATION_M,
+    MAP_ROUGHNESS_M,
+    MAP_SCALE_M,
+    OFFSET_PRIOR_M,
+    OFFSET_WALK_M,
+    PHASE_WALK_M,
+    SLOW_CODE_S,
+    START_SIGMA_M,
+)
 from railfix.motion.singer import singer_steps
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, TrackingLimits
 
@@ -78,11 +95,11 @@ class Oracle:
         """Prior of a start at a place."""
         limits, count = self.limits, len(self.epochs.satellite)
         sigma = np.ones(X + count)
-        sigma[[S, S0]] = limits.start_sigma_m
+        sigma[[S, S0]] = START_SIGMA_M
         sigma[[V, A, D, B]] = 50.0, limits.acceleration_mps2, 1e3, 1e3
         sigma[[MR, MU]] = self.line.sigma_plan_m, self.line.sigma_height_m
-        sigma[[CLOCK, WHEEL, W, Z]] = 1e3, 0.02, limits.doppler_error_mps, limits.slow_code_m
-        sigma[[GPS, GALILEO]] = 0.01, limits.offset_prior_m
+        sigma[[CLOCK, WHEEL, W, Z]] = 1e3, 0.02, DOPPLER_ERROR_MPS, limits.slow_code_m
+        sigma[[GPS, GALILEO]] = 0.01, OFFSET_PRIOR_M
         mean = np.zeros(X + count)
         mean[[S, S0]] = arc_m
         return mean, np.diag(sigma**2)
@@ -94,9 +111,9 @@ class Oracle:
         step, singer = singer_steps(np.array([dt]), limits.acceleration_mps2, limits.acceleration_s)
         kept = np.ones(size)
         kept[[B, CLOCK, QR, QU, QA]] = 0.0
-        kept[[MR, MU]] = np.exp(-travel / limits.map_absolute_m)
-        kept[[W, Z]] = np.exp(-dt / np.array([limits.doppler_correlation_s, limits.slow_code_s]))
-        kept[X:] = np.exp(-dt / limits.code_correlation_s - travel / limits.code_correlation_m)
+        kept[[MR, MU]] = np.exp(-travel / MAP_ABSOLUTE_M)
+        kept[[W, Z]] = np.exp(-dt / np.array([DOPPLER_CORRELATION_S, SLOW_CODE_S]))
+        kept[X:] = np.exp(-dt / CODE_CORRELATION_S - travel / CODE_CORRELATION_M)
         transition = np.diag(kept)
         transition[:3, :3] = step[0]
         transition[S0] = 0.0
@@ -104,14 +121,14 @@ class Oracle:
         transition[B, D] = dt
         sigma = np.zeros(size)
         sigma[[MR, MU]] = self.line.sigma_plan_m, self.line.sigma_height_m
-        sigma[[W, Z]] = limits.doppler_error_mps + limits.doppler_error_share * speed, limits.slow_code_m
+        sigma[[W, Z]] = DOPPLER_ERROR_MPS + DOPPLER_ERROR_SHARE * speed, limits.slow_code_m
         sigma[X:] = 1.0
         variance = sigma**2 * (1.0 - kept**2)
-        walk, least = limits.clock_walk_mps**2, 1e-6
+        walk, least = CLOCK_WALK_MPS**2, 1e-6
         variance[[D, B, CLOCK]] = walk * dt, walk * dt**3 / 3.0 + least, 1e6
-        variance[WHEEL], variance[[GPS, GALILEO]] = 5e-4**2 * dt, limits.offset_walk_m**2 * dt
-        length = limits.map_scale_m**2 * travel + limits.phase_walk_m**2 * dt
-        rough = 2.0 * limits.map_roughness_m**2 * (1.0 - np.exp(-travel / limits.map_correlation_m))
+        variance[WHEEL], variance[[GPS, GALILEO]] = 5e-4**2 * dt, OFFSET_WALK_M**2 * dt
+        length = MAP_SCALE_M**2 * travel + PHASE_WALK_M**2 * dt
+        rough = 2.0 * MAP_ROUGHNESS_M**2 * (1.0 - np.exp(-travel / MAP_CORRELATION_M))
         variance[[QR, QU, QA]] = rough + 1e-8, rough + 1e-8, length + 1e-8
         noise = np.diag(variance)
         noise[:3, :3] += singer[0]

@@ -14,7 +14,7 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotati
 from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, linear_model
 from railfix.integrity.raim.model import _model
 from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.ranges.channels import clock_groups
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -66,7 +66,7 @@ def made(
     if tie_sigma_m is not None:
         tie_sigma = np.broadcast_to(np.array(tie_sigma_m[: len(groups)]), (len(arc_m), len(groups)))
         offset = np.broadcast_to(np.array(CLOCK_OFFSET_M[: len(groups)]), tie_sigma.shape)
-        ties = ClockTies(offset_m=offset, sigma_m=tie_sigma)
+        ties = InterSystemBiases(offset_m=offset, sigma_m=tie_sigma)
         drawn = offset + np.minimum(tie_sigma, 100.0) * rng.normal(size=tie_sigma.shape)
     else:
         drawn = np.broadcast_to(np.array(CLOCK_OFFSET_M[: len(groups)]), (len(arc_m), len(groups)))

@@ -15,7 +15,7 @@ from railfix.pipeline.processor import Result
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.gross_errors import gross_alone, gross_errors, scan_line
 from railfix.positioning.normal_equations import point_position
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases
 from railfix.positioning.search_index import SearchIndex
 from railfix.tracking import TrackStatus
 
@@ -124,7 +124,7 @@ def test_range_alone_on_its_clock_is_checked_by_the_known_bias() -> None:
     code[2, 5] += 20.0
     ranges = replace(ranges, code_m=code)
     clock = point_position(ranges, line.at_arc(np.array([300.0] * 3))).clock_m
-    known = ClockTies(offset_m=np.zeros((3, 2)), sigma_m=np.full((3, 2), 2.0))
+    known = InterSystemBiases(offset_m=np.zeros((3, 2)), sigma_m=np.full((3, 2), 2.0))
     assert np.array_equal(gross_alone(ranges, clock, known), np.eye(6, dtype=bool)[5] & np.array([[0], [1], [0]], bool))
     nothing = replace(known, sigma_m=np.array([[0.0, UNTIED_M]] * 3))
     assert not gross_alone(ranges, clock, nothing).any()

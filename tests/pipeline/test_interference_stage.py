@@ -165,3 +165,56 @@ def test_a_clock_that_steps_after_a_break_between_two_looks_is_no_sign_whatever_
             parts.append(result["front"].interference.causes)
         jumped = (np.concatenate(parts) & int(Sign.CLOCK_JUMP)) != 0
         assert np.flatnonzero(jumped).tolist() == ([] if broken else list(range(20, 45)))
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize(("late_s", "from_epoch"), [(1.0, 5), (18.0, 5), (-18.0, 5), (0.01, 40)])
+def test_wrong_time_tags_are_named_with_their_size_and_give_no_level(late_s: float, from_epoch: int) -> None:
+    log = scene().observations
+    since = np.arange(len(log)) if abs(late_s) < 0.1 else np.ones(len(log))
+    shifted = replace(log, time=log.time + (late_s * since * 1e9).astype("timedelta64[ns]"))
+    found = result_of(shifted)["front"]
+    named = found.interference.suspicion == Suspicion.TIME_TAGS
+    assert named[from_epoch:].all()
+    median = found.interference.motion.tag_error_s
+    assert np.abs(median - late_s * since)[named].max() < 0.1
+    assert not np.isin(found.status[named], (Status.OK, Status.AMBIGUOUS, Status.SPOOFING_SUSPECTED)).any()
+    assert not (found.protection.status[named] == LevelStatus.AVAILABLE).any()
+
+
+@pytest.mark.requirement("B8")
+def test_time_tags_of_pieces_are_named_as_those_of_the_whole() -> None:
+    log = scene().observations[:60]
+    shifted = {"front": replace(log, time=log.time + np.timedelta64(1, "s"))}
+    whole, _ = pipeline_cases.processor({"filter": "off"}).process(shifted)
+    pieces, _ = pipeline_cases.in_pieces(pipeline_cases.processor({"filter": "off"}), shifted, [1, 2, 25])
+    for name in ("interference.causes", "interference.motion.tag_error_s"):
+        assert np.array_equal(pipeline_cases.flat(whole["front"])[name], pieces["front"][name], equal_nan=True)
+
+
+@pytest.mark.requirement("B8")
+@pytest.mark.parametrize(
+    ("kind", "letters", "factor", "words"),
+    [
+        ("doppler_hz", "E", -1.0, ["the Dopplers of Galileo have the wrong sign; they are not used"]),
+        ("doppler_hz", "GEJC", -1.0, ["the Dopplers of Galileo have", "the Dopplers of GPS have"]),
+        ("doppler_hz", "G", 0.19, ["the Dopplers of GPS are in metres a second, not in Hz"]),
+        ("doppler_hz", "G", 3.0, ["the Dopplers of GPS are 3 times", "their unit is not Hz"]),
+        ("phase_cycles", "GEJC", 0.19, ["the phases of GPS are in metres, not in cycles"]),
+        ("phase_cycles", "G", -1.0, ["the phases of GPS have the wrong sign"]),
+    ],
+)
+def test_signs_and_units_of_observables_are_named_and_nothing_else_changes(
+    kind: str, letters: str, factor: float, words: list[str]
+) -> None:
+    log = scene().observations
+    own = np.isin(log.satellite.astype("<U1"), list(letters))
+    wrong = replace(log, **{kind: np.where(own, factor, 1.0) * getattr(log, kind)})
+    result, clean = result_of(wrong), result_of(log)
+    notes = [note for note in result.notes if "not used" in note]
+    assert all(any(word in note for note in notes) for word in words)
+    assert not any("not used" in note for note in clean.notes)
+    found = result["front"]
+    assert (found.interference.suspicion == Suspicion.NONE).all()
+    assert np.nanmax(np.abs(found.chainage_m - clean["front"].chainage_m)) < 5.0
+    assert (found.status == Status.OK).mean() > (clean["front"].status == Status.OK).mean() - 0.05

@@ -15,6 +15,7 @@ from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.tables import antenna_positions
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, robust_fit
 from railfix.positioning.windows import Windows
@@ -108,3 +109,13 @@ def test_the_variance_of_an_epoch_lies_between_window_and_residuals() -> None:
     scale, wsse, redundancy = np.array([1.0, 1.0, 0.5]), np.array([40.0, np.nan, 1.0]), np.array([10, 3, 4])
     found = epoch_variance(scale, wsse, redundancy, limits=limits)
     assert found == pytest.approx([(4.0 + 40.0) / 14.0, 1.0, (1.0 + 1.0) / 8.0])
+
+
+@pytest.mark.requirement("B4")
+def test_the_statistic_of_raim_is_recomputed_from_the_tables_by_its_scale() -> None:
+    found = with_fault("G05", 0.0)
+    table = antenna_positions("front", found)
+    kept = (table["raim_outcome"] == "passed").to_numpy()
+    statistic = table["raim_statistic"].to_numpy() * table["raim_scale"].to_numpy() ** 2
+    assert kept.sum() > 100
+    np.testing.assert_allclose(statistic[kept], found.constrained.wsse[kept], rtol=1e-5)

@@ -112,12 +112,8 @@ def test_reflections_of_some_tenths_of_a_second_move_the_train_nowhere(tmp_path:
     both = train.join(true, on=["time_gpst", "antenna"], suffix="_true")
     assert len(both) == 1040
     assert (both["chainage_m"] - both["chainage_m_true"]).abs().max() < 3.0  # type: ignore[operator]
-    # in the first seconds of a start a place can still be without a level, which makes it doubtful
-    begun = pl.col("time_gpst") >= pl.datetime(2024, 3, 5, 3, 11, 42, time_unit="ns")
-    early, later = train.filter(~begun), train.filter(begun)
-    assert set(early["status"].unique()) <= {"doubtful", "tracking"}
-    assert early.filter(pl.col("status") == "doubtful")["protection_level_m"].is_infinite().all()
-    assert set(later["status"].unique()) == {"tracking", "coasting"}
+    assert set(train["status"].unique()) == {"tracking", "coasting"}
+    assert train["protection_level_m"].is_finite().all()
 
 
 def test_smoothing_needs_the_filter(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases, PhaseState, phase_positions
 from railfix.positioning.carrier.ambiguities import FREE_AMBIGUITY_M, number_hops
 from railfix.positioning.normal_equations import position_on_line
-from railfix.positioning.range_arrays import ClockTies, Ranges
+from railfix.positioning.range_arrays import InterSystemBiases, Ranges
 from railfix.track.trajectory import Trajectory
 
 LINE = carrier_cases.straight()
@@ -124,7 +124,7 @@ def test_equals_a_dense_least_squares(limits, clocks, tied):
     ranges, phases = carrier_cases.observed(LINE, arc, arc_id=broken_arcs(6, 8))
     if tied:
         sigma = np.tile([0.0, 1.0], (6, 1))
-        ranges = replace(ranges, ties=ClockTies(offset_m=np.tile([0.0, 5.5], (6, 1)), sigma_m=sigma))
+        ranges = replace(ranges, ties=InterSystemBiases(offset_m=np.tile([0.0, 5.5], (6, 1)), sigma_m=sigma))
     got = phase_run(time, ranges, phases, LINE, arc + 4.0, limits=limits)
     expected, ambiguities = dense(ranges, phases, time, arc + 4.0, LINE, limits)
     assert np.abs(got.arc_m - expected).max() < 1e-6
@@ -188,7 +188,7 @@ def test_without_phases_it_is_the_position_of_the_codes(tied):
     arc, time = moving(40), carrier_cases.times(40)
     ranges, phases = carrier_cases.observed(LINE, arc)
     if tied:
-        ties = ClockTies(offset_m=np.tile([0.0, 5.5], (40, 1)), sigma_m=np.tile([0.0, 1.0], (40, 1)))
+        ties = InterSystemBiases(offset_m=np.tile([0.0, 5.5], (40, 1)), sigma_m=np.tile([0.0, 1.0], (40, 1)))
         ranges = replace(ranges, ties=ties)
     none = replace(phases, weight=np.zeros_like(phases.weight), arc_id=np.full(phases.arc_id.shape, -1))
     code = position_on_line(ranges, LINE, np.clip(np.rint(arc / 50).astype(int), 0, 19))

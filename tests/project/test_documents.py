@@ -72,7 +72,7 @@ def test_command_lines_and_options_exist(path: Path) -> None:
         ("run ... --set elevation.mask=15", False, "elevation.mask"),
         ("run ... --without dopler", False, "dopler"),
         ("run --front a --track b --out c --chunk x", True, "integer"),
-        ("run --front a --track b --out c", True, "--nav"),
+        ("run --front a --track b --nav c", True, "--out"),
         ("run --front a --nav b --track c --out d --chunk 2", True, None),
     ],
 )

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ import railfix
 import railfix.core
 import railfix.ground
 import railfix.motion
-from railfix.core.errors import InputFileError, MismatchError
+from railfix import Config, EpochProcessor, read_navigation, read_observations
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.simulate.demonstration import demo_files
@@ -32,9 +34,9 @@ def test_every_name_of_the_package_can_be_imported(package: object) -> None:
 
 
 @pytest.mark.requirement("A7")
-@pytest.mark.slow
-def test_a_run_starts_without_the_large_parts_of_scipy() -> None:
-    heavy = ["scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal", "matplotlib", "networkx", "numba"]
+def test_the_help_of_a_run_loads_no_numerics() -> None:
+    scipy = [f"scipy.{part}" for part in ("special", "spatial", "linalg", "integrate", "ndimage", "optimize", "stats")]
+    heavy = [*scipy, "numba", "matplotlib", "networkx", "pandas", "xarray", "georinex", "filterpy"]
     program = f"import sys, railfix.cli.run; print([name for name in {heavy} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -81,6 +83,35 @@ def test_objects_show_themselves_in_one_line_and_as_a_table(demo: dict[str, obje
     assert html.startswith("<table>")
     assert html.count("<tr>") >= 2
     assert len(html) < 20_000
+
+
+@pytest.mark.requirement("S3")
+def test_settings_show_what_is_not_as_by_default_and_say_how_to_change_them() -> None:
+    assert repr(Config()) == "Config()"
+    assert repr(Config(min_satellites=4, elevation={"mask_deg": 10.0})) == (
+        "Config(elevation=ElevationLimits(mask_deg=10.0), min_satellites=4)"
+    )
+    with pytest.raises(SettingsError, match=r"^Config cannot be changed; .* settings\.replaced\(min_satellites=3\)$"):
+        Config().min_satellites = 3
+
+
+@pytest.mark.requirement("S3")
+def test_arguments_of_another_type_are_named_with_what_was_expected(demo: dict[str, object]) -> None:
+    track, trajectory, navigation = demo["Track"], demo["Trajectory"], demo["Navigation"]
+    make: Any = EpochProcessor
+    with pytest.raises(SettingsError, match=r"antenna front: expected Trajectory, got Track; .*from_track"):
+        make(Config(), {"front": track})
+    with pytest.raises(SettingsError, match="navigation: expected Navigation, got str; read_navigation"):
+        make(Config(), {"front": trajectory}, navigation="nav.rnx")
+    with pytest.raises(SettingsError, match="config: expected Config, got dict"):
+        make({}, {"front": trajectory})
+    processor: Any = EpochProcessor(Config(), {"front": trajectory}, navigation=navigation)  # type: ignore[arg-type,dict-item]
+    assert repr(processor).startswith("<EpochProcessor: front, filter track; screens elevation, ")
+    with pytest.raises(SettingsError, match="observations of antenna front: expected Observations, got str"):
+        processor.process({"front": "front.rnx"})
+    for read in (read_observations, read_navigation):
+        with pytest.raises(SettingsError, match="a path, or several, were expected, got NoneType"):
+            read(None)  # type: ignore[arg-type]
 
 
 def same_observations(first: Observations, second: Observations) -> None:

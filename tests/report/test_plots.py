@@ -143,6 +143,19 @@ def test_ranges_of_runs(errors: pl.DataFrame) -> None:
     np.testing.assert_allclose(conventional.mid, [np.nan, 2.5 / 3.0, np.nan, 2.5 / 3.0])
 
 
+@pytest.mark.requirement("D3")
+def test_errors_of_several_runs_lie_over_one_chainage(errors: pl.DataFrame) -> None:
+    """P1 figure 8: each run in its own colour; where the reference is poor there is no point."""
+    chart = plots.errors_of_runs({"morning": errors, "evening": errors.with_columns(error_m=pl.col("error_m") + 1.0)})
+    morning, evening = layer(chart, Points, "morning"), layer(chart, Points, "evening")
+    np.testing.assert_array_equal(morning.x, evening.x)
+    np.testing.assert_allclose(evening.y, morning.y + 1.0)
+    has_chainage = errors["chainage_m"].is_not_null() & errors["chainage_m"].is_not_nan()
+    good = errors.filter(has_chainage & errors["reference_good"])["error_m"].drop_nulls().drop_nans()
+    np.testing.assert_allclose(np.sort(morning.y), np.sort(good.to_numpy()))
+    assert morning.colour != evening.colour
+
+
 def test_stanford_counts_by_hand() -> None:
     error = [1.0, -5.0, 12.0, 3.0, 25.0, np.nan, 1.0]
     level = [4.0, 4.0, 30.0, np.inf, 8.0, 5.0, np.nan]

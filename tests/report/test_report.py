@@ -449,6 +449,8 @@ def test_several_runs_have_a_summary_and_a_part_each(folder: Path, tmp_path: Pat
     ranges = chart(read, "error-ranges")
     assert len(ranges["layers"][0]["names"]) == 8
     assert ranges["layers"][0]["names"][-1] == "other, rear, conventional"
+    names = [layer["label"] for layer in chart(read, "errors-of-runs")["layers"]]
+    assert names == [f"{name}, {antenna}" for name in (folder.name, "other") for antenna in ("front", "rear")]
     assert {"run0", "run1", "run0-0", "run1-1"} <= {found.get("id") for _, found in read.elements}
     assert document.count('<th scope="row">other</th>') == 2
     assert [figure["data-name"] for figure in read.figures].count("plan") == 6

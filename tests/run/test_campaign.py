@@ -89,8 +89,13 @@ def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path,
     record = out / "runs/train=A/day=2024-03-05/run.json"
     shutil.rmtree(out / "runs/train=A/day=2024-03-06")
     before = record.stat().st_mtime_ns
+    seen.clear()
     with ThreadPoolExecutor(1) as executor:
-        again = run_campaign(folder / "campaign.toml", out=out, executor=executor)
+        again = run_campaign(
+            folder / "campaign.toml", out=out, executor=executor, progress=lambda **state: seen.append(state)
+        )
+    # two were there, and the failed one and the removed one are positioned again: none is counted as the first
+    assert [(state["done"], state["kept"], state["failed"]) for state in seen] == [(3, 2, 0), (4, 2, 1)]
     assert record.stat().st_mtime_ns == before
     compared = [name for name in first.columns if name != "wall_s"]
     assert again.select(compared).equals(first.select(compared), null_equal=True)
@@ -101,6 +106,23 @@ def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path,
     with ThreadPoolExecutor(1) as executor:
         run_campaign(changed, out=out, executor=executor)
     assert record.stat().st_mtime_ns != before
+
+
+def test_lenience_of_the_command_reaches_every_run(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "logs/A/2024-03-05/front.obs").read_text().splitlines(keepends=True)
+    starts = [k for k, line in enumerate(text) if line.startswith(">")]
+    text[starts[20] + 1] = "G0x" + text[starts[20] + 1][3:]
+    (tmp_path / "one.obs").write_text("".join(text))
+    shutil.copy(folder / "line.csv", tmp_path)
+    shutil.copy(folder / "nav/2024-03-05.nav", tmp_path / "brdc.nav")
+    (tmp_path / "c.toml").write_text('front = "{log}.obs"\nnav = "brdc.nav"\ntrack = ["line.csv"]\n')
+    words = ["campaign", str(tmp_path / "c.toml"), "--workers", "1", "--json", "--out"]
+    result = RUNNER.invoke(app, [*words, str(tmp_path / "strict")])
+    assert result.exit_code == 7
+    assert "--lenient" in result.stderr
+    result = RUNNER.invoke(app, [*words, str(tmp_path / "lenient"), "--lenient"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["runs"][0]["status"] == "done"
 
 
 def test_the_command_and_what_reads_its_runs(folder: Path, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ import argparse
 import sys
 import tempfile
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -42,17 +43,20 @@ import sensed_ride
 from posterior_score import arc_of, bounds
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.reasons import Reason, Status
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.evaluate.cases import read_case
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations, carrier_frequency_hz
+from railfix.integrity.interference import Suspicion
 from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import read_reference
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.results import Result
 from railfix.run.processor import make_processor
 from railfix.simulate.run import truth_table, vehicle_table
 from railfix.simulate.scenario_file import list_scenarios, load_recipe
@@ -530,6 +534,109 @@ def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Cas
         yield "radar +1 m/s", replace(case, sensors=replace(sensors, radar=replace(radar, speed_mps=speed)))
 
 
+def whole_faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterator[tuple[str, str, Case]]:
+    """Faults that cover a whole trial: name, the cause that has to be named ("" where none need be), and the case."""
+    obs = case.observations
+    t, nothing = seconds(obs.time - obs.time[0]), np.zeros(obs.code_m.shape)
+    yield "nothing", "nothing", case
+    for late in (1.0, -1.0, 18.0, -18.0):
+        yield f"tags {late:+g} s", "time tags", on_tags(case, np.full(len(t), late))
+    yield "tags +10 ms/s", "time tags", on_tags(case, 0.01 * t)
+    letter = obs.satellite.astype("<U1")
+    # of constellations with records alone: the others are not used
+    letters = sorted(set(letter[np.abs(along).max(axis=0) > 0.0].tolist()))
+    wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(
+        obs.satellite, obs.signal, {**glonass_channels(case.navigation), **obs.header.glonass_channel}
+    )
+    own = letter == str(random.choice(letters))
+    for name, field_, factor in (
+        ("Dopplers flipped", "doppler_hz", np.full(len(letter), -1.0)),
+        ("Dopplers of one constellation flipped", "doppler_hz", np.where(own, -1.0, 1.0)),
+        ("Dopplers in m/s", "doppler_hz", wavelength),
+        ("phases flipped", "phase_cycles", np.full(len(letter), -1.0)),
+        ("phases in metres", "phase_cycles", wavelength),
+    ):
+        values = getattr(obs, field_) * factor
+        if np.isfinite(values[:, np.abs(along).max(axis=0) > 0.0]).any():
+            yield name, "observable", replace(case, observations=replace(obs, **{field_: values}))
+    seen = (np.isfinite(obs.code_m) & (np.abs(along) > 0.0)).mean(axis=0) > 0.8
+    names = np.unique(obs.satellite[seen])
+    for count in (1, 2, 3):
+        if len(names) >= 4 + count:
+            wrong = np.isin(obs.satellite, random.choice(names, count, replace=False))[None, :]
+            for size in (200.0, 1000.0, 300000.0):
+                fault = Fault("", size * wrong.repeat(len(t), 0), nothing, nothing)
+                yield f"{count} codes +{size / 1e3:g} km", "satellite", with_fault(case, fault)
+    if len(letters) > 1:
+        lost = ((letter != letters[-1])[None, :]) & (t >= 45.0)[:, None]
+        gone = {f: np.where(lost, np.nan, getattr(obs, f)) for f in ("code_m", "phase_cycles", "doppler_hz")}
+        yield "all but one constellation lost", "nothing", replace(case, observations=replace(obs, **gone))
+    steep = np.where(np.abs(along) > 0.0, along, 0.0)
+    for size in (8.0, 11.0):
+        yield f"ionosphere tilted by {size:g} m", "", with_fault(case, Fault("", size * steep, -size * steep, nothing))
+    late = 15.0 * (random.random(len(letter)) < 0.5)[None, :].repeat(len(t), 0)
+    yield "half of the sky 15 m late", "", with_fault(case, Fault("", late, nothing, nothing))
+    step = 500.0 * (t >= 45.0)[:, None] * np.ones(obs.code_m.shape)
+    yield "codes +500 m, all", "spoofing", with_fault(case, Fault("", step, nothing, nothing))
+    yield "off the map", "off the map", ended(case)
+
+
+def on_tags(case: Case, late_s: np.ndarray) -> Case:
+    """A case whose time tags are so late."""
+    time = case.observations.time + np.round(late_s * 1e9).astype("timedelta64[ns]")
+    return replace(case, observations=replace(case.observations, time=time))
+
+
+def named_cause(result: Result) -> str:
+    """The cause that a run names, in the order in which it decides."""
+    found, filtered = result.antennas["front"], result.fusion["front"].tracked.status
+    if any("they are not used" in note for note in result.notes):
+        return "observable"
+    kinds = [] if found.interference is None else found.interference.suspicion.tolist()
+    for kind, cause in ((Suspicion.TIME_TAGS, "time tags"), (Suspicion.SPOOFING_SUSPECTED, "spoofing")):
+        if kinds.count(kind) > 3:
+            return cause
+    away = (found.status == Status.OFF_MAP) | np.isin(filtered, (TrackStatus.OFF_MAP, TrackStatus.LOST))
+    if kinds.count(Suspicion.LEFT_MAP) > 3 or away.sum() > 10:
+        return "off the map"
+    wrong = (found.reason & int(Reason.GROSS_ERROR | Reason.LASTING_ERROR | Reason.NO_EPHEMERIS)) != 0
+    if (wrong & np.isfinite(found.elevation_deg)).mean(axis=0).max() > 0.3:
+        return "satellite"
+    return "map" if (filtered == TrackStatus.MAP_OFFSET).sum() > 10 else "nothing"
+
+
+def show_causes(case: Case, args: argparse.Namespace) -> None:
+    """Print the cause put in against the cause named, and what went over its level, by kind of fault."""
+    random = np.random.default_rng(args.seed)
+    config = parse_config({"filter": "track", "elevation": {"mask_deg": args.mask[0]}, **args.settings})
+    along, _ = sights(case)
+    rows: dict[tuple[str, str], list[tuple[str, Judged]]] = {}
+    t = seconds(case.observations.time - case.observations.time[0])
+    known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
+    for begin in np.arange(t[known[0]], t[known[-1]] - 90.0, args.fault_every):
+        first, end = (int(k) for k in np.searchsorted(t, [begin, begin + args.length]))
+        for label, cause, faulty in whole_faults(case.part(first, end), along[first:end], random):
+            processor = make_processor(config, faulty.navigation, {"front": faulty.trajectory})
+            result, _ = processor.process({"front": faulty.observations})
+            trial = judged(faulty, result.fusion["front"].tracked)
+            rows.setdefault((label, cause), []).append((named_cause(result), trial))
+    print(
+        f"| {case.name}: put in | has to be named | trials | named | tracking % | over, on the ground, sure and wrong |"
+    )
+    print("|---|---|---:|---|---:|---|")
+    right = total = 0
+    for (label, cause), found in rows.items():
+        named = Counter(name for name, _ in found)
+        trial = joined([each for _, each in found])
+        right, total = right + named[cause], total + (len(found) if cause else 0)
+        print(
+            f"| {label} | {cause or '-'} | {len(found)} | {', '.join(f'{n} {c}' for n, c in named.most_common())} | "
+            f"{100 * trial.tracking.mean():.0f} | {int((trial.over | trial.over_chainage).sum())}, "
+            f"{int(trial.over_ground.sum())}, {int(trial.sure_and_wrong.sum())} |"
+        )
+    print(f"{case.name}: {right} of {total} causes named right", flush=True)
+
+
 def over(label: str, found: Judged) -> np.ndarray:
     """Epochs over their level; on a wrong map, whose chainage is not defined, that on the ground."""
     return found.over_ground if label.startswith("map") else found.over | found.over_chainage
@@ -589,7 +696,9 @@ def counts(label: str, found: Judged, *, trials: int, failed: int) -> str:
     error = found.straight_m[np.isfinite(found.straight_m)]
     ratio = (found.straight_m / found.sigma_m)[np.isfinite(found.straight_m)]
     medians = [
-        f"{100 * mask.mean():.0f} % {np.median(level[mask]):.1f} m" if mask.any() else "none"
+        f"{100 * (level <= 20.0).mean():.0f}, {100 * (level <= 50.0).mean():.0f} % {np.median(level[mask]):.1f} m"
+        if mask.any()
+        else "none"
         for mask, level in ((found.bounded, found.level_m), (on_ground, found.ground_level_m))
     ]
     return (
@@ -602,7 +711,7 @@ def counts(label: str, found: Judged, *, trials: int, failed: int) -> str:
 
 
 HEAD: Final = (
-    "| recording, mask | trials | epochs | tracking % | level along | level on the ground | over it | by chainage | "
+    "| recording, mask | trials | epochs | tracking % | level within 20, 50 m | on the ground | over | chainage | "
     "trials with any | sure and wrong % | p50 / p95 / largest | error over sigma p95 |\n"
     "|---|---:|---:|---:|---|---|---:|---:|---:|---:|---|---:|"
 )
@@ -624,6 +733,11 @@ def calibration(found: Judged) -> list[str]:
     return lines
 
 
+def soon(found: Judged) -> bool:
+    """Return whether a start has a level on the ground within its first minute."""
+    return bool(np.isfinite(found.ground_level_m[found.time_s <= found.time_s[0] + 60.0]).any())
+
+
 def show_starts(case: Case, args: argparse.Namespace) -> None:
     """Print a row for each mask, and the calibration of the branches."""
     for mask in args.mask:
@@ -637,6 +751,7 @@ def show_starts(case: Case, args: argparse.Namespace) -> None:
             if args.verbose and (bad | found.sure_and_wrong).any():
                 print(f"    start {begin:.0f} s: {first_of(found, bad | found.sure_and_wrong)}", flush=True)
         print(counts(f"{case.name} {mask:g}", joined(parts), trials=len(parts), failed=failed), flush=True)
+        print(f"    first level on the ground within 60 s: {sum(map(soon, parts))} of {len(parts)} starts", flush=True)
         if args.calibration:
             print("\n".join(calibration(joined(parts))), flush=True)
 
@@ -659,6 +774,7 @@ def main() -> int:
     parser.add_argument("--set", dest="sets", nargs="*", default=[], help="settings of the filter, name=value")
     parser.add_argument("--frequencies", choices=("one", "two"), default="one")
     parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--causes", action="store_true", help="faults of whole trials: cause put in against named")
     parser.add_argument("--pairs", type=int, default=0, help="with --faults: so many pairs in their place")
     parser.add_argument("--fault-every", type=float, default=90.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -670,7 +786,7 @@ def main() -> int:
     given = "\n".join(args.sets)
     args.settings = {"frequencies": args.frequencies} | ({"tracking": tomllib.loads(given)} if given else {})
     known = cases(paths.DATA) if paths.DATA.is_dir() else {}
-    if not args.faults:
+    if not (args.faults or args.causes):
         print(HEAD)
     for name in args.folders or list(known):
         if name in known:
@@ -680,7 +796,9 @@ def main() -> int:
         case = case.part(0, len(case.observations.time), args.thin) if args.thin > 1 else case
         if args.whole:
             show_whole(case, args)
-        if args.faults:
+        if args.causes:
+            show_causes(case, args)
+        elif args.faults:
             show_faults(case, args)
         elif not args.no_starts:
             show_starts(case, args)

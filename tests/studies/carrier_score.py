@@ -43,7 +43,7 @@ from railfix.positioning.carrier import (
     track_jumps,
 )
 from railfix.positioning.normal_equations import position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.channels import clock_groups
 from railfix.run.processor import make_processor
@@ -102,7 +102,7 @@ def ranges_of(result: AntennaResult, code_m: np.ndarray, weight: np.ndarray) -> 
     columns = result.columns
     reason = result.reason[:, columns]
     used = (reason == 0) & np.isfinite(code_m) & np.isfinite(weight)
-    ties = ClockTies(offset_m=result.clock_offset_m, sigma_m=result.clock_offset_sigma_m)
+    ties = InterSystemBiases(offset_m=result.clock_offset_m, sigma_m=result.clock_offset_sigma_m)
     groups = clock_groups(result.satellite[columns].astype("<U1"))
     return Ranges(
         sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, (2.6e7, 0.0, 0.0)),

@@ -34,7 +34,7 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import misfit, position_on_line
-from railfix.positioning.range_arrays import FILLER_SATELLITE_M, ClockTies, Ranges
+from railfix.positioning.range_arrays import FILLER_SATELLITE_M, InterSystemBiases, Ranges
 from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
@@ -333,7 +333,7 @@ def ranges_of(result: AntennaResult, reasons: int = -1) -> Ranges:
         code_m=np.where(used, code, 0.0),
         weight=np.where(used, 1.0 / np.where(used, sigma, 1.0) ** 2, 0.0),
         groups=clock_groups(result.satellite[columns].astype("<U1")),
-        ties=ClockTies(offset_m=result.clock_offset_m, sigma_m=result.clock_offset_sigma_m)
+        ties=InterSystemBiases(offset_m=result.clock_offset_m, sigma_m=result.clock_offset_sigma_m)
         if len(result.clocks) > 1
         else None,
     )

@@ -15,8 +15,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
+from typer import Context
+from typer.main import get_group
+
 import paths
 from p1_page import SINGLE, figures
+from railfix.cli import app
 
 TABLE: Final = paths.ROOT / "docs" / "papers.md"
 DATA: Final[dict[str, Any]] = tomllib.loads(
@@ -40,6 +44,9 @@ def named(where: str) -> object:
     raise ImportError(where)
 
 
+PROGRAM: Final = get_group(app)
+
+
 @cache
 def tests() -> frozenset[str]:
     """All tests as file::function."""
@@ -57,6 +64,9 @@ def problems() -> list[str]:
             named(item["where"])
         except (ImportError, AttributeError):
             wrong.append(f"{item['what']}: there is no {item['where']}")
+        for command in re.findall(r"railfix ([\w-]+)", item["by"]):
+            if command not in PROGRAM.list_commands(Context(PROGRAM)):
+                wrong.append(f"{item['what']}: there is no command {command}")
         if "test" in item and item["test"] not in tests():
             wrong.append(f"{item['what']}: there is no test {item['test']}")
     return wrong
@@ -68,7 +78,8 @@ def document() -> str:
         "# The five papers, item by item",
         "",
         "Written by `python tests/studies/papers.py` from `tests/references/papers.toml` and kept outputs: each item,",
-        "what the paper asks, what is reached, function and test. An item without a test is open.",
+        "what the paper asks, what is reached, by which command (or Python alone, or a study of `tests/studies`),",
+        "function and test. An item without a test is open.",
     ]
     for paper, title in DATA["papers"].items():
         lines += ["", f"## {paper}: {title}", ""]
@@ -76,7 +87,7 @@ def document() -> str:
             asked = f"; asked: {item['asked']}" if "asked" in item else ""
             found = f"; reached: {reached(item)}" if reached(item) else ""
             test = f"`{item['test']}`" if "test" in item else "**open**"
-            lines.append(f"- {item['what']}{asked}{found}. `{item['where']}`, {test}")
+            lines.append(f"- {item['what']}{asked}{found}. By {item['by']}: `{item['where']}`, {test}")
     lines += ["", "## Where we read the papers differently", ""]
     for found in DATA["difference"]:
         why = f" Why: {found['why']}." if found["why"] else ""

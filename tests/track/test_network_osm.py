@@ -102,6 +102,9 @@ def test_a_feature_without_geometry_is_left_out_and_heights_of_zero_are_none(tmp
     segment = read_segments(path, MapReading(height_datum="ellipsoidal"))[0]
     assert any("1 feature 1 without geometry" in note for note in segment.notes)
     assert segment.height_datum == NO_HEIGHTS
+    table = tmp_path / "a.csv"
+    table.write_text("latitude_deg,longitude_deg,height_m\n46.5,7.0,0.0\n46.5,7.01,0.0\n")
+    assert read_segments(table, MapReading())[0].height_datum == NO_HEIGHTS
 
 
 @pytest.mark.requirement("A1")

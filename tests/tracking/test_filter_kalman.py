@@ -11,7 +11,9 @@ from kalman_oracle import GALILEO, Kalman, Oracle, S, V
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import SensorEpochs, Tracked, TrackingLimits, TrackState, smooth_steps, track
-from tracking_cases import ORIGIN_M, Ride, ride
+from railfix.tracking.chunk import prepare_chunk
+from railfix.tracking.search import places
+from tracking_cases import ORIGIN_M, Ride, part, ride
 
 #: One hypothesis, normal errors, nothing learnt of the noise and the map, every speed believed.
 NORMAL = TrackingLimits(
@@ -50,7 +52,9 @@ def case() -> tuple[Ride, SensorEpochs]:
 @pytest.fixture(scope="module")
 def expected(case: tuple[Ride, SensorEpochs]) -> Kalman:
     ride, sensors = case
-    return Oracle(ride.epochs, sensors, ride.line, NORMAL).run(200.0)
+    chunk = prepare_chunk(part(ride.epochs, slice(0, 1)), TrackState.empty(), NORMAL)
+    (start,), _ = places(chunk, 0, ride.line, NORMAL)
+    return Oracle(ride.epochs, sensors, ride.line, NORMAL).run(float(start))
 
 
 def assert_equal(found: Tracked, expected: Kalman) -> None:

@@ -11,9 +11,22 @@ from railfix.kernels.tracking.constants import ACROSS_LOST
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
+from railfix.tracking.chunk import prepare_chunk
+from railfix.tracking.search import places
 from railfix.tracking.state import Monitors, StateIndex, TrackState
 from railfix.tracking.velocity import singer_step
-from tracking_cases import Ride, bent_line, corner_line, part, reflected, ride, wheel, with_codes_behind, without_epochs
+from tracking_cases import (
+    ORIGIN_M,
+    Ride,
+    bent_line,
+    corner_line,
+    part,
+    reflected,
+    ride,
+    wheel,
+    with_codes_behind,
+    without_epochs,
+)
 
 
 def _in_parts(ride: Ride, cuts: list[int]) -> tuple[list[Tracked], TrackState | None]:
@@ -32,6 +45,21 @@ def test_noise_free_epochs_give_the_place_and_speed() -> None:
     assert np.abs(result.arc_m - case.arc_m)[settled].max() < 0.05
     assert np.abs(result.speed_mps - case.speed_mps)[settled].max() < 0.05
     assert (result.status[settled] == TrackStatus.TRACKING).all()
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("start_m", [190.0, 201.0, 208.0])
+def test_a_start_does_not_depend_on_where_the_map_has_its_points(start_m: float) -> None:
+    """Points 40 m apart, or one: at the vertices alone the place 20 m off left a second one 75 m away in doubt."""
+    found = []
+    for step in (40.0, 1.0):
+        points = ORIGIN_M[0] + np.arange(0.0, 2001.0, step)[:, None] * ORIGIN_M[1]
+        case = ride(5, trajectory=Trajectory.from_antenna_path(Track.from_ecef(points)), start_m=start_m, noise=1.0)
+        state = TrackState.empty()
+        chunk = prepare_chunk(part(case.epochs, slice(0, 1)), state, TrackingLimits())
+        found.append(places(chunk, 0, case.line, TrackingLimits())[0])
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+    assert np.abs(found[0][0] - start_m) < 10.0
 
 
 @pytest.mark.requirement("E5")

@@ -17,6 +17,8 @@ from railfix.kernels.tracking.constants import (
     FORCE_WALK_MPS2,
     FREEDOM_PLACE_M2,
     FREEDOM_SPEED_M2PS2,
+    OFFSET_WALK_M,
+    PASSES,
     RADAR_WALK,
     WHEEL_WALK,
 )
@@ -185,9 +187,37 @@ def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density()
         np.testing.assert_allclose(one.fit.residual, value - design @ gain @ value, atol=1e-5)
         np.testing.assert_allclose(one.fit.fitted, np.diagonal(design @ after @ design.T), rtol=1e-4)
         density.append(-0.5 * (value @ np.linalg.solve(innovation, value) + np.linalg.slogdet(innovation)[1]))
-        evidence.append(sum(recursion.compute_evidence(rows, (1e9, 1e9), limits.passes, one)))
+        evidence.append(sum(recursion.compute_evidence(rows, (1e9, 1e9), PASSES, one)))
     assert abs(density[0] - density[1]) > 0.3
     assert evidence[0] - evidence[1] == pytest.approx(density[0] - density[1], abs=1e-4)
+
+
+@pytest.mark.requirement("E5", "C2")
+def test_an_innovation_falls_by_what_its_row_gives_to_a_change_of_the_mean() -> None:
+    """All measurements, the error of a length of the map among the unknowns: a map aside turns into it in a bend."""
+    epochs, line, sensors = _case("sensors")
+    before, cut, limits = slice(0, 55), slice(55, 56), TrackingLimits()
+    _, state = track(part(epochs, before), line, sensors=_sensors_of(sensors, before))
+    own = _sensors_of(sensors, cut)
+    assert own is not None
+    chunk = prepare_chunk(part(epochs, cut), state, limits)
+    given = Recursion(chunk, line, own, limits, state, levels=False).given
+    packed = pack_state(state, chunk.time[0], limits, levels=False)
+    plain("tracking.recursion")._predict_all(given, 0, packed)
+    rows, module = plain("tracking.measurements").choose_measurements(given, 0, packed), plain("tracking.equations")
+    assert rows.sensor.stop > rows.sensor.start
+    x, step = packed.x[0], 0.01
+    at, found = (x[StateIndex.ARC], x[StateIndex.PREVIOUS_ARC]), module.new_equations(rows)
+    module.linearise(given, 0, rows, x, at, 1.0, found)
+    design = _design(rows, found, len(x))
+    for unknown in range(len(x)):
+        moved, other, shifted = x.copy(), module.new_equations(rows), module.new_equations(rows)
+        moved[unknown] += step
+        module.linearise(given, 0, rows, moved, at, 1.0, other)
+        change = -step * design[:, unknown]
+        np.testing.assert_allclose(other.value - found.value, change, rtol=1e-4, atol=2e-8, err_msg=str(unknown))
+        module.shift_sensors(rows, moved, x, found, shifted)
+        np.testing.assert_allclose((shifted.value - found.value)[rows.sensor], change[rows.sensor], atol=1e-12)
 
 
 def _ranged(case: Ride, *, kept: float) -> SensorEpochs:
@@ -343,13 +373,13 @@ def test_the_median_is_that_of_numpy(size: int) -> None:
 @pytest.mark.requirement("E5")
 def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
     """Clocks without a satellite and sensors that are not on board: their variances grow as those in use would."""
-    case, limits = ride(60), TrackingLimits()
+    case = ride(60)
     _, before = track(part(case.epochs, slice(0, 30)), case.line)
     _, after = track(part(case.epochs, slice(30, 60)), case.line, before)
     growth = np.diagonal(after.covariance[0] - before.covariance[0])
     walks = {
         StateIndex.WHEEL: WHEEL_WALK, StateIndex.RADAR: RADAR_WALK, StateIndex.FORCE_OFFSET: FORCE_WALK_MPS2,
-    } | {OFFSETS + CLOCKS.index(letter): limits.offset_walk_m for letter in "CRI"}  # fmt: skip
+    } | {OFFSETS + CLOCKS.index(letter): OFFSET_WALK_M for letter in "CRI"}  # fmt: skip
     for unknown, walk in walks.items():
         assert growth[unknown] == pytest.approx(30.0 * walk**2, rel=1e-6)
 

@@ -15,7 +15,7 @@ from railfix.cli import app
 from railfix.simulate.demonstration import demo_files
 from railfix.tracking import GnssEpochs, SensorEpochs, Tracked, TrackingLimits, TrackState, TrackStatus, track
 from railfix.tracking import levels as levels_of
-from railfix.tracking.levels import AccumulatedIncrement, LevelState, carried_levels, thin_epochs, track_with_levels
+from railfix.tracking.levels import AccumulatedIncrement, LevelState, carried_levels, decimate_epochs, track_with_levels
 from tracking_cases import Ride, part, ride, wheel
 
 LIMITS = TrackingLimits()
@@ -104,7 +104,7 @@ def test_thinned_epochs_have_what_was_measured_between() -> None:
     sigma = np.full(40, 0.5)
     sensors = SensorEpochs(wheel_m=way, wheel_sigma_m=sigma, force_mps2=force, force_sigma_mps2=sigma)
     epochs = replace(case.epochs, phase_joined=joined, phase_m=phase)
-    taken, some, sensed, since = thin_epochs(epochs, sensors, AccumulatedIncrement(), 1.0)
+    taken, some, sensed, since = decimate_epochs(epochs, sensors, AccumulatedIncrement(), 1.0)
     np.testing.assert_array_equal(taken, [0, 5, 15, 25, 35])
     np.testing.assert_array_equal(some.time, case.epochs.time[taken])
     assert sensed.wheel_m is not None
@@ -176,6 +176,24 @@ def test_a_filter_with_sub_filters_that_is_in_doubt_bounds_nothing(
 
 
 @pytest.mark.requirement("C2")
+def test_a_level_beyond_a_kilometre_is_none_and_the_place_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = ride(5)
+
+    def diverged(*inputs: object, **named: object) -> tuple[Tracked, TrackState]:
+        place, after = track(*inputs, **named)  # type: ignore[arg-type]
+        far = {
+            name: np.full(5, 990.0 if name == "ground_level_m" else 1500.0) for name in ("level_m", "ground_level_m")
+        }
+        return replace(place, status=np.full(5, TrackStatus.TRACKING, dtype=np.int8), **far), after
+
+    monkeypatch.setattr(levels_of, "track", diverged)
+    levels, _, _ = track_with_levels(case.epochs, case.line, None, LevelState(), LIMITS, SensorEpochs())
+    assert np.isposinf(levels.level_m[1:]).all()
+    assert np.isfinite(levels.ground_level_m[1:]).all()
+    assert (levels.status == TrackStatus.TRACKING).all()
+
+
+@pytest.mark.requirement("C2")
 def test_the_summary_of_a_run_has_the_level_of_the_filter(tmp_path: Path) -> None:
     files = {name: str(path) for name, path in demo_files().items() if name in ("front", "nav", "track", "vehicle")}
     options = [word for name, path in files.items() for word in (f"--{name}", path)]
@@ -190,7 +208,9 @@ def test_the_summary_of_a_run_has_the_level_of_the_filter(tmp_path: Path) -> Non
     summary = done.output.split("Filter along the track (train.csv)")[1]
     assert re.search(rf"indicative protection level, p50 │ +{finite.quantile(0.5):.2f} m", summary)
     assert len(finite) > 50
-    assert f"{len(finite)} │" in summary.split("with a level")[1]
+    for limit in (20, 50):
+        within = int((finite <= limit).sum())
+        assert re.search(rf"within {limit} m +│ +{within} │", summary)
     words = ["evaluate", str(tmp_path / "out"), "--reference", str(demo_files()["truth"])]
     judged = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert judged.exit_code == 0, judged.output

@@ -8,6 +8,7 @@ import pytest
 from plain_kernels import given, kernel_state, plain
 from posterior_score import bounds
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.kernels.tracking.constants import BRANCH_FLOOR, CODE_COMMON_M, MAP_BRANCH_M
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import TrackingLimits, TrackState, track
@@ -107,21 +108,19 @@ def _after(seconds_: int, motion: float, code: float, *, speed_mps: float = 10.0
 
 @pytest.mark.requirement("C6")
 def test_evidence_within_the_error_of_the_map_saturates() -> None:
-    limits = TrackingLimits()
     odds = _after(200, -2.0, 0.0)
-    assert odds[1] == pytest.approx(-2.25 / limits.map_branch_m**2)
+    assert odds[1] == pytest.approx(-2.25 / MAP_BRANCH_M**2)
     assert odds[3] < -300.0
 
 
 @pytest.mark.requirement("C6")
 def test_codes_alone_leave_a_near_branch_its_floor_and_decide_against_a_far_one() -> None:
-    limits = TrackingLimits()
     odds = _after(900, 0.0, -2.0)
-    assert odds[2] == pytest.approx(np.log(limits.branch_floor))
+    assert odds[2] == pytest.approx(np.log(BRANCH_FLOOR))
     assert odds[3] < -100.0
     # one independent epoch: d^2 / (2 code_common_m^2)
     first = _after(1, 0.0, -1e3)
-    assert first[2] == pytest.approx(-(18.0**2) / (2.0 * limits.code_common_m**2))
+    assert first[2] == pytest.approx(-(18.0**2) / (2.0 * CODE_COMMON_M**2))
 
 
 @pytest.mark.requirement("C6")
@@ -184,8 +183,7 @@ def test_of_laps_within_the_error_of_the_map_codes_of_the_last_half_minute_choos
 
 @pytest.mark.requirement("C6")
 def test_what_codes_said_of_a_branch_far_away_does_not_hold_once_it_is_near() -> None:
-    limits = TrackingLimits()
     probability, code = np.array([0.0, -60.0]), np.array([0.0, -60.0])
     near = np.array([[0.0, 0.0, 0.0], [18.0, 0.0, 0.0]])
     after, _ = judged(probability, code, np.zeros(2), np.zeros(2), near, 60.0, 600.0)
-    assert after[1] - after[0] == pytest.approx(np.log(limits.branch_floor))
+    assert after[1] - after[0] == pytest.approx(np.log(BRANCH_FLOOR))

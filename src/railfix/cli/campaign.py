@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
@@ -16,13 +17,14 @@ from rich.console import Console
 from railfix.cli.console import (
     TableConsole,
     prepare_kernels,
+    print_json,
     progress_bar,
     show_files,
     show_notes,
     show_table,
     show_verdict,
 )
-from railfix.cli.options import Choices, OutOption, Without, from_models, resolve_settings
+from railfix.cli.options import Choices, JsonOption, OutOption, Without, from_models, resolve_settings
 from railfix.core.errors import MismatchError, NoPositionError, SettingsError
 from railfix.core.tables import number, percent, plain_table
 from railfix.evaluate import Score
@@ -31,11 +33,13 @@ from railfix.evaluate.benchmark import heads, run_benchmark, shown_rows
 from railfix.report.campaign import report_campaign, write_campaign_page
 from railfix.run import RunInputs, RunOptions
 from railfix.run.campaign import run_campaign
-from railfix.run.inputs import ColumnNames
+from railfix.run.inputs import ColumnNames, LogReading
 
 
+@from_models
 def campaign(
     path: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="Patterns of logs and navigation, track.")],
+    reading: LogReading,
     *,
     out: OutOption,
     workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Processes side by side.")] = 2,
@@ -47,6 +51,7 @@ def campaign(
             help="Use the workers of a Dask scheduler, tcp://HOST:PORT, that see the same files (extra `cluster`).",
         ),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     r"""Position all logs of a campaign, each into its own folder; a killed campaign is continued.
 
@@ -75,26 +80,31 @@ def campaign(
     """
     with open_executor(workers, scheduler) as (executor, lost):
         prepare_kernels()
-        table = run_campaign(path, out=out, executor=executor, progress=show_progress, lost=lost)
+        table = run_campaign(path, out=out, executor=executor, reading=reading, progress=show_progress, lost=lost)
     failed = table.filter(status="failed")
     report = report_campaign(table, out)
     page = write_campaign_page(report, out / "campaign.html", title=f"railfix campaign: {path.stem}")
-    console = TableConsole()
-    show_verdict(console, [*report.sentences, f"next: open {page}"])
-    for found in report.tables:
-        show_table(console, found)
-    show_notes(console, report.notes)
-    show_files(console, [out / "campaign.csv", page])
+    files = [out / "campaign.csv", page]
+    if as_json:
+        print_json({"runs": table.to_dicts(), "sentences": report.sentences, "notes": report.notes, "files": files})
+    else:
+        console = TableConsole()
+        show_verdict(console, [*report.sentences, f"next: open {page}"])
+        for found in report.tables:
+            show_table(console, found)
+        show_notes(console, report.notes)
+        show_files(console, files)
     if len(failed) == len(table):
         raise NoPositionError(f"every run has failed; the first: {failed['error'][0]}")
     if len(failed):
         raise MismatchError(f"{len(failed)} of {len(table)} runs failed; the first: {failed['error'][0]}")
 
 
-def show_progress(*, done: int, failed: int, total: int, left_s: float) -> None:
-    """Print how many runs are done, and the time left."""
+def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
+    """Print how many runs are done, those of an earlier call among them, and the time left."""
     minutes, seconds = divmod(round(left_s), 60)
-    typer.echo(f"{done} of {total} runs, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
+    before = f" ({kept} from before)" if kept else ""
+    typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
     sys.stderr.flush()
 
 
@@ -105,8 +115,13 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
     SettingsError: there is no such scheduler, or `distributed` is not installed.
     """
     if scheduler is None:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            yield pool, (BrokenExecutor,)
+        context, default = get_context("spawn"), (signal.SIGINT, signal.SIG_DFL)
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=signal.signal, initargs=default) as pool:
+            try:
+                yield pool, (BrokenExecutor,)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
         return
     try:
         from distributed import Client, KilledWorker
@@ -215,7 +230,7 @@ def ablate(
     inputs = inputs.replaced(config=choices.config)
     with progress_bar() as progress:
         ablation = ablate_files(
-            inputs, settings, out=out, options=options, asked=asked, names=columns.names, progress=progress
+            inputs, settings, out=out, options=options, asked=asked, reading=columns, progress=progress
         )
     show_ablation(ablation)
 

@@ -101,6 +101,9 @@ class Commands(TyperGroup):
             if extra is None:
                 raise
             _end(SettingsError(f"this needs {error.name}, which is not installed; pip install 'railfix[{extra}]'"))
+        except KeyboardInterrupt:
+            typer.echo("railfix: interrupted; what was unfinished is removed, finished files are kept", err=True)
+            raise typer.Exit(SIGNALLED + signal.SIGINT) from None
         except MemoryError:
             _end(SettingsError("this needs more memory than there is; give a shorter time or fewer epochs at a time"))
         except RuntimeError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,9 +18,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column as TableColumn
 from rich.table import Table as RichTable
 from rich.text import Text
+from typer import echo
 
 from railfix import kernels
 from railfix.core.tables import Table, plural
+from railfix.run.output import finite_values
 from railfix.run.record import budget_tables, level_basis
 
 if TYPE_CHECKING:
@@ -37,14 +40,24 @@ _ANTENNAS: Final = ("front", "rear")
 _OVERCONFIDENT: Final = 3.0
 
 
-def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Say for each run and antenna how good its positions are and whether what it states is true; the worst first."""
+def print_json(values: Mapping[str, Any]) -> None:
+    """Print plain values as one line of JSON; NaN, infinities and paths are written as texts."""
+    echo(json.dumps(finite_values(values), default=str, allow_nan=False))
+
+
+def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """Return the figures of each run and antenna over its own epochs on the map, the worst first."""
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("position") == "constrained",
         pl.col("run") != "all", pl.col("antenna") != "all",
     ).sort("p95_m", descending=True, nulls_last=False)  # fmt: skip
+    return rows.to_dicts()
+
+
+def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
+    """Say for each run and antenna how good its positions are and whether what it states is true; the worst first."""
     room = _MOST - 1
-    texts = [_judge(row) for row in rows.iter_rows(named=True)]
+    texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
         texts = [*texts[: room - 1], f"and {len(texts) - room + 1} better ones, in the tables below"]
     paths, references = ({str(getattr(run, what)) for run in evaluation.runs} for what in ("path", "reference"))

@@ -12,6 +12,8 @@ from rich.console import Console
 
 from railfix.cli.console import (
     TableConsole,
+    list_antenna_errors,
+    print_json,
     show_files,
     show_notes,
     show_table,
@@ -19,6 +21,7 @@ from railfix.cli.console import (
     verdict_of_evaluation,
 )
 from railfix.cli.options import (
+    JsonOption,
     OutOption,
     OverwriteOption,
     Without,
@@ -106,6 +109,7 @@ def evaluate(
         bool, typer.Option("--beside-p1", rich_help_panel="Choices", help="Also show the results of the source paper.")
     ] = False,
     overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     r"""Compute errors of runs along the line against references, and statistics of them.
 
@@ -146,7 +150,11 @@ def evaluate(
         with OutputFolder(out, overwrite=overwriting(overwrite), inputs=read) as folder:
             evaluation = evaluate_runs(pairs, sections=inputs.sections, files=files, options=options)
             written = write_evaluation(evaluation, folder)
-    show_evaluation(evaluation, written, beside="p1" if beside_p1 else "nothing")
+    if as_json:
+        notes = [note for run in evaluation.runs for note in run.notes]
+        print_json({"antennas": list_antenna_errors(evaluation), "notes": notes, "files": list(written.values())})
+    else:
+        show_evaluation(evaluation, written, beside="p1" if beside_p1 else "nothing")
 
 
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:
@@ -252,7 +260,7 @@ def error_model(
     position = beside.base_position
     place = None if position is None else parse_position(position, "--base-position")
     inputs = [
-        ModelInputs(run=run, reference=file, base=beside.base, base_position_ecef_m=place, columns=beside.columns.names)
+        ModelInputs(run=run, reference=file, base=beside.base, base_position_ecef_m=place, columns=beside.columns)
         for run, file in zip(runs, reference, strict=True)
     ]
     model, samples = error_model_from_runs(inputs, fit=fit)

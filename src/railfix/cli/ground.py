@@ -22,6 +22,7 @@ from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
 
 if TYPE_CHECKING:
+    from railfix.ground.station_fixes import StationFixes
     from railfix.ground.triangle import Order
 
 app = command_group("ground")
@@ -48,6 +49,7 @@ class MonitorChoices(Settings):
         (),
         metavar="LAT,LON,HEIGHT",
     )
+    fixes: bool = option("The logs are positions of the receivers, computed elsewhere (RTK, PPP-RTK, CLAS).", False)
     live: bool = option("Judge streams as they arrive, once a second.", False)
     for_s: float | None = option("With --live: end after this time.", None, name="--for", metavar="S", ge=0)
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
@@ -64,7 +66,8 @@ def monitor(
         list[str],
         typer.Argument(
             metavar="OBS OBS OBS",
-            help="RINEX observation files of the three receivers; with --live their streams, as of `railfix live`.",
+            help="RINEX observation files of the three receivers; with --fixes logs of positions (.pos, NMEA, CSV); "
+            "with --live streams, as of `railfix live`.",
         ),
     ],
 ) -> None:
@@ -75,42 +78,34 @@ def monitor(
 
     Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
 
+    With --fixes the logs are positions that another program or service has computed, such as CLAS.
+
+    Example: `railfix ground monitor --fixes a.pos b.pos c.pos --point ... --point ... --point ... --out monitor`
+
     With --live the logs are streams, judged as they arrive until they end; monitor.csv grows with them.
 
     Example: `railfix ground monitor --live tcp://10.0.0.1:2101 tcp://10.0.0.2:2101 tcp://10.0.0.3:2101 --point ...`
 
     Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
     """
-    from railfix.ground.station_fixes import station_fixes
     from railfix.ground.triangle import TriangleVerdict, draw_triangle, monitor_log
-    from railfix.io import read_navigation, read_observations
 
     if len(logs) != 3:
         raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
-    out, point, nav = choices.out, choices.point, choices.nav
+    out = choices.out
     files = [out / "monitor.csv", out / "triangle.png"]
     if out.exists():
-        inputs = [*(Path(log) for log in logs), *nav]
+        inputs = [*(Path(log) for log in logs), *choices.nav]
         overwrite = choices.overwrite == "replace"
         check_outputs((files[0], "any"), (files[1], "any"), overwrite=overwrite, inputs=inputs)
-    if len(point) not in (0, 3):
-        raise SettingsError(f"--point was given {len(point)} times; give it once for each receiver")
+    if len(choices.point) not in (0, 3):
+        raise SettingsError(f"--point was given {len(choices.point)} times; give it once for each receiver")
+    if choices.live and choices.fixes:
+        raise SettingsError("--live judges streams of observations; --fixes is for logs of positions")
     if choices.live:
         _monitor_live(logs, choices, files[0], limits=limits, times=times)
         return
-    if not nav:
-        raise SettingsError("--nav is missing: logs need navigation files")
-    observations = [read_observations(path) for path in logs]
-    if point:
-        from railfix.run.processor import parse_position
-
-        points = np.stack([parse_position(text, "--point") for text in point])
-    else:
-        points = np.stack([log.header.approximate_ecef_m for log in observations])
-        for log, known in zip(logs, points, strict=True):
-            if not np.isfinite(known).all():
-                raise MismatchError(f"{log}: the header has no position; give the known points with --point")
-    fixes = station_fixes(observations, points, read_navigation(nav))
+    fixes = _read_fixes(logs, choices)
     result = monitor_log(fixes, limits=limits, times=times)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -128,6 +123,30 @@ def monitor(
     if not result.orders:
         console.print("no stop")
     show_files(console, files)
+
+
+def _read_fixes(logs: list[str], choices: MonitorChoices) -> StationFixes:
+    """Read the positions of the three receivers, or compute them from their observations."""
+    from railfix.ground.station_fixes import fixes_of_positions, station_fixes
+    from railfix.io import read_navigation, read_observations, read_positions
+    from railfix.run.processor import parse_position
+
+    points = np.array([parse_position(text, "--point") for text in choices.point])
+    if choices.fixes:
+        if choices.nav:
+            raise SettingsError("--nav has no use with --fixes: positions are not computed again")
+        if not len(points):
+            raise SettingsError("--point is missing: logs of positions name no known points; give it for each receiver")
+        return fixes_of_positions([read_positions(path) for path in logs], points)
+    if not choices.nav:
+        raise SettingsError("--nav is missing: logs need navigation files")
+    observations = [read_observations(path) for path in logs]
+    if not len(points):
+        points = np.stack([log.header.approximate_ecef_m for log in observations])
+        for log, known in zip(logs, points, strict=True):
+            if not np.isfinite(known).all():
+                raise MismatchError(f"{log}: the header has no position; give the known points with --point")
+    return station_fixes(observations, points, read_navigation(choices.nav))
 
 
 def _monitor_live(

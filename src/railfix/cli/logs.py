@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 import typer
 
-from railfix.cli.console import TableConsole, show_files, show_notes, show_table
+from railfix.cli.console import TableConsole, print_json, show_files, show_notes, show_table
 from railfix.cli.options import (
     Choices,
+    JsonOption,
     OverwriteOption,
     Without,
     check_outputs,
@@ -39,6 +40,7 @@ def locate(
     *,
     out: Annotated[Path, typer.Option(metavar="FILE.pos", help="Positions to write, RTKLIB's solution format.")],
     overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Compute conventional 3-D positions with standard deviations from a log alone, without a track map.
 
@@ -52,6 +54,9 @@ def locate(
     check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
     summary = locate_files(inputs, settings, out=out, reading=reading)
+    if as_json:
+        print_json({**asdict(summary), "files": [out]})
+        return
     console = TableConsole()
     north, east, up = summary.sigma_m
     console.print(
@@ -214,9 +219,7 @@ def doctor(
         list[Path], typer.Argument(metavar="FILE...", help="Logs, navigation, track, vehicle, references.")
     ],
     *,
-    as_json: Annotated[
-        bool, typer.Option("--json", rich_help_panel="Choices", help="Print the findings as one line of JSON.")
-    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Examine files before a run: what each is, whether they fit together, and the command to run.
 
@@ -231,10 +234,10 @@ def doctor(
     diagnosis = examine_files(files)
     problems = diagnosis.problems
     if as_json:
-        typer.echo(json.dumps(diagnosis.as_dict()))
+        print_json(diagnosis.as_dict())
         raise typer.Exit(5 if problems else 0)
     console = TableConsole()
-    verdict = f"{plural(problems, 'thing')} to mend" if problems else "the files fit together"
+    verdict = f"{plural(problems, 'problem')} to fix" if problems else "the files fit together"
     console.print(f"{len(diagnosis.findings)} files: {verdict}")
     for problem in problems:
         console.print(f"- {problem}")

@@ -227,6 +227,7 @@ def from_positions_command(
         log, spacing_m=spacing, quality=_qualities(quality), max_sigma_m=max_sigma, name=name or positions.stem
     )
     write_track_csv(track, out)
+    show_notes(TableConsole(), log.notes)
     _print_thinned(track, thinned, len(log), out)
 
 

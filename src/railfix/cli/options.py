@@ -35,6 +35,9 @@ VerboseOption = Annotated[
     bool,
     typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables of statuses and reasons."),
 ]
+JsonOption = Annotated[
+    bool, typer.Option("--json", rich_help_panel="Choices", help="Print the verdict as one line of JSON.")
+]
 
 
 def overwriting(asked: bool) -> Overwrite:

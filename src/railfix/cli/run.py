@@ -9,8 +9,17 @@ from typing import Annotated, Any, Final
 import typer
 
 from railfix.cli.command import SIGNALLED
-from railfix.cli.console import prepare_kernels, progress_bar, show_summary
-from railfix.cli.options import Choices, OutOption, VerboseOption, Without, from_models, resolve_settings, set_value
+from railfix.cli.console import prepare_kernels, print_json, progress_bar, show_summary
+from railfix.cli.options import (
+    Choices,
+    JsonOption,
+    OutOption,
+    VerboseOption,
+    Without,
+    from_models,
+    resolve_settings,
+    set_value,
+)
 from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
@@ -27,6 +36,7 @@ def run(
     *,
     out: OutOption,
     verbose: VerboseOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     r"""Positions along the line from receiver logs, navigation files and a track map.
 
@@ -62,7 +72,10 @@ def run(
     sys.setswitchinterval(_TURN_S)
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
-    show_summary(summary, verbose=verbose)
+    if as_json:
+        print_json({**summary.verdict.as_dict(), "files": list(summary.files.values())})
+    else:
+        show_summary(summary, verbose=verbose)
 
 
 @from_models

@@ -49,6 +49,16 @@ def kernel_array(array: NDArray[Any]) -> Floats:
     return read_only(np.ascontiguousarray(array, dtype=np.float64))
 
 
+def masked_median(values: Floats, known: Masks) -> Floats:
+    """Return the median of the known values of each row, shape (T,); NaN for a row without any."""
+    if not values.shape[1]:
+        return np.full(len(values), np.nan)
+    ordered, count = np.sort(np.where(known, values, np.inf), axis=1), known.sum(axis=1)
+    rows = np.arange(len(values))
+    low, high = ordered[rows, np.maximum(count - 1, 0) // 2], ordered[rows, np.minimum(count // 2, values.shape[1] - 1)]
+    return np.where(count > 0, 0.5 * (low + high), np.nan)
+
+
 def freeze_arrays(instance: DataclassInstance) -> None:
     """Replace the array fields of a dataclass by read-only views; to be called in its `__post_init__`."""
     vars(instance).update({n: read_only(v) for n, v in vars(instance).items() if isinstance(v, np.ndarray)})

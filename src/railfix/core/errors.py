@@ -57,6 +57,13 @@ class SettingsError(RailfixError):
     exit_code = 4
 
 
+def check_type(value: object, expected: type, *, what: str, hint: str = "") -> None:
+    """Raise SettingsError where an argument is not of the type that is expected; `hint` says how to get one."""
+    if not isinstance(value, expected):
+        made = f"; {hint}" if hint else ""
+        raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{made}")
+
+
 class MismatchError(RailfixError):
     """Inputs are readable but do not match each other (another day, another place)."""
 

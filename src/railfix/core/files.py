@@ -8,12 +8,11 @@ temporary file).
 from __future__ import annotations
 
 import codecs
-import gzip
+import errno
 import hashlib
 import importlib.resources
 import io
 import json
-import lzma
 import os
 import re
 import shutil
@@ -21,8 +20,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from functools import cache
 from os import PathLike
@@ -31,8 +29,8 @@ from typing import IO, Any, Final, Literal, cast
 
 import ncompress
 
-from railfix.core.errors import InputFileError, OutputError
-from railfix.core.packed import COMPRESS, STREAMS, ZIP, open_zip, zip_member
+from railfix.core.errors import InputFileError, OutputError, SettingsError
+from railfix.core.packed import COMPRESS, STREAMS, ZIP, damage_errors, open_zip, zip_member
 
 FilePath = str | PathLike[str]
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
@@ -76,7 +74,7 @@ class ByteStream(io.BufferedIOBase):
             return self._source.read(-1 if size is None else size)
         except EOFError as error:
             raise InputFileError(self.path, "the packed data end early; copy or download it again") from error
-        except (zlib.error, gzip.BadGzipFile, lzma.LZMAError, zipfile.BadZipFile) as error:
+        except damage_errors() as error:
             raise InputFileError(self.path, f"the packed data are damaged ({error}); download it again") from error
         except OSError as error:
             raise InputFileError(self.path, f"cannot be read ({error.strerror or error})") from error
@@ -123,10 +121,12 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of texts; ValueError where there is none."""
-    names = [paths] if isinstance(paths, str | PathLike) else list(paths)
+    """Return one or several paths as a list of texts; ValueError where there is none, SettingsError: it is no path."""
+    names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise ValueError("no file was given")
+    if wrong := [name for name in names if not isinstance(name, str | PathLike)]:
+        raise SettingsError(f"a path, or several, were expected, got {type(wrong[0]).__name__}")
     return [str(name) for name in names]
 
 
@@ -163,7 +163,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             raise InputFileError(path, "is empty")
         if content == "text" and head.startswith(_UTF16):
             source = _as_utf8(path, source, held)
-        elif content == "text" and b"\0" in head:
+        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # at the end a power cut leaves them
             raise InputFileError(path, "is binary, a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
@@ -305,7 +305,21 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
             if temporary.parent.is_dir():
                 temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise OutputError(f"{target}: the {what} cannot be written ({error.strerror or error})") from error
+        raise write_error(target, error, what=f"the {what} ") from error
+
+
+#: Errors of a file system without room, and what to do.
+_FULL: Final = {
+    errno.ENOSPC: "free some space on the disk, or name a folder on another",
+    errno.EDQUOT: "free some of your quota, or name a folder elsewhere",
+    errno.EFBIG: "name a folder on a file system for larger files",
+}
+
+
+def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputError:
+    """Return the error of a file that cannot be written: the system's reason, and what to do about it."""
+    hint = _FULL.get(error.errno or 0, "name a folder that can be written to")
+    return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
 
 
 def read_text_lines(path: FilePath) -> list[str]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import bz2
 import gzip
-import io
 import lzma
+import sys
 import zipfile
+import zlib
 from collections.abc import Callable
-from contextlib import suppress
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -19,18 +19,14 @@ from railfix.core.errors import InputFileError
 FilePath = str | PathLike[str]
 
 
-def read_zstd(source: IO[bytes]) -> IO[bytes]:
-    """Return a reader of zstd data, by the standard library (3.14) or the package zstandard."""
-    for module in ("compression.zstd", "backports.zstd"):
-        with suppress(ModuleNotFoundError):
-            reader: IO[bytes] = import_module(module).ZstdFile(source)
-            return reader
-    try:
-        data = import_module("zstandard").ZstdDecompressor().stream_reader(source).read()
-    except ModuleNotFoundError:
-        name = getattr(source, "name", "the file")
-        raise InputFileError(str(name), "is packed by zstd; pip install zstandard, or unpack it") from None
-    return io.BytesIO(data)
+def _zstd() -> Any:
+    """Return the module of zstd: that of the standard library (3.14), or the same for older versions."""
+    return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+
+
+def damage_errors() -> tuple[type[Exception], ...]:
+    """Return the errors that the readers of packed data raise where the data are damaged."""
+    return zlib.error, gzip.BadGzipFile, lzma.LZMAError, zipfile.BadZipFile, _zstd().ZstdError
 
 
 def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
@@ -63,5 +59,5 @@ STREAMS: Final[dict[bytes, Callable[[IO[bytes]], Any]]] = {
     b"\x1f\x8b": lambda source: gzip.GzipFile(fileobj=source, mode="rb"),
     b"BZh": bz2.BZ2File,
     b"\xfd7zXZ": lzma.LZMAFile,
-    b"(\xb5/\xfd": read_zstd,
+    b"(\xb5/\xfd": lambda source: _zstd().ZstdFile(source),
 }

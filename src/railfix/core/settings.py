@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args, get_origin
@@ -47,6 +47,18 @@ class Settings(BaseModel):
                 raise SettingsError(f"{type(self).__name__}: {first_fault(type(self), error)}") from None
 
         __init__.__pydantic_base_init__ = True  # validation of files does without it
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            raise SettingsError(
+                f"{type(self).__name__} cannot be changed; make another one: settings.replaced({name}={value!r})"
+            )
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Show the settings that are not as by default."""
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if field.is_required() or value != field.get_default(call_default_factory=True):
+                yield name, value
 
     @field_validator("*", mode="before")
     @classmethod

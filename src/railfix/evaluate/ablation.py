@@ -25,7 +25,7 @@ from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.driver import Progress, collect_notes, open_inputs, read_samples_and_units
-from railfix.run.inputs import RunInputs, RunOptions
+from railfix.run.inputs import ColumnNames, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import make_processor
 from railfix.run.record import NO_FIGURES, RunProvenance, package_versions, run_record
@@ -140,7 +140,7 @@ def ablate_files(
     out: Path,
     options: RunOptions | None = None,
     asked: Mapping[str, Any] | None = None,
-    names: Mapping[str, str] | None = None,
+    reading: ColumnNames | None = None,
     progress: Progress | None = None,
 ) -> Ablation:
     """Process the logs with every choice of screens and sources, and write ``ablation.csv`` and ``ablation.json``."""
@@ -153,7 +153,11 @@ def ablate_files(
     ):
         entries = inputs.entries(pool, out)
         antennas = tuple(inputs.logs)
-        truth = None if inputs.truth is None else read_reference(inputs.truth, antennas, columns=names)
+        truth = (
+            None
+            if inputs.truth is None
+            else read_reference(inputs.truth, antennas, **(reading or ColumnNames()).arguments)
+        )
         navigation, line, logs = open_inputs(inputs, options, config)
         screens, left_out = judging_screens(config, line.trajectories)
         # protection levels are not part of the result

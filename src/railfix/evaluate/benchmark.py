@@ -264,8 +264,8 @@ def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path],
     logs: dict[str, tuple[PositionLog, Antenna]] = {} if note else {RTKLIB_SINGLE: (read_positions(single), "front")}
     notes += [note] if note else []
     for name, other in case.content.positions.items():
-        columns = other.columns.names
-        logs[name] = read_positions(case.folder.absolute() / other.file, columns=columns), other.antenna
+        reading = other.columns.arguments
+        logs[name] = read_positions(case.folder.absolute() / other.file, **reading), other.antenna
     folders = {name: out / re.sub(r"[^\w.-]+", "_", name) for name in logs}
     for name, (log, antenna) in logs.items():
         write_program_run(log, run.out, folders[name], antenna)

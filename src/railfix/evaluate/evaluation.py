@@ -200,8 +200,8 @@ def _evaluate(
             raise MismatchError(f"{path}: is a table of the run itself; give a reference that was measured otherwise")
         key = path, tuple(folder.antennas)
         if key not in read:
-            names = options.columns.names
-            read[key] = read_reference(path, folder.antennas, quality=options.reference_quality, columns=names)
+            reading = options.columns.arguments
+            read[key] = read_reference(path, folder.antennas, quality=options.reference_quality, **reading)
         references, source = read[key], str(path)
         inputs.append(fingerprint("reference", path))
     stretches = None

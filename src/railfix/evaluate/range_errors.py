@@ -253,7 +253,7 @@ class ModelInputs:
     reference: Path  #: Reference trajectory of its antennas (`railfix.io.reference_log`).
     base: tuple[Path, ...] = ()  #: RINEX files of a nearby reference station; may be empty.
     base_position_ecef_m: Floats | None = None  #: Of the station, where its header is not good enough; shape (3,).
-    columns: Mapping[str, str] = field(default_factory=dict)  #: Names of columns in a reference that is CSV.
+    columns: ColumnNames = field(default_factory=ColumnNames)  #: How to read the reference.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -321,7 +321,7 @@ def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErr
     past = read_record(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options, past.config)
-    references = read_reference(source.reference, tuple(past.inputs.logs), columns=source.columns)
+    references = read_reference(source.reference, tuple(past.inputs.logs), **source.columns.arguments)
     processor = make_processor(past.config.replaced(filter="off"), navigation, line.trajectories)
     state = State()
     base: StationErrors | None = None

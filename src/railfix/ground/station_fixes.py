@@ -17,6 +17,7 @@ from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
+from railfix.io.position_log import PositionLog
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import ReceivedData, arrivals, fresh_state, next_arrival
 from railfix.pipeline.channels import ChannelBook
@@ -126,6 +127,22 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
         n_satellites=np.stack([item.n_used for item in ranges]).max(axis=0),
         cn0_fallen=cn0_fallen,
     )
+
+
+def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
+    """Return fixes that other programs or services have computed (RTK, PPP-RTK), one log per receiver.
+
+    Whether they are from the same satellites is not known: `n_satellites` is 0. MismatchError: no epoch in common.
+    """
+    known = [np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time) for log in logs]
+    epochs = [round_tags(log.time[rows]) for log, rows in zip(logs, known, strict=True)]
+    if not len(reduce(np.intersect1d, epochs)):
+        raise MismatchError("the logs have no epoch in common; positions of the same time are needed")
+    nothing = no_fixes(reduce(np.union1d, epochs), points_ecef_m)
+    fixes, plane = nothing.fixes_m.copy(), axes_at(points_ecef_m[0])[:2]
+    for k, (log, rows) in enumerate(zip(logs, known, strict=True)):
+        fixes[np.searchsorted(nothing.time, epochs[k]), k] = (log.ecef_m[rows] - points_ecef_m[0]) @ plane.T
+    return replace(nothing, fixes_m=fixes)
 
 
 def no_fixes(time: Datetimes, points_ecef_m: Floats) -> StationFixes:

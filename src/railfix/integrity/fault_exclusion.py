@@ -36,6 +36,7 @@ class RaimResult:
     #: Before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
     statistic: Floats
     threshold: Floats
+    scale: Floats  #: Noise scale that the residuals are compared with, from earlier epochs; shape (T,).
     excluded: Masks  #: Shape (T, K).
     own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
     #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN where
@@ -55,7 +56,8 @@ def compute_statistic(
     found = _detect(ranges, fix, scale, limits or RaimLimits())
     return RaimResult(
         outcome=np.full(len(ranges), int(Outcome.UNTESTABLE), dtype=np.int8), statistic=found.statistic,
-        threshold=found.threshold, excluded=np.zeros(ranges.code_m.shape, dtype=bool),
+        threshold=found.threshold, scale=np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),)),
+        excluded=np.zeros(ranges.code_m.shape, dtype=bool),
         own_error_m=np.full(ranges.code_m.shape, np.nan), protection_level_m=np.full(len(ranges), np.nan),
     )  # fmt: skip
 

@@ -66,7 +66,7 @@ class EpochOrder:
     def _rises(self) -> bool:
         """Return whether all epochs that are held follow each other and those that were handed on."""
         last = [self._times[-1][-1:]] if self._times else []
-        time = np.concatenate([*last, *(run.epochs.time for run in self._held)])
+        time = np.concatenate([*last, *(run.epochs.time for run in self._held), np.empty(0, "datetime64[ns]")])
         return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
 
     def _hand_on(self, part: Observations) -> Observations:

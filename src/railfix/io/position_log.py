@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import FilePath, read_text
+from railfix.core.files import LENIENT, BrokenLines, FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.core.settings import misspelt
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, timedelta, utc_to_gpst
-from railfix.io.named_columns import NamedColumns, fails, read_named_columns, with_usual_names
+from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
 
 SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
 #: Columns of a CSV log; the time is GPS time, UTC, Unix time, or GPS week and seconds; geodetic or ECEF.
@@ -45,6 +45,7 @@ class PositionLog:
     ratio: Floats | None = None  #: Ratio of the ambiguity test, where the log has it; shape (n,).
     #: Latitude and longitude of all rows, where some have no height; shape (n, 2).
     plan_deg: Floats | None = None
+    antennas: tuple[str, ...] = ()  #: Names of antennas in a table that has them.
 
     @property
     def geodetic(self) -> tuple[Floats, Floats, Floats]:
@@ -63,13 +64,43 @@ class PositionLog:
         return bool((self.quality >= 0).any())
 
 
-def read_csv_positions(path: FilePath, *, columns: Mapping[str, str] | None = None) -> PositionLog:
-    """Read positions of one antenna from a table with named columns; see `railfix.io.positions.read_positions`."""
-    table = rename_columns(read_named_columns(path), columns or {}, known=CSV_COLUMNS)
+#: Broken lines of a log after which it is none.
+_MOST_BROKEN: Final = 200
+Parsed = TypeVar("Parsed")
+
+
+def skip_broken(
+    path: FilePath, parse: Callable[[list[str]], Parsed], *, broken_lines: BrokenLines
+) -> tuple[Parsed, tuple[str, ...]]:
+    """Parse the lines of a log; return the result, and a note on each line that was skipped.
+
+    With "count" every broken line below the first is skipped, else a last line alone that has no end, as a power cut
+    leaves it. InputFileError: a line is broken, and the message names the option that skips it.
+    """
+    text = read_text(path)
+    lines = text.splitlines()
+    cut = len(lines) if not text.endswith(("\n", "\r")) else None
+    first = next((number for number, line in enumerate(lines, start=1) if line.strip() and line[0] not in "#%"), 0)
+    notes: list[str] = []
+    while True:
+        try:
+            return parse(lines), tuple(notes)
+        except InputFileError as error:
+            if error.line is None or error.line <= first or not lines[error.line - 1].strip():
+                raise
+            if broken_lines == "stop" and error.line != cut:
+                raise InputFileError(path, f"{error.message}; {LENIENT}", line=error.line) from None
+            if len(notes) == _MOST_BROKEN:
+                raise InputFileError(path, f"over {_MOST_BROKEN} lines are broken; the last one: {error}") from None
+            notes.append(f"{error}; the line was skipped")
+            lines[error.line - 1] = ""
+
+
+def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> PositionLog:
+    """Parse the positions in a table with named columns; see `railfix.io.positions.read_positions`."""
+    table = rename_columns(parse_named_columns(lines, path), columns, known=CSV_COLUMNS)
     antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
-    if len(antennas) > 1:
-        raise InputFileError(path, f"has positions of {' and '.join(antennas)}; give those of one antenna")
-    return positions_of_table(table)
+    return replace(positions_of_table(table), antennas=tuple(antennas))
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
@@ -179,6 +210,8 @@ def positions_times(table: NamedColumns) -> Datetimes:
 def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
     """Parse a column of dates with times: ISO 8601, or the same with slashes; UTC may end in Z."""
     cells = [cell.replace("/", "-") for cell in table.cells[name].to_list()]
+    if table.separator != ",":
+        cells = [cell.replace(",", ".") for cell in cells]
     if name == "time_utc":
         cells = [cell.removesuffix("Z").removesuffix("+00:00").strip() for cell in cells]
     for row, cell in enumerate(cells):
@@ -206,9 +239,8 @@ def _times(texts: list[str]) -> Datetimes:
 # --- RTKLIB ------------------------------------------------------------------
 
 
-def read_rtklib_positions(path: FilePath) -> PositionLog:
-    """Read RTKLIB's solution format (manual 2.4.2, B.1); baselines and heights above the geoid are rejected."""
-    lines = read_text(path).splitlines()
+def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
+    """Parse RTKLIB's solution format (manual 2.4.2, B.1); baselines and heights above the geoid are rejected."""
     header = [line for line in lines if line.startswith("%")]
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]
     scale, names = _rtklib_header(path, header)
@@ -219,8 +251,8 @@ def read_rtklib_positions(path: FilePath) -> PositionLog:
     sexagesimal = any("(d'" in name for name in names[:2])
     fixed = 2 + (7 if sexagesimal else 3)
     for line, row in zip(number, fields, strict=True):
-        if len(row) < fixed + 1:
-            message = f"{len(row)} fields; time, coordinates and quality were expected"
+        if len(row) < max(fixed + 1, len(fields[0])):
+            message = f"{len(row)} fields; time, coordinates, quality and as many as in the first row were expected"
             raise InputFileError(path, message, line=int(line))
     time = _rtklib_times(path, number, [(row[0], row[1]) for row in fields], scale)
     width = min(len(row) for row in fields)

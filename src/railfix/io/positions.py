@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, Literal
 
@@ -16,8 +17,9 @@ from railfix.core.files import BrokenLines, FilePath, ending, read_text
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.tables import plural
 from railfix.core.timescale import from_week, utc_to_gpst
+from railfix.gnss.observations import first_problems
 from railfix.io.nmea import read_nmea
-from railfix.io.position_log import PositionLog, read_csv_positions, read_rtklib_positions
+from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtklib_positions, skip_broken
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.io.receiver.log import read_receiver_positions
 
@@ -63,11 +65,11 @@ def _read_gpx(path: FilePath) -> PositionLog:
     )
 
 
-def _read_novatel(path: FilePath) -> PositionLog:
-    """Read the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN)."""
+def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
+    """Parse the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN)."""
     rows: list[tuple[float, ...]] = []
     lines: list[int] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(text, start=1):
         name = line.lstrip("#%").split(",", 1)[0]
         if name not in ("BESTPOSA", "BESTGNSSPOSA", "INSPVAA", "INSPVASA", "INSPVAXA") or ";" not in line:
             continue
@@ -109,6 +111,13 @@ _GPX: Final = re.compile(rb"<(?:\w+:)?gpx[\s>]")
 _RTKLIB: Final = re.compile(rb"^%.*(?:latitude|ecef|baseline|program|GPST|UTC|JST)", re.MULTILINE)
 
 
+def header_line(head: bytes) -> str:
+    """Return the first line of the beginning of a text that is neither blank nor a comment; "" without any."""
+    coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    lines = head.decode(coding, "replace").splitlines()
+    return next((line for line in lines if line.strip() and not line.startswith("#")), "")
+
+
 def position_kind(path: FilePath) -> str:
     """Return the kind of a log of positions by its content: csv, rtklib, nmea, gpx, novatel, receiver; "" of none."""
     head = read_head(path)
@@ -117,8 +126,7 @@ def position_kind(path: FilePath) -> str:
     for kind, pattern in (("gpx", _GPX), ("nmea", _NMEA), ("novatel", _NOVATEL), ("rtklib", _RTKLIB)):
         if pattern.search(head):
             return kind
-    lines = (line for line in head.decode("utf-8", "replace").lstrip("\ufeff").splitlines() if line.strip())
-    first = next((line for line in lines if not line.startswith("#")), "")
+    first = header_line(head)
     is_table = any(mark in first for mark in ",;\t|") and any(letter.isalpha() for letter in first)
     if ending(path) == ".csv" or (is_table and not first.lstrip().startswith(("{", "<", "["))):
         return "csv"
@@ -132,6 +140,7 @@ def read_positions(
     date: np.datetime64 | None = None,
     columns: Mapping[str, str] | None = None,
     heights: Literal["needed", "optional"] = "needed",
+    antennas: Literal["one", "several"] = "one",
 ) -> PositionLog:
     """Read a log of positions of any kind; its content decides which.
 
@@ -142,13 +151,15 @@ def read_positions(
     ----------
     path : path
     broken_lines : {"stop", "count"}
-        A broken line of NMEA is an error, or is skipped and noted.
+        A broken line is an error, or is skipped and noted; a last line that is cut is always skipped.
     date : datetime64, optional
         For NMEA (see `railfix.io.nmea.read_nmea`), and UBX logs whose positions have no date.
     columns : mapping of str, optional
         For tables with other column names: name in railfix to name in the file, such as ``{"latitude_deg": "Lat"}``.
     heights : {"needed", "optional"}
         Whether a file without any height is an error.
+    antennas : {"one", "several"}
+        Whether a table with rows of several antennas is an error.
 
     Returns
     -------
@@ -166,20 +177,28 @@ def read_positions(
     kind = position_kind(path)
     if columns and kind != "csv":
         raise SettingsError(f"{path}: columns can be renamed in a table with named columns only")
-    if kind == "csv":
-        log = read_csv_positions(path, columns=columns)
+    parsers: dict[str, Callable[[list[str]], PositionLog]] = {
+        "csv": lambda lines: parse_csv_positions(lines, path, columns or {}),
+        "novatel": lambda lines: _parse_novatel(lines, path),
+        "rtklib": lambda lines: parse_rtklib_positions(lines, path),
+    }
+    if kind in parsers:
+        log, skipped = skip_broken(path, parsers[kind], broken_lines=broken_lines)
+        log = replace(log, notes=(*log.notes, *first_problems(skipped, count=len(skipped))))
     elif kind == "nmea":
         log = read_nmea(path, broken_lines=broken_lines, date=date)
     elif kind == "receiver":
         log = read_receiver_positions(path, date=date)
-    elif kind:
-        log = {"gpx": _read_gpx, "novatel": _read_novatel, "rtklib": read_rtklib_positions}[kind](path)
+    elif kind == "gpx":
+        log = _read_gpx(path)
     else:
         raise InputFileError(
             path,
             "is no log of positions: RTKLIB's solution (.pos), NMEA, GPX, NovAtel ASCII, UBX, SBF, or a table (CSV) "
             "whose first line names its columns was expected",
         )
+    if antennas == "one" and len(log.antennas) > 1:
+        raise InputFileError(path, f"has positions of {' and '.join(log.antennas)}; give those of one antenna")
     if heights == "needed" and log.plan_deg is not None and np.isnan(log.ecef_m).all():
         raise InputFileError(path, "its positions have no height; expected heights above the ellipsoid (height_m)")
     return _in_order(log)

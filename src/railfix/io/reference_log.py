@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath
+from railfix.core.files import BrokenLines, FilePath
 from railfix.core.tables import reading_table
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
@@ -30,6 +30,7 @@ from railfix.io.position_log import (
     positions_times,
     qualities_in_words,
     rename_columns,
+    skip_broken,
 )
 from railfix.io.positions import position_kind, read_positions
 
@@ -76,6 +77,8 @@ def read_reference(
     *,
     quality: Collection[int] = (_FIX,),
     columns: Mapping[str, str] | None = None,
+    broken_lines: BrokenLines = "stop",
+    date: np.datetime64 | None = None,
 ) -> dict[str, AntennaReference]:
     """Read the reference of one antenna, or of several by the column ``antenna``.
 
@@ -90,6 +93,8 @@ def read_reference(
         Accepted qualities, where the log has them.
     columns : mapping of str, optional
         For CSV with other column names, as in `read_positions`.
+    broken_lines, date
+        As in `read_positions`.
 
     Returns
     -------
@@ -102,8 +107,11 @@ def read_reference(
     InputFileError
         No positions, no times, an unknown source, or no column ``antenna`` where two are to be read.
     """
-    table = _table(Path(path), columns or {})
-    log = read_positions(path, columns=columns) if table is None else positions_of_table(table)
+    table: NamedColumns | None = None
+    if position_kind(path) == "csv":
+        table, log = skip_broken(path, lambda lines: _parse(lines, path, columns or {}), broken_lines=broken_lines)[0]
+    else:
+        log = read_positions(path, columns=columns, broken_lines=broken_lines, date=date)
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
     if log.has_quality:
         usable &= np.isin(log.quality, [*quality])
@@ -123,11 +131,11 @@ def read_reference(
     return {name: _of_antenna(path, name, owner, usable, values, what) for name in antennas}
 
 
-def _table(path: Path, columns: Mapping[str, str]) -> NamedColumns | None:
-    """Read the file as a table; None for a file other than CSV."""
-    if position_kind(path) != "csv":
-        return None
-    return rename_columns(read_named_columns(path), columns, known=dict.fromkeys((*CSV_COLUMNS, *COLUMNS)))
+def _parse(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> tuple[NamedColumns, PositionLog]:
+    """Parse a table, and its positions."""
+    known = dict.fromkeys((*CSV_COLUMNS, *COLUMNS))
+    table = rename_columns(parse_named_columns(lines, path), columns, known=known)
+    return table, positions_of_table(table)
 
 
 def _columns(log: PositionLog, table: NamedColumns) -> dict[str, NDArray[np.generic]]:

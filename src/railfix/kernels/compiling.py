@@ -71,8 +71,10 @@ def inner(function: Function) -> Function:
 
 @cache
 def _files(package: Path, module: str) -> set[Path]:
-    """Return the file of a module of this package and those of all that it imports from the package."""
+    """Return the file of a module of this package, or of all of a room's, and those of all that it imports from it."""
     path = package / f"{module.replace('.', '/')}.py"
+    if not path.exists():
+        return set(path.with_suffix("").glob("*.py"))
     imported = re.findall(r"^from railfix\.kernels\.([\w.]+) import", path.read_text(encoding="utf-8"), re.MULTILINE)
     return {path}.union(*(_files(package, name) for name in imported))
 

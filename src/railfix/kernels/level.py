@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -87,6 +88,21 @@ def _quantile(probability: float) -> float:
     return x if probability < 0.5 else -x
 
 
+class _Room(NamedTuple):
+    """Work space of an epoch: of each hypothesis the inverse of sigma, the weight where a fault of it is checked, the
+    level that it requires, the sigmas to the level, exp(-z^2/2), and the tail; shape (K,); the tails of each kind.
+    """
+
+    inverse: Floats
+    checked: Floats
+    required: Floats
+    z: Floats
+    bell: Floats
+    bits: Indices
+    tail: Floats
+    of_kind: Floats
+
+
 @kernel
 def solve_level(
     offset_m: Floats, sigma_m: Floats, weight: Floats, bounds: Indices, share: Floats, reserved: Floats
@@ -122,88 +138,116 @@ def solve_level(
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
     part, k_of = np.zeros((epochs, kinds)), np.full((epochs, kinds), -np.inf)
     worst = np.full((epochs, kinds), -1, dtype=np.intp)
-    inverse, checked, z, bell = np.empty(width), np.empty(width), np.empty(width), np.empty(width)
-    each, tail, bits, ends = np.empty(width), np.empty(width), np.empty(width, dtype=np.int64), np.empty(kinds)
+    of_each = np.empty((6, width))
+    room = _Room(
+        of_each[0], of_each[1], of_each[2], of_each[3], of_each[4], np.empty(width, dtype=np.int64), of_each[5],
+        np.empty(kinds),
+    )  # fmt: skip
     for t in range(epochs):
-        offset, sigma, prior = offset_m[t], sigma_m[t], weight[t]
         allowed = -reserved[t]
         for m in range(width):
-            inverse[m] = 1.0 / sigma[m]
-            checked[m] = prior[m] if inverse[m] > 0.0 else 0.0
+            room.inverse[m] = 1.0 / sigma_m[t, m]
+            room.checked[m] = weight[t, m] if room.inverse[m] > 0.0 else 0.0
         for kind in range(kinds):
-            total, whole = 0.0, 0.0
-            for m in range(bounds[kind], bounds[kind + 1]):
-                total += checked[m]
-                whole += prior[m]
-            left = share[t, kind] - (whole - total)
+            of_kind = slice(bounds[kind], bounds[kind + 1])
+            left, k_of[t, kind], largest, worst[t, kind] = _require(
+                offset_m[t, of_kind], sigma_m[t, of_kind], weight[t, of_kind], room.checked[of_kind], share[t, kind],
+                room.required[of_kind],
+            )  # fmt: skip
             allowed += left
-            needed = whole > share[t, kind]
-            spent = needed and left <= 0.0
-            k = -np.inf
-            if needed and not (left > 0.0 and total == 0.0):
-                k = _quantile(left / total if total > 0.0 else 0.0)
-            k_of[t, kind] = k
-            largest = -np.inf
-            for m in range(bounds[kind], bounds[kind + 1]):
-                if prior[m] > 0.0:
-                    value = -np.inf
-                    if spent and (total == whole or checked[m] == 0.0):
-                        value = np.inf
-                    elif checked[m] > 0.0 and math.isfinite(k):
-                        value = offset[m] + k * sigma[m]
-                    largest = max(largest, value)
-                    each[m] = value
             part[t, kind] = max(largest, 0.0)
-            alike = largest - _ALIKE * abs(largest) if math.isfinite(largest) else largest
-            for m in range(bounds[kind + 1] - 1, bounds[kind] - 1, -1):
-                if prior[m] > 0.0 and each[m] >= alike > -np.inf:
-                    worst[t, kind] = m - bounds[kind]
             level[t] = max(level[t], part[t, kind])
-        highest = level[t]
-        if not (math.isfinite(highest) and allowed > 0.0):
-            continue
-        aim, here, below, above = allowed * (1.0 - _AIM), highest, 0.0, highest
-        for number in range(_STEPS):
-            for m in range(width):
-                z[m] = (offset[m] - here) * inverse[m]
-            _bells(z, bits, bell)
-            if number == 0:
-                for m in range(width):
-                    x = max(-z[m], 0.0)
-                    near = (1.0 - _MILLS[0]) * x + _MILLS[0] * math.sqrt(x * x + _MILLS[1])
-                    tail[m] = checked[m] * bell[m] / (_ROOT_TWO_PI * near)
-            else:
-                for m in range(width):
-                    beyond = _mills(abs(z[m])) * bell[m] / _ROOT_TWO_PI
-                    tail[m] = checked[m] * (1.0 - beyond if z[m] > 0.0 else beyond)
-            total, slope, bend = 0.0, 0.0, 0.0
-            for kind in range(kinds):
-                ends[kind] = 0.0
-                for m in range(bounds[kind], bounds[kind + 1]):
-                    ends[kind] += tail[m]
-                total += ends[kind]
-            for m in range(width):
-                density = checked[m] * bell[m] * inverse[m]
-                slope += density
-                bend -= density * inverse[m] * z[m]
-            total = max(total, _TINY)
-            slope /= _ROOT_TWO_PI * total
-            bend = bend / (_ROOT_TWO_PI * total) - slope * slope
-            excess = math.log(total / aim)
-            steepest = slope + math.sqrt(max(slope * slope - 2.0 * bend * excess, 0.0))
-            following = min(here + 2.0 * excess / max(steepest, _TINY), highest)
-            if number > 0:
-                spender[t] = np.argmax(ends)
-                if excess > 0.0:
-                    below = here
-                else:
-                    above = here
-            close = number > 0 and abs(following - here) <= _CLOSE * here
-            halved = number >= _HALVING and number % 2 == 1
-            if halved or not below <= following <= above:
-                following = min(max(following, below), above) if close else (below + above) / 2.0
-            level[t] = following if close else above
-            if close:
-                break
-            here = following
+        if math.isfinite(level[t]) and allowed > 0.0:
+            level[t], spender[t] = _lower(offset_m[t], bounds, level[t], allowed * (1.0 - _AIM), room)
     return level, spender, part, k_of, worst
+
+
+@inner
+def _require(
+    offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
+) -> tuple[float, float, float, int]:
+    """Return what is left of a kind's share of the risk, its k, the largest level required, and by which hypothesis."""
+    total, whole = 0.0, 0.0
+    for m in range(len(prior)):
+        total += checked[m]
+        whole += prior[m]
+    left, needed = share - (whole - total), whole > share
+    spent = needed and left <= 0.0
+    k, largest, worst = -np.inf, -np.inf, -1
+    if needed and not (left > 0.0 and total == 0.0):
+        k = _quantile(left / total if total > 0.0 else 0.0)
+    for m in range(len(prior)):
+        if prior[m] > 0.0:
+            required[m] = -np.inf
+            if spent and (total == whole or checked[m] == 0.0):
+                required[m] = np.inf
+            elif checked[m] > 0.0 and math.isfinite(k):
+                required[m] = offset[m] + k * sigma[m]
+            largest = max(largest, required[m])
+    alike = largest - _ALIKE * abs(largest) if math.isfinite(largest) else largest
+    for m in range(len(prior) - 1, -1, -1):
+        if prior[m] > 0.0 and required[m] >= alike > -np.inf:
+            worst = m
+    return left, k, largest, worst
+
+
+@inner
+def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _Room) -> tuple[float, int]:
+    """Return the level whose tails together are `aim`, by steps down from `highest`, and the kind with the most."""
+    level, spender, here, below, above = highest, 0, highest, 0.0, highest
+    for number in range(_STEPS):
+        _write_tails(offset, here, number == 0, room)
+        excess, following = _step(bounds, here, highest, aim, room)
+        if number > 0:
+            spender = int(np.argmax(room.of_kind))
+            if excess > 0.0:
+                below = here
+            else:
+                above = here
+        close = number > 0 and abs(following - here) <= _CLOSE * here
+        halved = number >= _HALVING and number % 2 == 1
+        if halved or not below <= following <= above:
+            following = min(max(following, below), above) if close else (below + above) / 2.0
+        level = following if close else above
+        if close:
+            break
+        here = following
+    return level, spender
+
+
+@inner
+def _write_tails(offset: Floats, level: float, roughly: bool, room: _Room) -> None:
+    """Write the tail of each hypothesis beyond a level: its weight times Q."""
+    for m in range(len(offset)):
+        room.z[m] = (offset[m] - level) * room.inverse[m]
+    _bells(room.z, room.bits, room.bell)
+    if roughly:
+        for m in range(len(offset)):
+            x = max(-room.z[m], 0.0)
+            near = (1.0 - _MILLS[0]) * x + _MILLS[0] * math.sqrt(x * x + _MILLS[1])
+            room.tail[m] = room.checked[m] * room.bell[m] / (_ROOT_TWO_PI * near)
+    else:
+        for m in range(len(offset)):
+            beyond = _mills(abs(room.z[m])) * room.bell[m] / _ROOT_TWO_PI
+            room.tail[m] = room.checked[m] * (1.0 - beyond if room.z[m] > 0.0 else beyond)
+
+
+@inner
+def _step(bounds: Indices, here: float, highest: float, aim: float, room: _Room) -> tuple[float, float]:
+    """Return the logarithm of the tails over `aim`, and the next level by its slope and bend."""
+    total, slope, bend = 0.0, 0.0, 0.0
+    for kind in range(len(room.of_kind)):
+        room.of_kind[kind] = 0.0
+        for m in range(bounds[kind], bounds[kind + 1]):
+            room.of_kind[kind] += room.tail[m]
+        total += room.of_kind[kind]
+    for m in range(len(room.tail)):
+        density = room.checked[m] * room.bell[m] * room.inverse[m]
+        slope += density
+        bend -= density * room.inverse[m] * room.z[m]
+    total = max(total, _TINY)
+    slope /= _ROOT_TWO_PI * total
+    bend = bend / (_ROOT_TWO_PI * total) - slope * slope
+    excess = math.log(total / aim)
+    steepest = slope + math.sqrt(max(slope * slope - 2.0 * bend * excess, 0.0))
+    return excess, min(here + 2.0 * excess / max(steepest, _TINY), highest)

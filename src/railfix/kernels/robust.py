@@ -3,16 +3,42 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
-from railfix.kernels.compiling import kernel
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
 #: Least scale of whitened residuals: ranges do not agree better than that by their own merit.
 _LEAST_SCALE = 0.05
+
+
+class _Room(NamedTuple):
+    """Work space of an epoch: its channels in use side by side, those of clock g from ``begin[g]`` on.
+
+    Of each channel (M,): its `channel` in the ranges, `base` weight and the `root` of it, unit vector to the satellite
+    `sight` (3, M), `misfit`, robust `factor` of the weight, `white` residual, `order` by it, weight in the `row`s,
+    which are sights and misfits without the clock's mean (4, M). Of each clock (G,): the `total` weight, the `mean`
+    row (4, G), and of the ties its weight `mass` and its distance from the others, `apart` (4, G).
+    """
+
+    begin: Indices
+    channel: Indices
+    order: Indices
+    base: Floats
+    root: Floats
+    misfit: Floats
+    factor: Floats
+    weight: Floats
+    white: Floats
+    sight: Floats
+    row: Floats
+    total: Floats
+    mass: Floats
+    mean: Floats
+    apart: Floats
 
 
 @kernel
@@ -46,124 +72,180 @@ def reweight_ranges(
     solved : ndarray of bool, shape (T,)
         False where the last step was not determined.
     """
-    sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
-    epochs, channels = weight.shape
-    groups = len(starts)
-    tied, informed = len(offset_m) == epochs, len(information) == epochs
+    epochs, channels = ranges.weight.shape
+    tied, informed = len(ranges.offset_m) == epochs, len(information) == epochs
     kept, wsse = np.zeros((epochs, channels), dtype=np.bool_), np.zeros(epochs)
     solved = np.zeros(epochs, dtype=np.bool_)
-    u, misfit, root, factor = np.empty((3, channels)), np.empty(channels), np.empty(channels), np.empty(channels)
-    base, w, rows, white = np.empty(channels), np.empty(channels), np.empty((4, channels)), np.empty(channels)
-    order, channel = np.empty(channels, dtype=np.int64), np.empty(channels, dtype=np.int64)
-    ux, uy, uz, of_x, of_y, of_z, rest = u[0], u[1], u[2], rows[0], rows[1], rows[2], rows[3]
-    begin = np.zeros(groups + 1, dtype=np.int64)
-    totals, mass, means, apart = np.empty(groups), np.empty(groups), np.empty((4, groups)), np.empty((4, groups))
+    room = _new_room(channels, len(ranges.starts))
+    normal, vector, step = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for t in range(epochs):
-        x, y, z = place_ecef_m[t, 0], place_ecef_m[t, 1], place_ecef_m[t, 2]
-        # The used channels side by side, those of group g from begin[g] on.
-        count = 0
-        for g in range(groups):
-            begin[g], stop = count, starts[g + 1] if g + 1 < groups else channels
-            for m in range(starts[g], stop):
-                if weight[t, m] > 0.0:
-                    base[count], channel[count], order[count] = weight[t, m], m, count
-                    count += 1
-        begin[groups] = count
-        for k in range(count):
-            m = channel[k]
-            distance, ux[k], uy[k], uz[k] = sight(
-                sat_ecef_m[t, m, 0], sat_ecef_m[t, m, 1], sat_ecef_m[t, m, 2], x, y, z
-            )
-            misfit[k], root[k], factor[k] = code_m[t, m] - distance, math.sqrt(base[k]), 1.0
-        finite, scale = False, 1.0
+        count = _choose_channels(ranges, t, place_ecef_m[t], room)
+        scale = 1.0
         for _ in range(iterations):
-            for k in range(count):
-                w[k] = base[k] * factor[k]
-            for g in range(groups):
-                total = mean_x = mean_y = mean_z = mean_r = 0.0
-                for k in range(begin[g], begin[g + 1]):
-                    total += w[k]
-                    mean_x += w[k] * ux[k]
-                    mean_y += w[k] * uy[k]
-                    mean_z += w[k] * uz[k]
-                    mean_r += w[k] * misfit[k]
-                if total > 0.0:
-                    mean_x, mean_y, mean_z, mean_r = mean_x / total, mean_y / total, mean_z / total, mean_r / total
-                totals[g], means[0, g], means[1, g], means[2, g], means[3, g] = total, -mean_x, -mean_y, -mean_z, mean_r
-                for k in range(begin[g], begin[g + 1]):
-                    of_x[k], of_y[k], of_z[k] = mean_x - ux[k], mean_y - uy[k], mean_z - uz[k]
-                    rest[k] = misfit[k] - mean_r
-            a = b = c = d = e = f = v0 = v1 = v2 = 0.0
-            for k in range(count):
-                wx, wy, wz = w[k] * of_x[k], w[k] * of_y[k], w[k] * of_z[k]
-                a, b, c, d = a + wx * of_x[k], b + wx * of_y[k], c + wx * of_z[k], d + wy * of_y[k]
-                e, f, v0 = e + wy * of_z[k], f + wz * of_z[k], v0 + wx * rest[k]
-                v1, v2 = v1 + wy * rest[k], v2 + wz * rest[k]
+            _sum_clocks(room)
+            _sum_normal(count, room, normal, vector)
             if tied:
-                all_mass = 0.0
-                for g in range(groups):
-                    mass[g] = 1.0 / (1.0 / totals[g] + sigma_m[t, g] ** 2) if totals[g] > 0.0 else 0.0
-                    all_mass += mass[g]
-                for i in range(4):
-                    common = 0.0
-                    for g in range(groups):
-                        apart[i, g] = means[i, g] - (offset_m[t, g] if i == 3 else 0.0)
-                        common += mass[g] * apart[i, g]
-                    for g in range(groups):
-                        apart[i, g] -= common / all_mass if all_mass > 0.0 else 0.0
-                for g in range(groups):
-                    if not totals[g] > 0.0:
-                        continue
-                    own, ax, ay, az, ar = mass[g], apart[0, g], apart[1, g], apart[2, g], apart[3, g]
-                    a, b, c, d = a + own * ax * ax, b + own * ax * ay, c + own * ax * az, d + own * ay * ay
-                    e, f, v0 = e + own * ay * az, f + own * az * az, v0 + own * ax * ar
-                    v1, v2 = v1 + own * ay * ar, v2 + own * az * ar
-                    own = 1.0 / (totals[g] * sigma_m[t, g] ** 2 + 1.0)
-                    for i in range(4):
-                        means[i, g] -= apart[i, g] * own
+                _add_ties(ranges.offset_m[t], ranges.sigma_m[t], room, normal, vector)
             if informed:
-                a, b, c = a + information[t, 0, 0], b + information[t, 0, 1], c + information[t, 0, 2]
-                d, e, f = d + information[t, 1, 1], e + information[t, 1, 2], f + information[t, 2, 2]
-            c00, c11, c22 = d * f - e * e, a * f - c * c, a * d - b * b
-            c01, c02, c12 = c * e - b * f, b * e - c * d, b * c - a * e
-            determinant = a * c00 + b * c01 + c * c02
-            mean = (a + d + f) / 3.0
-            finite = determinant > 1e-12 * mean * mean * mean
-            s0 = s1 = s2 = 0.0
-            if finite:
-                s0 = (c00 * v0 + c01 * v1 + c02 * v2) / determinant
-                s1 = (c01 * v0 + c11 * v1 + c12 * v2) / determinant
-                s2 = (c02 * v0 + c12 * v1 + c22 * v2) / determinant
-            for g in range(groups):
-                known = 1.0 if finite and totals[g] > 0.0 else 0.0
-                clock = means[3, g] - (s0 * means[0, g] + s1 * means[1, g] + s2 * means[2, g])
-                for k in range(begin[g], begin[g + 1]):
-                    moved = ux[k] * s0 + uy[k] * s1 + uz[k] * s2
-                    white[k] = known * root[k] * abs(misfit[k] + moved - clock)
-            for k in range(count):  # nearly in order from the second step on
-                at, one = k, order[k]
-                while at > 0 and white[order[at - 1]] > white[one]:
-                    order[at] = order[at - 1]
-                    at -= 1
-                order[at] = one
-            middle = min(count // 2, channels - 1)
-            median = white[order[middle]] if middle < count else 0.0
-            scale = max(median * correction[t], _LEAST_SCALE)
-            changed = False
-            for k in range(count):
-                size, before = white[k] / scale, factor[k]
-                if not size < reject:
-                    factor[k] = 0.0
-                elif size <= keep:
-                    factor[k] = 1.0
-                else:
-                    factor[k] = ((reject - size) / (reject - keep)) ** 2 * keep / max(size, 1e-9)
-                changed |= factor[k] != before
-            if not changed:
+                normal += information[t]
+            solved[t] = _solve(normal, vector, step)
+            _write_residuals(step, solved[t], room)
+            scale = max(_median(count, room) * correction[t], _LEAST_SCALE)
+            if not _reweight(count, scale, keep, reject, room):
                 break  # every further step would be this one
         for k in range(count):
-            if white[k] / scale < reject:
-                kept[t, channel[k]] = True
-                wsse[t] += white[k] * white[k]
-        solved[t] = finite
+            if room.white[k] / scale < reject:
+                kept[t, room.channel[k]] = True
+                wsse[t] += room.white[k] * room.white[k]
     return kept, wsse, solved
+
+
+@inner
+def _new_room(channels: int, clocks: int) -> _Room:
+    """Return work space."""
+    numbers, of_channel = np.zeros((2, channels), dtype=np.int64), np.empty((6, channels))
+    return _Room(
+        np.zeros(clocks + 1, dtype=np.int64), numbers[0], numbers[1], of_channel[0], of_channel[1], of_channel[2],
+        of_channel[3], of_channel[4], of_channel[5], np.empty((3, channels)), np.empty((4, channels)),
+        np.empty(clocks), np.empty(clocks), np.empty((4, clocks)), np.empty((4, clocks)),
+    )  # fmt: skip
+
+
+@inner
+def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
+    """Write the channels in use side by side, their sights and misfits, and return how many they are."""
+    channels, clocks, count = ranges.weight.shape[1], len(ranges.starts), 0
+    for g in range(clocks):
+        room.begin[g], stop = count, ranges.starts[g + 1] if g + 1 < clocks else channels
+        for m in range(ranges.starts[g], stop):
+            if not ranges.weight[t, m] > 0.0:
+                continue
+            satellite = ranges.sat_ecef_m[t, m]
+            distance, room.sight[0, count], room.sight[1, count], room.sight[2, count] = sight(
+                satellite[0], satellite[1], satellite[2], place[0], place[1], place[2]
+            )
+            room.base[count], room.root[count] = ranges.weight[t, m], math.sqrt(ranges.weight[t, m])
+            room.misfit[count], room.factor[count] = ranges.code_m[t, m] - distance, 1.0
+            room.channel[count], room.order[count] = m, count
+            count += 1
+    room.begin[clocks] = count
+    return count
+
+
+@inner
+def _sum_clocks(room: _Room) -> None:
+    """Write the weights, and of each clock their sum and the mean row; the rows become differences from it."""
+    for g in range(len(room.total)):
+        total = x = y = z = misfit = 0.0
+        for k in range(room.begin[g], room.begin[g + 1]):
+            weight = room.base[k] * room.factor[k]
+            room.weight[k] = weight
+            total += weight
+            x += weight * room.sight[0, k]
+            y += weight * room.sight[1, k]
+            z += weight * room.sight[2, k]
+            misfit += weight * room.misfit[k]
+        if total > 0.0:
+            x, y, z, misfit = x / total, y / total, z / total, misfit / total
+        room.total[g] = total
+        room.mean[0, g], room.mean[1, g], room.mean[2, g], room.mean[3, g] = -x, -y, -z, misfit
+        for k in range(room.begin[g], room.begin[g + 1]):
+            room.row[0, k], room.row[1, k] = x - room.sight[0, k], y - room.sight[1, k]
+            room.row[2, k], room.row[3, k] = z - room.sight[2, k], room.misfit[k] - misfit
+
+
+@inner
+def _sum_normal(count: int, room: _Room, normal: Floats, vector: Floats) -> None:
+    """Write the normal equations of the place, the clocks eliminated."""
+    for a in range(3):
+        for b in range(a, 3):
+            total = 0.0
+            for k in range(count):
+                total += room.weight[k] * room.row[a, k] * room.row[b, k]
+            normal[a, b] = normal[b, a] = total
+        total = 0.0
+        for k in range(count):
+            total += room.weight[k] * room.row[a, k] * room.row[3, k]
+        vector[a] = total
+
+
+@inner
+def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, vector: Floats) -> None:
+    """Add what the known offsets between the clocks say of the place."""
+    clocks, whole = len(room.total), 0.0
+    for g in range(clocks):
+        room.mass[g] = 1.0 / (1.0 / room.total[g] + sigma_m[g] ** 2) if room.total[g] > 0.0 else 0.0
+        whole += room.mass[g]
+    for i in range(4):
+        common = 0.0
+        for g in range(clocks):
+            room.apart[i, g] = room.mean[i, g] - (offset_m[g] if i == 3 else 0.0)
+            common += room.mass[g] * room.apart[i, g]
+        for g in range(clocks):
+            room.apart[i, g] -= common / whole if whole > 0.0 else 0.0
+    for g in range(clocks):
+        if not room.total[g] > 0.0:
+            continue
+        for a in range(3):
+            for b in range(3):
+                normal[a, b] += room.mass[g] * room.apart[a, g] * room.apart[b, g]
+            vector[a] += room.mass[g] * room.apart[a, g] * room.apart[3, g]
+        own = 1.0 / (room.total[g] * sigma_m[g] ** 2 + 1.0)
+        for i in range(4):
+            room.mean[i, g] -= room.apart[i, g] * own
+
+
+@inner
+def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
+    """Solve three symmetric equations, and return whether they are determined; the step is zero where they are not."""
+    a, b, c, d, e, f = normal[0, 0], normal[0, 1], normal[0, 2], normal[1, 1], normal[1, 2], normal[2, 2]
+    of_x, of_y, of_z = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant, mean = a * of_x + b * of_y + c * of_z, (a + d + f) / 3.0
+    step[:] = 0.0
+    if not determinant > 1e-12 * mean * mean * mean:
+        return False
+    x, y, z = vector[0], vector[1], vector[2]
+    step[0] = (of_x * x + of_y * y + of_z * z) / determinant
+    step[1] = (of_y * x + (a * f - c * c) * y + (b * c - a * e) * z) / determinant
+    step[2] = (of_z * x + (b * c - a * e) * y + (a * d - b * b) * z) / determinant
+    return True
+
+
+@inner
+def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
+    """Write the whitened residuals after the step of the place and of each clock; zero where there is none."""
+    for g in range(len(room.total)):
+        known = 1.0 if solved and room.total[g] > 0.0 else 0.0
+        clock = room.mean[3, g]
+        clock -= step[0] * room.mean[0, g] + step[1] * room.mean[1, g] + step[2] * room.mean[2, g]
+        for k in range(room.begin[g], room.begin[g + 1]):
+            moved = room.sight[0, k] * step[0] + room.sight[1, k] * step[1] + room.sight[2, k] * step[2]
+            room.white[k] = known * room.root[k] * abs(room.misfit[k] + moved - clock)
+
+
+@inner
+def _median(count: int, room: _Room) -> float:
+    """Return the median of the whitened residuals; their order is kept for the next time, which is nearly the same."""
+    for k in range(count):
+        at, number = k, room.order[k]
+        while at > 0 and room.white[room.order[at - 1]] > room.white[number]:
+            room.order[at] = room.order[at - 1]
+            at -= 1
+        room.order[at] = number
+    return float(room.white[room.order[count // 2]]) if count > 0 else 0.0
+
+
+@inner
+def _reweight(count: int, scale: float, keep: float, reject: float, room: _Room) -> bool:
+    """Write the robust factors by the residuals over their scale; return whether one of them has changed."""
+    changed = False
+    for k in range(count):
+        size, before = room.white[k] / scale, room.factor[k]
+        if not size < reject:
+            room.factor[k] = 0.0
+        elif size <= keep:
+            room.factor[k] = 1.0
+        else:
+            room.factor[k] = ((reject - size) / (reject - keep)) ** 2 * keep / max(size, 1e-9)
+        changed |= room.factor[k] != before
+    return changed

@@ -187,10 +187,13 @@ def _describe_place(place: TrainPlace, frame: TrainFrame, running: int) -> dict[
     return values
 
 
+_INTERFERENCE: Final = frozenset(SuspectedInterference)
+
+
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
     """Return the worst interference of the antennas at the last epoch; None where it is not looked for."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
-    return SuspectedInterference(max(found)) if found else None
+    return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:

@@ -5,6 +5,7 @@ During a live session it would delay epochs by seconds, in a run nobody would kn
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -25,14 +26,20 @@ from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
+from railfix.tracking.chunk import prepare_chunk
+from railfix.tracking.epochs import GnssEpochs, SensorEpochs
+from railfix.tracking.filter import Recursion
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.line import Line
+from railfix.tracking.state import TrackState
 
 #: Settings and numbers of epochs that together call every kernel but those of `_look_beyond`; the second has too few
 #: satellites for 3-D positions.
-_SETTINGS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
+_SINGLE_EPOCHS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
-    ({"filter": "track", "protection": "off"}, 8),
 )
+_WITH_FILTER: Final[tuple[dict[str, Any], int]] = ({"filter": "track", "protection": "off"}, 8)
 
 
 def prepare_kernels() -> bool:
@@ -44,29 +51,60 @@ def prepare_kernels() -> bool:
     if kernels.is_compiled():
         return False
     begin = time.monotonic()
-    _process()
-    _look_beyond()
+    # numba compiles one function at a time in a process: the filter's, about half of all, are compiled in another one
+    filter_process = subprocess.Popen(
+        [sys.executable, "-c", f"from {__name__} import compile_filter; compile_filter()"]
+    )
+    try:
+        logs = _read_logs()
+        for chosen, epochs in _SINGLE_EPOCHS:
+            _process(chosen, epochs, logs)
+        _look_beyond()
+    finally:
+        filter_process.wait()
+    _process(*_WITH_FILTER, logs)
     kernels.record_compiled()
     if sys.stderr.isatty():
         sys.stderr.write(f"compiled in {time.monotonic() - begin:.0f} s; later commands load it\n")
     return True
 
 
-def _process() -> None:
+def compile_filter() -> None:
+    """Compile the recursion of the filter along the track; it is kept on disk for other processes."""
+    nothing = np.full((1, 1), np.nan)
+    epochs = GnssEpochs(
+        time=np.array(["2024-01-01"], dtype="datetime64[ns]"), satellite=np.array(["G01"]), clock=np.array(["G"]),
+        sat_ecef_m=np.full((1, 1, 3), np.nan), sat_velocity_mps=np.full((1, 1, 3), np.nan), code_m=nothing,
+        code_sigma_m=nothing, phase_m=nothing, phase_joined=np.zeros((1, 1), dtype=np.bool_), rate_mps=nothing,
+        cn0_dbhz=nothing, off_map=np.zeros(1, dtype=np.bool_),
+    )  # fmt: skip
+    inputs = demo_inputs()
+    assert inputs.vehicle is not None
+    line = Line.of(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
+    state, limits = TrackState.empty(), TrackingLimits()
+    chunk = prepare_chunk(epochs, state, limits)
+    recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
+    recursion.advance(state, len(epochs), trace=None)  # of no epoch: the call compiles it
+
+
+def _read_logs() -> dict[str, Observations]:
+    """Read the first epochs of the demonstration, with a fault that RAIM looks for."""
+    inputs, longest = demo_inputs(), max(epochs for _, epochs in (*_SINGLE_EPOCHS, _WITH_FILTER))
+    logs = {"front": _first_epochs(inputs.front[0], longest), "rear": _first_epochs(inputs.rear[0], longest)}
+    strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
+    return {name: _faulty(log, strongest) for name, log in logs.items()}
+
+
+def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations]) -> None:
+    """Process epochs at once and one by one."""
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
-    longest = max(epochs for _, epochs in _SETTINGS)
-    logs = {"front": _first_epochs(inputs.front[0], longest), "rear": _first_epochs(inputs.rear[0], longest)}
-    strongest = str(logs["front"].satellite[np.nan_to_num(logs["front"].cn0_dbhz[0]).argmax()])
-    logs = {name: _faulty(log, strongest) for name, log in logs.items()}
     paths = {name: antenna_trajectory(track, vehicle, name) for name in ("front", "rear")}
-    navigation = read_navigation(inputs.nav)
-    for chosen, epochs in _SETTINGS:
-        processor, state = make_processor(parse_config(chosen), navigation, paths), None
-        processor.process({name: log[:epochs] for name, log in logs.items()})
-        for epoch in range(epochs):
-            _, state = processor.process({name: log[epoch : epoch + 1] for name, log in logs.items()}, state)
+    processor, state = make_processor(parse_config(chosen), read_navigation(inputs.nav), paths), None
+    processor.process({name: log[:epochs] for name, log in logs.items()})
+    for epoch in range(epochs):
+        _, state = processor.process({name: log[epoch : epoch + 1] for name, log in logs.items()}, state)
 
 
 def _look_beyond() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import expm
+import scipy
 
 from railfix.core.arrays import Floats
 
@@ -23,7 +23,7 @@ def singer_steps(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, F
     system[:, 2, 2] = part / tau_s
     system[:, 3:, 3:] = -np.swapaxes(system[:, :3, :3], 1, 2)
     system[:, 2, 5] = 2.0 * sigma_mps2**2 * part / tau_s
-    exponential = expm(system)
+    exponential = scipy.linalg.expm(system)
     unit = part[:, None] ** np.array([2.0, 1.0, 0.0])
     step = np.swapaxes(exponential[:, 3:, 3:], 1, 2)
     noise = step @ exponential[:, :3, 3:] * unit[:, :, None] * unit[:, None, :]

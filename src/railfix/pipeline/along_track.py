@@ -14,7 +14,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
-from railfix.integrity.interference import WheelSigns, WheelState, wheel_signs
+from railfix.integrity.interference import Suspicion, WheelSigns, WheelState, wheel_signs
 from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balises import BaliseLimits, find_passings
 from railfix.pipeline.config import Config
@@ -84,7 +84,11 @@ def along_track(
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
     tracked = mark_doubtful(tracked, beside, TrackStatus.MAP_OFFSET)
-    tracked = mark_doubtful(tracked, single.spoofed & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
+    spoofed = single.suspicion == Suspicion.SPOOFING_SUSPECTED
+    tracked = mark_doubtful(tracked, spoofed & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
+    doubted = np.isin(single.suspicion, (Suspicion.TIME_TAGS, Suspicion.LEFT_MAP, Suspicion.CONTRADICTED))
+    placed = is_bounded(tracked.status) | (tracked.status == TrackStatus.SEVERAL_BRANCHES)
+    tracked = mark_doubtful(tracked, doubted & placed, TrackStatus.DOUBTFUL)
     wheel = None
     if config.interference.use == "on" and any(replay.sensors.wheel_m is not None for replay in replays):
         wheel, alone = _against_wheel(replays, single.arc_m, single.sigma_m, after.wheel, config)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Bits, Datetimes, Floats, Masks, copy_with, read_only
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
-from railfix.integrity.interference import Sign, Suspicion
+from railfix.integrity.interference import Sign
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.filter_result import COORDINATES, AlongTrack, SingleEpochs
@@ -170,9 +170,9 @@ def filter_inputs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits
         near_ecef_m=result.conventional_ecef_m,
         off_map=off_map,
         map_offset=beyond_threshold(result.map_offset, limits),
-        spoofed=np.zeros(len(result), dtype=bool)
+        suspicion=np.zeros(len(result), dtype=np.int8)
         if result.interference is None
-        else result.interference.suspicion == Suspicion.SPOOFING_SUSPECTED,
+        else result.interference.suspicion,
     )
 
 

@@ -51,7 +51,7 @@ class SingleEpochs:
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
     off_map: Masks  #: The train is away from the line: `railfix.pipeline.off_map`.
     map_offset: Masks  #: 3-D positions of the last minutes lie beside or above the line.
-    spoofed: Masks  #: Spoofing is suspected.
+    suspicion: Codes  #: `railfix.integrity.interference.Suspicion`.
 
 
 @dataclass(frozen=True, kw_only=True)

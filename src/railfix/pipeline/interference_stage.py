@@ -31,7 +31,7 @@ from railfix.integrity.interference import (
 )
 from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.range_arrays import ClockTies
+from railfix.positioning.range_arrays import InterSystemBiases
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Reasons given because ranges contradict others: those of a spoofer do.
@@ -48,6 +48,17 @@ _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
     Status.MAP_OFFSET,
 ])  # fmt: skip
+#: Statuses of positions that failed a check by their ranges.
+_FAILED: Final = np.isin(np.arange(len(Status)), [
+    Status.OFF_MAP, Status.INCONSISTENT, Status.UNCERTAIN, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
+])  # fmt: skip
+#: Statuses that causes give, and those that they outrank.
+_STATUS_BY_CAUSE: Final = (
+    (Suspicion.JAMMING_SUSPECTED, np.arange(len(Status)) == Status.OK, Status.JAMMING_SUSPECTED),
+    (Suspicion.SPOOFING_SUSPECTED, _UNDER_SPOOFING, Status.SPOOFING_SUSPECTED),
+    (Suspicion.TIME_TAGS, _UNDER_SPOOFING, Status.INCONSISTENT),
+    (Suspicion.LEFT_MAP, _UNDER_SPOOFING, Status.OFF_MAP),
+)
 #: Interference is looked for once so long [ns].
 _SECOND_NS: Final = 1_000_000_000
 #: Where seconds begin: tags may be 5 ms before the whole one [ns].
@@ -90,7 +101,8 @@ class PositionEpochs(NamedTuple):
     point_ecef_m: Floats
     consistent_ecef_m: Floats
     noise_scale: Floats  #: Shape (T,).
-    ties: ClockTies  #: Inter-system biases known before each epoch.
+    ties: InterSystemBiases  #: Inter-system biases known before each epoch.
+    status: Codes  #: `Status`, before causes are known; shape (T,).
 
 
 def _motion_inputs(
@@ -125,6 +137,7 @@ def _find_interference(
     corrected: CorrectedRanges,
     rows: Indices,
     alarm: Bytes,
+    failed: Masks,
     inputs: MotionInputs,
     fitted: MotionFit,
     state: InterferenceState,
@@ -132,14 +145,14 @@ def _find_interference(
 ) -> tuple[Interference, InterferenceState]:
     """Return the interference of some epochs of one antenna, and the state to pass on.
 
-    `alarm`: alarms of the receiver since the epoch before, of each.
+    `alarm`: alarms of the receiver since the epoch before, of each; `failed`: their position failed a check.
     """
     cn0 = np.where(np.isfinite(inputs.code_m), corrected.cn0_dbhz[rows], np.nan)
     power, power_state = power_signs(
         inputs.time, inputs.channel, cn0, corrected.observations.front_end_gain[rows], state.power, limits
     )
     motion, motion_state = motion_signs(inputs, state.motion, limits, fitted)
-    signs = _signs(alarm, power, motion, limits)
+    signs = _signs(alarm, failed, power, motion, limits)
     hold, release = _times(limits)
     _, stays, held_state = hold_signs(inputs.time, signs, state.held, hold_s=hold, release_s=release)
     causes = (stays * np.array([int(cause) for cause in CAUSES])).sum(axis=1, dtype=np.int64)
@@ -147,7 +160,7 @@ def _find_interference(
     return Interference(causes=causes, power=power, motion=motion), after
 
 
-def _signs(alarm: Bytes, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
+def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
     """Return which signs the epochs show by themselves, shape (T, causes)."""
     sigmas = limits.jump_sigmas
     by_cause = {
@@ -164,6 +177,9 @@ def _signs(alarm: Bytes, power: PowerSigns, motion: MotionSigns, limits: Interfe
         Sign.CONSTELLATIONS_PART: motion.part_sigmas >= limits.part_sigmas,
         Sign.WHEEL_PARTS: np.zeros(len(alarm), dtype=np.bool_),  # by the filter along the track
         Sign.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
+        Sign.TIME_TAGS: (np.abs(motion.tag_error_s) >= limits.tag_error_s)
+        & (motion.tag_error_sigmas >= limits.tag_sigmas),
+        Sign.CONTRADICTED: failed,
     }
     return np.array([by_cause[cause] for cause in CAUSES]).T
 
@@ -174,15 +190,13 @@ def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
     hold = {
         Sign.CN0_FALL: limits.hold_s, Sign.GAIN_FALL: limits.hold_s, Sign.EQUAL_CN0: limits.hold_s,
         Sign.LEFT_MAP: limits.hold_s, Sign.CONSTELLATIONS_PART: limits.part_hold_s,
+        Sign.CONTRADICTED: limits.contradicted_s,
     }  # fmt: skip
-    release = {
-        Suspicion.JAMMING_SUSPECTED: limits.jamming_release_s,
-        Suspicion.SPOOFING_SUSPECTED: limits.spoofing_release_s,
-    }
+    release = {Suspicion.SPOOFING_SUSPECTED: limits.spoofing_release_s, Suspicion.CONTRADICTED: 0.0}
     kinds = suspicion(np.array(CAUSES, dtype=np.int64)).tolist()
     return (
         read_only(np.array([hold.get(cause, 0.0) for cause in CAUSES])),
-        read_only(np.array([release[Suspicion(kind)] for kind in kinds])),
+        read_only(np.array([release.get(Suspicion(kind), limits.jamming_release_s) for kind in kinds])),
     )
 
 
@@ -239,10 +253,9 @@ def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
     if not suspected:
         return status
     kind = np.concatenate(suspected)
-    jammed = (kind == int(Suspicion.JAMMING_SUSPECTED)) & (status == int(Status.OK))
-    spoofed = (kind == int(Suspicion.SPOOFING_SUSPECTED)) & _UNDER_SPOOFING[status]
-    status = np.where(jammed, np.int8(Status.JAMMING_SUSPECTED), status)
-    return np.where(spoofed, np.int8(Status.SPOOFING_SUSPECTED), status)
+    for cause, outranked, by_cause in _STATUS_BY_CAUSE:
+        status = np.where((kind == int(cause)) & outranked[status], np.int8(by_cause), status)
+    return status
 
 
 def judge_interference(
@@ -273,8 +286,9 @@ def judge_interference(
         new, at = None, slice(first, first := first + len(own.rows))
         if len(own.rows) or not len(own.group):
             new, state = _find_interference(
-                corrected, own.rows, own.alarm[:-1], inputs.take(at), fitted.take(at), state, limits
-            )
+                corrected, own.rows, own.alarm[:-1], _FAILED[single.status[own.rows]], inputs.take(at), fitted.take(at),
+                state, limits,
+            )  # fmt: skip
         if len(own.group):
             new, state = _on_all_epochs(own, new, state)
         assert new is not None, "an epoch without one before it is due"

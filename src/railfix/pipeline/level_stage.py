@@ -150,7 +150,7 @@ def level_stage(
     bounding = (model, scale)
     if config.error_model is not None:
         sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
-        bounding = bounding_model(sigma, ranges, antennas, fix)
+        bounding = overbound_model(sigma, ranges, antennas, fix)
     beyond = np.where(fix.section.excess > config.section.threshold, level.level.level_m, np.nan)
     open_elsewhere = places_beyond_the_level(
         antennas, fix.constrained.arc_m, bounding[0], beyond, bounding[1], systems, get_risk_budget(config), sides
@@ -186,7 +186,7 @@ def protection_levels(
     return ProtectionResult(level=level, status=status, kind=choose_kind(config), basis=choose_basis(config))
 
 
-def bounding_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
+def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
     """Return the model of positions whose sigmas (T, K) bound the errors of the ranges, and its scale."""
     weight = np.where(ranges.weight > 0, 1.0 / sigma_m**2, 0.0)
     found = fix.constrained

@@ -87,7 +87,7 @@ class Located:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UncorrectedRanges:
+class RangesWithoutMap:
     """Corrected ranges of one antenna seen from an approximate place, T epochs by K channels."""
 
     channels: Channels
@@ -100,7 +100,7 @@ class UncorrectedRanges:
     no_position: Codes  #: `NoPosition` by the number of codes, records and satellites; shape (T,).
 
 
-def uncorrected_ranges(obs: Observations, received: Received, config: Config, book: ChannelBook) -> UncorrectedRanges:
+def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
     """Return corrected ranges of one antenna without a track: the approximate place is that of the codes alone."""
     channels = book.of(obs, received.navigation)
     satellite, columns = channels.satellite, channels.columns
@@ -145,7 +145,7 @@ def uncorrected_ranges(obs: Observations, received: Received, config: Config, bo
         (~_solvable(ranges), NoPosition.TOO_FEW_SATELLITES),
     ):
         lacking = np.where(failed & (lacking == int(NoPosition.NONE)), int(cause), lacking)
-    return UncorrectedRanges(
+    return RangesWithoutMap(
         channels=channels,
         ranges=ranges,
         states=states,
@@ -198,11 +198,11 @@ def _at_surface(ecef_m: Floats) -> Floats:
 
 
 def locate(obs: Observations, received: Received, config: Config, book: ChannelBook) -> Located:
-    """Compute the conventional position of every epoch, ranges that disagree left out; see `uncorrected_ranges`."""
-    return locate_ranges(obs.time, uncorrected_ranges(obs, received, config, book), config)
+    """Compute the conventional position of every epoch, ranges that disagree left out; see `ranges_without_map`."""
+    return locate_ranges(obs.time, ranges_without_map(obs, received, config, book), config)
 
 
-def locate_ranges(time: Datetimes, seen: UncorrectedRanges, config: Config) -> Located:
+def locate_ranges(time: Datetimes, seen: RangesWithoutMap, config: Config) -> Located:
     """Compute the conventional position of every epoch from corrected ranges; see `locate`."""
     ranges = seen.ranges
     start = np.where(np.isnan(seen.place_ecef_m), _below(ranges), seen.place_ecef_m)
@@ -279,7 +279,7 @@ def _survey_part(
     A range changes by the carrier phase where it goes on without a slip at every epoch between, else by the mean of
     the Dopplers at both ends.
     """
-    seen = uncorrected_ranges(obs, received, config, book)
+    seen = ranges_without_map(obs, received, config, book)
     located = locate_ranges(obs.time, seen, config)
     slips, after = find_slips(obs, slip_state, frequency_hz=seen.channels.every_frequency_hz, limits=config.slips)
     columns = seen.channels.columns

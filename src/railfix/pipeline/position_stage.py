@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, expit
+import scipy
 
 from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
@@ -36,7 +36,7 @@ from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
 from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
 from railfix.positioning.normal_equations import SinglePoint, misfit, point_position, position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges, without
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
 from railfix.positioning.receiver_noise import (
     LastingErrorState,
     NoiseState,
@@ -68,7 +68,7 @@ class Solution:
     consistent_ecef_m: Floats
     point_status: Codes  #: `railfix.integrity.PointStatus`, shape (T,).
     fix: LineFix  #: Positions from the codes, after exclusions.
-    ties: ClockTies  #: Inter-system biases known before each epoch.
+    ties: InterSystemBiases  #: Inter-system biases known before each epoch.
     raim: RaimResult
     status: Codes  #: `reasons.Status`, shape (T,).
     #: Shape (T,).
@@ -152,7 +152,7 @@ def position_stage(
     return corrected, solution, after
 
 
-def _alone_on_clock(corrected: CorrectedRanges, ties: ClockTies) -> Masks:
+def _alone_on_clock(corrected: CorrectedRanges, ties: InterSystemBiases) -> Masks:
     """Return the satellites that are the only ones of a clock without a known bias, shape (T, K)."""
     alone = np.zeros(corrected.reason.shape, dtype=bool)
     for g, group in enumerate(corrected.channels.groups):
@@ -302,7 +302,7 @@ def _published(
     own = epoch_sigma_m(ranges.redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
     variance = epoch_variance(scale, constrained.wsse, ranges.redundancy, limits=config.noise_scale)
-    nominal, phase = _nominal_variance_m2(checked.model, corrected.unmodelled_m), None
+    nominal, phase = _nominal_variance_m2(checked.model, corrected.nominal_elevation_sigma_m), None
     if config.carrier in ("float", "fixed"):
         assert slips is not None, "found where the carrier phase is used"
         of_all = slips
@@ -322,9 +322,11 @@ def _published(
     return PublishedPositions(arc, along, own, judged, phase), carriers
 
 
-def _nominal_variance_m2(model: LinearModel, unmodelled_m: Floats) -> Floats:
+def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) -> Floats:
     """Return the variance along the line by satellites and atmosphere, where the ranges' sigmas leave them out."""
-    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(unmodelled_m, 0.0), 0.0)
+    share = (
+        model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal_elevation_sigma_m, 0.0), 0.0)
+    )
     return np.asarray(np.einsum("tk,tk->t", share, share))
 
 
@@ -340,14 +342,14 @@ def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, 
         line, vertex = index.trajectory, section.other_vertex[rows]
         other = position_on_line(ranges.take(rows), line, vertex, limits=config.constrained)
         apart = line.at_arc(other.arc_m) - line.at_arc(arc[rows])
-        square[rows] = np.nan_to_num((apart**2).sum(axis=1)) * expit(-section.excess[rows] / 2.0)
+        square[rows] = np.nan_to_num((apart**2).sum(axis=1)) * scipy.special.expit(-section.excess[rows] / 2.0)
     return square
 
 
 @lru_cache
 def _chi_square_limit(risk: float, freedom: int) -> float:
     """Return the chi-square value that noise exceeds with a probability of `risk`."""
-    return float(chdtri(freedom, risk))
+    return float(scipy.special.chdtri(freedom, risk))
 
 
 def _off_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Masks:

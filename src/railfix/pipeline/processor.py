@@ -18,6 +18,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, copy_with
 from railfix.core.epoch_rows import take_epochs
+from railfix.core.errors import check_type
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.motion.samples import SensorSamples
@@ -103,7 +104,7 @@ class EpochProcessor:
     Raises
     ------
     SettingsError
-        SBAS and precise ephemerides together, or no SBAS message of the GEO asked for.
+        SBAS and precise ephemerides together, no SBAS message of the GEO asked for, or an argument of another type.
     """
 
     def __init__(
@@ -120,6 +121,12 @@ class EpochProcessor:
     ) -> None:
         if not (isinstance(trajectories, Mapping) and trajectories):
             raise ValueError("trajectories are one for each antenna, at least one: {'front': trajectory}")
+        check_type(config, Config, what="config")
+        for name, trajectory in trajectories.items():
+            hint = "railfix.track.vehicle.antenna_trajectory or Trajectory.from_track makes one of a Track"
+            check_type(trajectory, Trajectory, what=f"trajectory of antenna {name}", hint=hint)
+        if navigation is not None:
+            check_type(navigation, Navigation, what="navigation", hint="read_navigation reads a file")
         if len({(t.sigma_plan_m, t.sigma_height_m) for t in trajectories.values()}) > 1:
             raise ValueError("the trajectories of the antennas have different sigmas of the map; they are of one map")
         self.config = config
@@ -153,6 +160,10 @@ class EpochProcessor:
         self._track, self.units, self.balises = track, stations.units, stations.balises
         self._features: dict[str, LineFeatures] = {}
         self._lacking = self._inactive_notes()
+
+    def __repr__(self) -> str:
+        screens = ", ".join(screen.name for screen, _ in self.screens) or "none"
+        return f"<EpochProcessor: {' and '.join(self.trajectories)}, filter {self.config.filter}; screens {screens}>"
 
     @cached_property
     def _threads(self) -> ThreadPoolExecutor:
@@ -253,6 +264,9 @@ class EpochProcessor:
             raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
         state = state or State()
         for name, part in observations.items():
+            check_type(
+                part, Observations, what=f"observations of antenna {name}", hint="read_observations reads a file"
+            )
             _check_rising(name, part, state.antennas.get(name))
         began = min((part.time[0] for part in observations.values() if len(part)), default=np.datetime64("NaT", "ns"))
         received = receive(
@@ -281,6 +295,7 @@ class EpochProcessor:
             slips=screening.slips, pair=pair, sensors=sensors,
             notes=(
                 *missing_notes(received, self.config, corrected.second), *received.notes, *self._lacking,
+                *screening.notes,
                 *self._curve_notes(headers),
                 *(self._support.notes(obs.time) if self._support is not None else ()),
             ),
@@ -298,7 +313,9 @@ class EpochProcessor:
         corrected, solution, own_states = position_stage(
             chunk.corrected, chunk.slips, antennas, self.config, own_states
         )
-        single = PositionEpochs(solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties)
+        single = PositionEpochs(
+            solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties, solution.status
+        )
         interference, signs = judge_interference(
             corrected, single, antennas, [own.interference for own in own_states], self.config.interference
         )

@@ -191,6 +191,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
             "raim.statistic",
         ),
+        Column("raim_scale", "noise scale of that statistic: of the ranges of earlier epochs that agree", "raim.scale"),
         Column("raim_threshold", "threshold of the statistic, above which a fault is detected", "raim.threshold"),
         Column(
             "raim_level_m",
@@ -304,7 +305,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference",
-            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has another",
+            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has another; or what "
+            "explains the signs: `time_tags`, `left_map`, `contradicted`",
             "interference.suspicion",
             words=tuple(s.name.lower() for s in Suspicion),
         ),

@@ -10,6 +10,7 @@ from railfix.core.epoch_rows import join_epochs, take_epochs
 from railfix.pipeline.carrier_stage import CarrierState, find_antenna_slips, smooth_ranges
 from railfix.pipeline.config import Config
 from railfix.pipeline.frequency_stage import combine_frequencies
+from railfix.pipeline.observable_checks import check_observables
 from railfix.pipeline.range_stage import apply_verdict
 from railfix.pipeline.state import AntennaState
 from railfix.positioning.antenna_rows import AntennaRows
@@ -23,6 +24,7 @@ class Screening(NamedTuple):
     """Ranges of all antennas after the screens of each antenna."""
 
     corrected: CorrectedRanges
+    notes: tuple[str, ...]  #: On Dopplers and phases that are not used.
     screens: Mapping[str, Screened]  #: Metric and verdict of each screen.
     combined: Combined | None
     slips: Slips | None
@@ -39,8 +41,16 @@ def screen_antennas(
 ) -> tuple[Screening, list[AntennaState]]:
     """Return the ranges after the screens that judge one antenna alone (`screens`, with their limits), and new states.
 
-    Codes of two frequencies are combined then, and smoothed by the carrier phase where the settings ask for it.
+    Dopplers and phases of the wrong sign or unit are left out first. Codes of two frequencies are combined then, and
+    smoothed by the carrier phase where the settings ask for it.
     """
+    checked = [
+        check_observables(take_epochs(corrected, rows), state.observables)
+        for rows, state in zip(antennas.parts, states, strict=True)
+    ]
+    if any(own.notes for own in checked):
+        corrected = join_epochs([own.corrected for own in checked])
+    states = [copy_with(state, observables=own.state) for state, own in zip(states, checked, strict=True)]
     found: dict[str, Screened] = {}
     kept = [dict(state.screens) for state in states]
     for screen, limits in screens:
@@ -69,7 +79,7 @@ def screen_antennas(
     after = [
         copy_with(state, screens=kept[k], carrier=carriers[k], two_frequencies=two[k]) for k, state in enumerate(states)
     ]
-    return Screening(corrected, found, combined, slips), after
+    return Screening(corrected, tuple(note for own in checked for note in own.notes), found, combined, slips), after
 
 
 def screen_pairs(

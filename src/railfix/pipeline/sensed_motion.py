@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,14 @@ from railfix.motion.slip import (
     pitch_rate_radps,
     roll_sine,
 )
-from railfix.motion.tachometer import TachometerLimits, distance_m, faults_until, pulse_acceleration, pulse_speeds
+from railfix.motion.tachometer import (
+    PulseSpeeds,
+    TachometerLimits,
+    distance_m,
+    faults_until,
+    pulse_acceleration,
+    pulse_speeds,
+)
 from railfix.track import Track
 from railfix.track.curves import curved_line
 from railfix.track.trajectory import Trajectory
@@ -133,6 +140,48 @@ class FeatureFix:
         return self.located.arc_m - self.feature.arc_m
 
 
+class _Stretch(NamedTuple):
+    """Ticks without a break from `first` on, and the whole metres passed up to the last of them."""
+
+    first: int
+    sense: float  #: 1 toward rising arc length, else -1.
+    distance_m: Floats  #: At all ticks of the chunk, the one before the first of them at index 0.
+    body_m: Floats  #: Place of the body's middle at each tick of the stretch.
+    behind_m: Floats  #: And the place that a feature has to be passed by to be compared.
+    metre: Integers
+    heading_rad: Floats
+    pitch_rad: Floats
+
+    def shift_m(self, tick: int) -> float:
+        """Return what leads from distances to places of the body's middle at a tick."""
+        return float(self.body_m[tick - self.first] - self.distance_m[tick + 1])
+
+
+def _fix_feature(
+    feature: Feature,
+    stretch: _Stretch,
+    line: LineFeatures,
+    noise: tuple[float, tuple[float, float]],
+    facing: float,
+    last: tuple[float, float, float] | None,
+) -> FeatureFix | None:
+    """Compare the profile that was passed with a feature; `noise` is of the place by the wheel, and of the profile."""
+    tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
+    shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
+    # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
+    passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
+    place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
+    profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])
+    before = None
+    if last is not None:
+        covered = feature.arc_m - shift - last[2]
+        # on a closed line the last feature may lie before the join
+        nearest = line.line.nearest_m(np.array(last[0]), np.array(feature.arc_m - covered))
+        before = (float(nearest), last[1], covered)
+    located = _compare(profile, feature, line, noise[0], before, noise[1])
+    return None if located is None else FeatureFix(tick=tick, feature=feature, located=located)
+
+
 def feature_fixes(
     rates: RateSeries,
     line: LineFeatures,
@@ -182,31 +231,17 @@ def feature_fixes(
         sense = 1.0 if metre[-1] > metre[0] else -1.0
         behind = body - sense * HALF_LENGTH_M
         passed = float(behind[-1])
+        stretch = _Stretch(begin + 1, sense, distances, body, behind, metre, headings, pitches)
         known = done if done == done else float(behind[0])
         for feature in line.features[:: int(sense)]:
             if not 0.0 < sense * (feature.arc_m - known) <= sense * (passed - known):
                 continue
-            tick = begin + 1 + int(np.argmax(sense * (behind - feature.arc_m) >= 0.0))
-            shift = float(body[tick - begin - 1] - distances[tick + 1])  # from distances to places of the body's middle
-            # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
-            passed_by = np.flatnonzero(sense * (metre - distances[tick + 1]) <= 0.0)[:: int(sense)]
-            profile = (
-                np.asarray(metre[passed_by] + shift, dtype=np.float64),
-                headings[passed_by],
-                facing * pitches[passed_by],
-            )
-            before = None
-            if last is not None:
-                covered = feature.arc_m - shift - last[2]
-                # on a closed line the last feature may lie before the join
-                nearest = line.line.nearest_m(np.array(last[0]), np.array(feature.arc_m - covered))
-                before = (float(nearest), last[1], covered)
-            located = _compare(profile, feature, line, sigma_m, before, noise)
-            if located is None:
+            fix = _fix_feature(feature, stretch, line, (sigma_m, noise), facing, last)
+            if fix is None:
                 continue
-            fixes.append(FeatureFix(tick=tick, feature=feature, located=located))
-            if located.verdict == "accepted":
-                last = (located.arc_m, located.sigma_m, feature.arc_m - shift)
+            fixes.append(fix)
+            if fix.located.verdict == "accepted":
+                last = (fix.located.arc_m, fix.located.sigma_m, feature.arc_m - stretch.shift_m(fix.tick))
         # a place corrected backward passes nothing twice
         done = passed if not sense * (passed - done) < 0.0 or abs(passed - done) > HALF_LENGTH_M else done
     metre, headings, pitches = metre[-kept:], headings[-kept:], pitches[-kept:]
@@ -345,10 +380,7 @@ def sensed_motion(
     when = (ticks * _TICK_NS).astype("datetime64[ns]")
     earlier = ((ticks * _TICK_NS) - _MEAN_NS).astype("datetime64[ns]")
     speed = pulse_speeds(pulses, when, limits=tachometer)
-    acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=tachometer), speed)
-    # a lost tooth is no slip
-    faulty = faults_until(pulses, when) > faults_until(pulses, (ticks * _TICK_NS - _FAULT_NS).astype("datetime64[ns]"))
-    acceleration = np.where(faulty, np.nan, acceleration)
+    acceleration = _wheel_acceleration(pulses, ticks, speed, tachometer)
     last = np.searchsorted(pulses.time, when, side="right") - 1
     since = np.full(len(when), np.nan)
     since[last >= 0] = seconds(when[last >= 0] - pulses.time[last[last >= 0]])
@@ -386,13 +418,8 @@ def sensed_motion(
         pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer
     )
     passed_m = state.arc_m + facing * (passed[1:] - distances[0])
-    sine = facing * (found.metric + found.pitch)
-    under = np.stack([
-        sine / np.sqrt(1.0 - np.clip(sine, -0.5, 0.5) ** 2),
-        facing * turned / np.where(known_speed == 0.0, np.nan, known_speed),
-        facing * roll_sine(force, rates, known_speed) * (trajectory.contact_m or np.nan),
-        passed_m,
-    ])  # fmt: skip
+    sine, cant = found.metric + found.pitch, roll_sine(force, rates, known_speed) * (trajectory.contact_m or np.nan)
+    under = np.stack([*_slope_and_bend(facing * sine, facing * turned, known_speed), facing * cant, passed_m])
     under[:, ~(rolls & (np.abs(known_speed) > SLOWEST_MPS))] = np.nan
     sensed = _by_interval(found.state, found.speed_mps, doubt, swing, under, at, seconds(np.diff(edges)))
     along = trajectory.body_at if trajectory.body_chainage_m is not None else trajectory.chainage_at
@@ -403,6 +430,21 @@ def sensed_motion(
         climbed_rad=step * (turning - found.gyro_bias_radps), speed_mps=facing * speed.speed_mps, rolls=rolls,
     )  # fmt: skip
     return sensed, series, replace(state, tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
+
+
+def _slope_and_bend(sine: Floats, turned_radps: Floats, speed_mps: Floats) -> tuple[Floats, Floats]:
+    """Return gradient and curvature of the line by the sine of the gradient and the rate of turn."""
+    gradient = sine / np.sqrt(1.0 - np.clip(sine, -0.5, 0.5) ** 2)
+    return gradient, turned_radps / np.where(speed_mps == 0.0, np.nan, speed_mps)
+
+
+def _wheel_acceleration(
+    pulses: TachometerPulses, ticks: Integers, speed: PulseSpeeds, limits: TachometerLimits
+) -> Floats:
+    """Return the acceleration by the wheel at the ticks; NaN by a lost tooth, which is no slip."""
+    when, earlier, before = ((ticks * _TICK_NS - ago).astype("datetime64[ns]") for ago in (0, _MEAN_NS, _FAULT_NS))
+    acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=limits), speed)
+    return np.where(faults_until(pulses, when) > faults_until(pulses, before), np.nan, acceleration)
 
 
 def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Floats:

@@ -52,8 +52,8 @@ _CARRY_SIGMA_MPS: Final = 0.1
 #: Standard deviations in one metre of distance: swings of the body of 1 mrad, and of its heading [1/m].
 _GRADIENT_NOISE: Final = 1e-3
 _CURVATURE_NOISE_1PM: Final = 1e-4
-#: Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`) [m]: a map of 0.3 m places no
-#: feature better than some metres, one of 0.05 m to half a metre.
+#: Length over which the errors of the map change (as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`) [m]: a map
+#: of 0.3 m places no feature better than some metres, one of 0.05 m to half a metre.
 _MAP_LENGTH_M: Final = 50.0
 #: Least standard deviation of the place of a feature: the map's, and that of the body on its bogies [m].
 _FEATURE_SIGMA_M: Final = 0.5
@@ -183,51 +183,68 @@ def sensor_epochs(
             fixes, passing = feature_fixes(rates, references.features, facing, motion.sigma_m, passing, noise=noise)
             values |= _places(fixes, rates, time)
     if wheel:
-        distance = np.diff(distance_m(pulses, edges, limits=limits.tachometer))
-        known = (
-            usable
-            & (edges[:-1] >= pulses.time[0])
-            & ~(np.abs(distance) < LEAST_SPEED_MPS * np.maximum(span, 1e-9))
-            & (np.diff(faults_until(pulses, edges)) == 0)
-        )
-        quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
-        known &= ~_silent("tachometer", samples, len(time))
-        carried = np.isin(sensed.state, CARRIED)
-        known &= ~carried & (sensed.state != MotionState.EXPIRED)
-        rolled = np.where(known, distance, np.where(carried & usable, sensed.distance_m, np.nan))
-        speed_sigma = np.where(carried, _CARRY_SIGMA_MPS * (sensed.state != MotionState.STANDING), sensed.doubt_mps)
-        values |= {
-            "wheel_m": facing * rolled,
-            "wheel_sigma_m": np.sqrt(limits.wheel_sigma_m**2 + quantum**2 + (speed_sigma * span) ** 2),
-            "wheel_sign": "unknown" if (pulses.direction == 0).all() else "measured",
-        }
+        values |= _wheel_values(pulses, edges, sensed, limits, known=~_silent("tachometer", samples, len(time)))
     if len(radar) and "radar" in sources:
         mean, share = _mean_between(radar.time, radar.speed_mps, edges)
         known = usable & (share >= _COMPLETE) & ~_silent("radar", samples, len(time))
         sigma = _RADAR_SIGMA_MPS * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
-        values |= {"radar_m": np.where(known, facing * mean * span, np.nan), "radar_sigma_m": sigma}
+        values |= {"radar_m": np.where(known, mean * span, np.nan), "radar_sigma_m": sigma}
     if force:
         mean, share = _mean_between(inertial.time, inertial.force_mps2[:, 0], edges)
         known = usable & (share >= _COMPLETE) & ~_silent("inertial", samples, len(time))
         values |= {
-            "force_mps2": np.where(known, facing * (mean - sensed.swing_mps2), np.nan),
+            "force_mps2": np.where(known, mean - sensed.swing_mps2, np.nan),
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
         }
+    # + toward rising chainage
+    values |= {name: facing * values[name] for name in ("wheel_m", "radar_m", "force_mps2") if name in values}
     if len(ranging) and "range" in sources and references is not None and references.units is not None:
         values["ranges"] = _ranges(ranging, edges, references.units, ranging_lever_m(trajectory, limits))
     if len(state.samples.balises) and "balise" in sources and references is not None and references.balises:
         values["balises"], balises = balise_epochs(
             state.samples.balises, edges, references.balises, trajectory, balises, limits.balise
         )
-    kept = SensorSamples(
-        tachometer=_latest(pulses, _find_first_needed(pulses, edges[-1] - REACH, limits)),
-        inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1] - REACH, side="right") - 1),
-        radar=_latest(radar, np.searchsorted(radar.time, edges[-1], side="right") - 1),
-        ranging=_latest(ranging, np.searchsorted(ranging.time, edges[-1], side="right")),
-        balises=_latest(state.samples.balises, np.searchsorted(state.samples.balises.time, edges[-1], side="right")),
-    )
+    kept = _latest_samples(state.samples, edges[-1], limits)
     state = SensorState(time=time[-1], samples=kept, motion=motion, features=passing, balises=balises)
     return SensorEpochs(**values), sensed, state
+
+
+def _wheel_values(
+    pulses: TachometerPulses, edges: Datetimes, sensed: SensedMotion, limits: SensorLimits, *, known: Masks
+) -> dict[str, Any]:
+    """Return the distances by the wheel toward the front, by inertia while it slips, where `known` or carried."""
+    span = seconds(np.diff(edges))
+    usable = (span > 0.0) & (span <= _LONGEST_S)
+    distance = np.diff(distance_m(pulses, edges, limits=limits.tachometer))
+    carried = np.isin(sensed.state, CARRIED)
+    known = (
+        known
+        & usable
+        & (edges[:-1] >= pulses.time[0])
+        & ~(np.abs(distance) < LEAST_SPEED_MPS * np.maximum(span, 1e-9))
+        & (np.diff(faults_until(pulses, edges)) == 0)
+        & ~carried
+        & (sensed.state != MotionState.EXPIRED)
+    )
+    speed_sigma = np.where(carried, _CARRY_SIGMA_MPS * (sensed.state != MotionState.STANDING), sensed.doubt_mps)
+    quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
+    return {
+        "wheel_m": np.where(known, distance, np.where(carried & usable, sensed.distance_m, np.nan)),
+        "wheel_sigma_m": np.sqrt(limits.wheel_sigma_m**2 + quantum**2 + (speed_sigma * span) ** 2),
+        "wheel_sign": "unknown" if (pulses.direction == 0).all() else "measured",
+    }
+
+
+def _latest_samples(samples: SensorSamples, end: np.datetime64, limits: SensorLimits) -> SensorSamples:
+    """Return the samples that the next chunk needs."""
+    pulses, inertial, radar, ranging = samples.tachometer, samples.inertial, samples.radar, samples.ranging
+    return SensorSamples(
+        tachometer=_latest(pulses, _find_first_needed(pulses, end - REACH, limits)),
+        inertial=_latest(inertial, np.searchsorted(inertial.time, end - REACH, side="right") - 1),
+        radar=_latest(radar, np.searchsorted(radar.time, end, side="right") - 1),
+        ranging=_latest(ranging, np.searchsorted(ranging.time, end, side="right")),
+        balises=_latest(samples.balises, np.searchsorted(samples.balises.time, end, side="right")),
+    )
 
 
 def _with_map(trajectory: Trajectory) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from railfix.pipeline.base_station import BaseState
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import FilterState
 from railfix.pipeline.interference_stage import InterferenceState
+from railfix.pipeline.observable_checks import ObservableState
 from railfix.pipeline.off_map import OffMapState
 from railfix.pipeline.received import Received
 from railfix.positioning.map_offset import MapOffsetState
@@ -37,6 +38,7 @@ class AntennaState(NotebookTable):
     two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
 
     interference: InterferenceState = field(default_factory=InterferenceState)
+    observables: ObservableState = field(default_factory=ObservableState)  #: Signs and units of Dopplers and phases.
 
     def __repr__(self) -> str:
         screens = ", ".join(sorted(self.screens)) or "none"

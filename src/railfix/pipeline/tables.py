@@ -237,7 +237,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("force_offset_mps2", "offset of the accelerometer, as estimated", "tracked.force_offset_mps2"),
         Column(
             "map_scale",
-            "factor on `tracking.map_scale_m`: above 1 where pseudoranges keep moving against the map",
+            "factor on 0.03 m per square root of a metre: above 1 where pseudoranges keep moving against the map",
             "tracked.map_scale",
         ),
         Column(

@@ -12,7 +12,7 @@ from .normal_equations import (
     point_position,
     position_on_line,
 )
-from .range_arrays import ClockTies, Ranges, weighted_ranges, without
+from .range_arrays import InterSystemBiases, Ranges, weighted_ranges, without
 from .receiver_noise import (
     ClockOffsetLimits,
     NoiseScaleLimits,
@@ -32,10 +32,10 @@ __all__ = [
     "AntennaRows",
     "ApproximatePosition",
     "ClockOffsetLimits",
-    "ClockTies",
     "Constrained",
     "ConstrainedLimits",
     "FixLimits",
+    "InterSystemBiases",
     "LineFix",
     "NoiseScaleLimits",
     "OffsetState",

@@ -18,7 +18,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.normal_equations import SinglePoint, normal_equations
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.track.trajectory import Trajectory
 
 #: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].
@@ -284,7 +284,7 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     return GrossErrors(gross, unsure)
 
 
-def gross_alone(ranges: Ranges, clock_m: Floats, ties: ClockTies) -> Masks:
+def gross_alone(ranges: Ranges, clock_m: Floats, ties: InterSystemBiases) -> Masks:
     """Return the ranges that are alone on their clock and off by more than `GROSS_M` by the known biases, shape (T, M).
 
     Nothing contradicts such a range while its clock is free. `clock_m` are the clocks of a position with free clocks,

@@ -13,7 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks, patch_rows
 from railfix.core.epoch_rows import EVERY
 from railfix.positioning.gross_errors import gross_alone
 from railfix.positioning.normal_equations import SinglePoint, SinglePointLimits, point_position
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges, without
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
 from railfix.positioning.receiver_noise import ClockOffsetLimits, OffsetState, RobustFitLimits, robust_fit, tie_clocks
 
 
@@ -27,7 +27,7 @@ class PointPositions(NamedTuple):
     #: Ranges that agree with each other in space, and the positions from these.
     agreeing: Ranges
     free: SinglePoint
-    ties: ClockTies
+    ties: InterSystemBiases
     gross: Masks  #: Ranges that are alone on their clock and contradict the known biases grossly, shape (T, K).
 
 
@@ -93,7 +93,7 @@ def tie_constellations(
 
 
 def _tie(
-    ranges: Ranges, ties: ClockTies, point: SinglePoint, start_ecef_m: Floats, limits: SinglePointLimits
+    ranges: Ranges, ties: InterSystemBiases, point: SinglePoint, start_ecef_m: Floats, limits: SinglePointLimits
 ) -> SinglePoint:
     """Return the 3-D positions with the clocks tied; those with free clocks where no bias is known yet."""
     rows = ((ties.sigma_m < UNTIED_M).sum(axis=1) > 1).nonzero()[0]

@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.special import chdtri, chndtrinc
 
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
@@ -44,17 +44,17 @@ class MapOffsetLimits(Settings):
     @cached_property
     def note_threshold(self) -> float:
         """Statistic from which on a run has a note."""
-        return float(chdtri(2, self.note_risk))
+        return float(scipy.special.chdtri(2, self.note_risk))
 
     @cached_property
     def threshold(self) -> float:
         """Statistic from which on epochs have the status."""
-        return float(chdtri(2, self.risk))
+        return float(scipy.special.chdtri(2, self.risk))
 
     @cached_property
     def detectable_sigmas(self) -> float:
         """Offset that the status misses with the probability `missed` (non-central chi-square) [sigmas]."""
-        return float(np.sqrt(chndtrinc(self.threshold, 2, self.missed)))
+        return float(np.sqrt(scipy.special.chndtrinc(self.threshold, 2, self.missed)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,8 @@
 
 Subtracting the weighted mean of a constellation's satellites from its residuals and design rows is the same as solving
 for that clock (the Schur complement of the clock block). Where the offsets between the clocks are known to some sigma
-(`ClockTies`), each mean, less its offset, is one more observation of a common clock, eliminated in the same way.
+(`InterSystemBiases`), each mean, less its offset, is one more observation of a common clock, eliminated in the same
+way.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
 height errors are two more unknowns with their covariance as prior, the same as an added covariance ``H_m S_m H_m^T``.

@@ -23,7 +23,7 @@ UNTIED_M: Final = 1e6  #: Sigma of an offset between clocks of which nothing is 
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClockTies(RowArrays):
+class InterSystemBiases(RowArrays):
     """Known offsets between the receiver clocks of the constellations."""
 
     #: Receiver clock of each group less a clock common to all; any finite value where unknown; shape (T, G).
@@ -38,7 +38,7 @@ class RangeArrays(NamedTuple):
     code_m: Floats  # (T, M)
     weight: Floats  # (T, M)
     starts: Indices  # (G,) first channel of each group
-    offset_m: Floats  # (T, G), of `ClockTies`; (0, G) without ties
+    offset_m: Floats  # (T, G), of `InterSystemBiases`; (0, G) without ties
     sigma_m: Floats  # likewise
 
     @property
@@ -67,7 +67,7 @@ class Ranges:
     code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
     weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
     groups: tuple[slice, ...]  #: Channels that share one receiver clock stand side by side; one slice a clock.
-    ties: ClockTies | None = None  #: Known offsets between these clocks; None: none.
+    ties: InterSystemBiases | None = None  #: Known offsets between these clocks; None: none.
 
     def __len__(self) -> int:
         return len(self.code_m)

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.special import ndtri, stdtrit
 
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, kernel_array
@@ -29,7 +29,7 @@ from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.normal_equations import Constrained, SinglePoint
-from railfix.positioning.range_arrays import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory
 
@@ -140,8 +140,8 @@ def robust_on_line(
     return robust_fit(ranges, at, information=information, limits=limits)
 
 
-#: Half-widths of the 95 % interval, Student's t against the normal distribution, by degrees of freedom from 1.
-_WIDENED: Final = stdtrit(np.arange(1, 129), 0.975) / ndtri(0.975)
+#: Beyond so many degrees of freedom Student's t is taken at this many.
+_MOST_FREEDOM: Final = 128
 
 
 class NoiseScaleLimits(Settings):
@@ -216,7 +216,8 @@ def epoch_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Fl
     """
     freedom = np.maximum(redundancy, 1)
     shown = np.sqrt(np.maximum(wsse, 0.0) / freedom)
-    return np.asarray(sigma_m * np.maximum(scale, shown) * _WIDENED[np.minimum(freedom, len(_WIDENED)) - 1])
+    widened = scipy.special.stdtrit(np.minimum(freedom, _MOST_FREEDOM), 0.975) / scipy.special.ndtri(0.975)
+    return np.asarray(sigma_m * np.maximum(scale, shown) * widened)
 
 
 #: Huber's tuning constant [sigma]: 95 % efficiency for normal errors.
@@ -312,7 +313,7 @@ def tie_clocks(
     *,
     parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
-) -> tuple[ClockTies, list[OffsetState]]:
+) -> tuple[InterSystemBiases, list[OffsetState]]:
     """Return the offsets known at each epoch from the epochs before it, and the new states of the receivers.
 
     `ranges`: without ties, those that agree with each other alone, with the letter of each of its groups in `clocks`;
@@ -349,4 +350,4 @@ def tie_clocks(
     offset[:, others] = np.where(has, of_moment / safe, 0.0)
     spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
     sigma[:, others] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
-    return ClockTies(offset_m=offset, sigma_m=sigma), after
+    return InterSystemBiases(offset_m=offset, sigma_m=sigma), after

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices
@@ -21,7 +21,7 @@ class SearchIndex:
         self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)  #: Mean of its points, shape (3,).
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
-        self.tree = cKDTree(points)  #: Of its points.
+        self.tree = scipy.spatial.cKDTree(points)  #: Of its points.
         #: Stretches of each level: middle points, and the radii [m] that cover the rest.
         self.levels: list[tuple[Indices, Floats]] = []
         count, size = len(points), 1

@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.special import chdtri
 
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers
@@ -45,12 +45,12 @@ class SectionLimits(Settings):
     @cached_property
     def threshold(self) -> float:
         """Excess of q that noise of unit variance explains."""
-        return float(chdtri(1, self.ambiguity_risk))
+        return float(scipy.special.chdtri(1, self.ambiguity_risk))
 
     @cached_property
     def reach(self) -> float:
         """Excess of q up to which other places are found."""
-        return float(chdtri(1, min(_REACH_RISK, self.ambiguity_risk)))
+        return float(scipy.special.chdtri(1, min(_REACH_RISK, self.ambiguity_risk)))
 
 
 @dataclass(frozen=True, kw_only=True)

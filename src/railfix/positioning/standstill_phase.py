@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.special import logsumexp
+import scipy
 
 from railfix.core.arrays import Floats, Integers
 
@@ -152,20 +151,20 @@ def phase_log_likelihood(
     unknown; with the probability `fault_prior` they follow no model (a slip, half a cycle) and are uniform there.
     """
     measured = np.concatenate([code.place_m for code in codes])
-    of_codes = block_diag(*(code.covariance_m2 for code in codes))
+    of_codes = scipy.linalg.block_diag(*(code.covariance_m2 for code in codes))
     gain = np.linalg.solve(prior_m2 + of_codes, prior_m2).T
     places = expected_m + (measured - expected_m) @ gain.T
     spread = prior_m2 - gain @ prior_m2
-    away = block_diag(*(phase.away for phase in phases))
+    away = scipy.linalg.block_diag(*(phase.away for phase in phases))
     wavelength = np.concatenate([phase.wavelength_m for phase in phases])
-    covariance = block_diag(*(phase.covariance_m2 for phase in phases)) + away @ spread @ away.T
+    covariance = scipy.linalg.block_diag(*(phase.covariance_m2 for phase in phases)) + away @ spread @ away.T
     cycles = (np.concatenate([phase.difference_m for phase in phases]) - places @ away.T) / wavelength
     search = IntegerSearch(covariance / np.outer(wavelength, wavelength))
     constant = np.log1p(-fault_prior) - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1]
     uniform = uniform_log_likelihood(phases, fault_prior=fault_prior)
     below = 2.0 * (constant - uniform - _NEGLIGIBLE)
     squares = [search.nearest(row, _VECTORS, below=below)[1] for row in cycles]
-    return np.array([logsumexp(np.append(constant - 0.5 * square, uniform)) for square in squares])
+    return np.array([scipy.special.logsumexp(np.append(constant - 0.5 * square, uniform)) for square in squares])
 
 
 def uniform_log_likelihood(phases: Sequence[MeanPhases], *, fault_prior: float) -> float:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.special import chdtrc, logsumexp
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.settings import Settings, option
@@ -103,7 +103,7 @@ class StandstillFix:
     @property
     def fits(self) -> bool:
         """Whether the residuals agree with the error model."""
-        return self.freedom < 1 or bool(chdtrc(self.freedom, self.misfit) > _MISFIT)
+        return self.freedom < 1 or bool(scipy.special.chdtrc(self.freedom, self.misfit) > _MISFIT)
 
 
 def standstill_fix(
@@ -218,10 +218,13 @@ def track_posterior(
     with np.errstate(divide="ignore"):
         log_prior = np.log([*weights, errors.unmapped_prior / width])
     logs = np.array(
-        [[logsumexp(item.log_evidence) if len(item.log_evidence) else -np.inf for item in row] for row in found]
+        [
+            [scipy.special.logsumexp(item.log_evidence) if len(item.log_evidence) else -np.inf for item in row]
+            for row in found
+        ]
     )
     logs += log_prior[:, None]
-    total = logsumexp(logs)
+    total = scipy.special.logsumexp(logs)
     if not np.isfinite(total):
         shares = np.zeros((len(tracks) + 1, 2))
         shares[-1] = 0.5
@@ -357,7 +360,7 @@ def _places(
     likeliest = np.argmax(exponent, axis=0)
     chosen = np.stack(expected, axis=2)[likeliest, np.arange(len(shifts_m))]
     return _Places(
-        log_evidence=logsumexp(exponent, axis=0)
+        log_evidence=scipy.special.logsumexp(exponent, axis=0)
         - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1]
         + np.log(_ALONG_M),
         expected_m=chosen,

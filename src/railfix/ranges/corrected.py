@@ -62,7 +62,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     #: Standard deviation of satellites and atmosphere: by SBAS, otherwise by `NominalErrors`; shape (T, K).
     nominal_m: Floats
     #: What `NominalErrors` assumes at the elevation alone; 0 with SBAS; shape (T, K).
-    unmodelled_m: Floats
+    nominal_elevation_sigma_m: Floats
     #: Overbounding sigma and largest nominal bias of each range by an error model; 0 without one; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
@@ -204,7 +204,7 @@ def corrected_ranges(
         doppler_hz=observations.doppler_hz[:, channels.columns], cn0_dbhz=cn0, satellites=states, near_ecef_m=near,
         elevation_deg=seen.elevation_deg, azimuth_deg=seen.azimuth_deg, ionosphere_m=delays.ionosphere_m,
         troposphere_m=delays.troposphere_m, corrected_code_m=clean, sigma_m=sigma, nominal_m=given.nominal_m,
-        unmodelled_m=given.unmodelled_m, bound_sigma_m=none, bias_m=none,
+        nominal_elevation_sigma_m=given.nominal_elevation_sigma_m, bound_sigma_m=none, bias_m=none,
         unsure=np.zeros(len(time), dtype=np.bool_), second=second, base=given.base,
         reason=np.where(lacking, int(Reason.NO_CORRECTION), reason),
     )  # fmt: skip

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.special import betaincinv, ndtri
 
 from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings, option
@@ -35,7 +35,7 @@ def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")
     ordered = np.sort(error_m)
-    score = ndtri(np.arange(1, len(ordered) + 1) / (len(ordered) + 1.0))
+    score = scipy.special.ndtri(np.arange(1, len(ordered) + 1) / (len(ordered) + 1.0))
     half = score >= 0.0
     # Both halves as distances from zero outward: the upper as it is, the lower mirrored.
     score, sizes = score[half], (ordered[half], -ordered[::-1][half])
@@ -210,7 +210,7 @@ def fault_rate(samples: ErrorSamples) -> FaultRate:
 
 def _upper(hits: int, trials: int) -> float:
     """Return the upper end of the one-sided interval of a probability (Clopper and Pearson)."""
-    return float(betaincinv(hits + 1, trials - hits, _CONFIDENCE)) if trials > hits else 1.0
+    return float(scipy.special.betaincinv(hits + 1, trials - hits, _CONFIDENCE)) if trials > hits else 1.0
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
@@ -238,8 +238,8 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
     bad[number.ravel()[faulty[used]]] = True
     places, of = np.unique(pairs[:, 0], return_inverse=True)
     blocks, hits = np.bincount(of), np.bincount(of, weights=bad)
-    upper = betaincinv(bad.sum() + 1, max(len(bad) - bad.sum(), 1), _CONFIDENCE)
-    lower = np.where(hits > 0, betaincinv(np.maximum(hits, 1), blocks - hits + 1, 1.0 - _CONFIDENCE), 0.0)
+    upper = scipy.special.betaincinv(bad.sum() + 1, max(len(bad) - bad.sum(), 1), _CONFIDENCE)
+    lower = np.where(hits > 0, scipy.special.betaincinv(np.maximum(hits, 1), blocks - hits + 1, 1.0 - _CONFIDENCE), 0.0)
     marked = places[lower > upper]
     edges = np.flatnonzero(np.diff(marked, prepend=marked[:1] - 2, append=marked[-1:] + 2) > 1)
     return tuple(

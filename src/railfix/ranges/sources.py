@@ -49,7 +49,7 @@ class SourceDelays(NamedTuple):
     sigma_m: Floats  #: In the weights beside the receiver's noise, shape (T, K).
     #: Standard deviation of satellites and atmosphere, and the part of it that is assumed by elevation alone; (T, K).
     nominal_m: Floats
-    unmodelled_m: Floats
+    nominal_elevation_sigma_m: Floats
     base: BaseDifferences | None = None  #: What a base station subtracts.
     floor: Literal["added", "included"] = "added"  #: Whether `sigma_m` includes the error floor of the codes.
 
@@ -235,7 +235,7 @@ class BaseStationSource:
         differenced = np.isfinite(base.code_m)
         nominal, beyond = (np.where(differenced, base.sigma_m, each) for each in (given.nominal_m, given.sigma_m))
         beyond = np.where(differenced, beyond, np.hypot(beyond, self.floor_sigma_m))
-        return SourceDelays(given.delays, beyond, nominal, given.unmodelled_m, base, "included")
+        return SourceDelays(given.delays, beyond, nominal, given.nominal_elevation_sigma_m, base, "included")
 
 
 SBAS_SIGNAL: Final = "1C"  #: The signal that corrections are made for: GPS L1 C/A, as RINEX 3 calls it.

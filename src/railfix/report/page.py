@@ -31,7 +31,7 @@ from railfix.report.charts_page import (
 )
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, antenna_groups, overview, protection, run_group
 from railfix.report.headline import headline
-from railfix.report.plots.errors import error_ranges
+from railfix.report.plots.errors import error_ranges, errors_of_runs
 from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
@@ -252,8 +252,9 @@ def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers:
         for antenna in run.folder.antennas
         if (errors := run.get_errors(antenna)) is not None
     }
-    chart = error_ranges(series)
-    return PagePart(title="", figures=() if chart.empty else (figure(chart, numbers),))
+    # one run has its own chart over chainage
+    charts = [error_ranges(series), *([errors_of_runs(series)] if len(runs) > 1 else [])]
+    return PagePart(title="", figures=[figure(chart, numbers) for chart in charts if not chart.empty])
 
 
 def _run(

@@ -10,7 +10,7 @@ import re
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -21,7 +21,7 @@ from railfix.core.files import write_whole
 from railfix.core.settings import Settings, load_settings
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
-from railfix.run.inputs import RunInputs, RunOptions
+from railfix.run.inputs import LogReading, RunInputs, RunOptions
 from railfix.run.output import check_folder
 from railfix.run.processor import with_measured_priors
 from railfix.run.record import read_record
@@ -85,8 +85,8 @@ class CampaignRun:
 class CampaignProgress(Protocol):
     """Callback for the progress of a campaign."""
 
-    def __call__(self, *, done: int, failed: int, total: int, left_s: float) -> None:
-        """Runs done, failed and in total, and the estimated time left [s]."""
+    def __call__(self, *, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
+        """Runs done, of these kept from an earlier call, failed, in total, and the estimated time left [s]."""
 
 
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
@@ -142,6 +142,7 @@ def run_campaign(
     *,
     out: Path,
     executor: Executor,
+    reading: LogReading | None = None,
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
@@ -151,10 +152,14 @@ def run_campaign(
     where it was. A run that fails is a row with its error: the fields, `status` ("done", "failed"), `error`, `epochs`,
     `positioning_rate`, `ok_rate`, `wall_s`, `reference`, `folder` (below `out`).
 
+    `reading` takes the place of that in the campaign's options, where it is given and not the default.
     The executor is of `concurrent.futures`: processes on this machine, or any other with its interface whose workers
     see the same files; by the errors `lost` it reports that a worker process is gone.
     """
-    return position_runs(read_campaign(path, out), out=out, executor=executor, progress=progress, lost=lost)
+    runs = read_campaign(path, out)
+    if reading not in (None, LogReading()):
+        runs = [replace(run, options=run.options.replaced(logs=reading)) for run in runs]
+    return position_runs(runs, out=out, executor=executor, progress=progress, lost=lost)
 
 
 def position_runs(
@@ -168,38 +173,41 @@ def position_runs(
     """Position runs below the folder ``out / "runs"``; parameters, result and errors as `run_campaign`."""
     if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():
         raise OutputError(f"{out}: the folder is not empty, nor that of a campaign; name another one")
-    began, results = clock.perf_counter(), {}
+    began, results, kept = clock.perf_counter(), {}, 0
     (out / "runs").mkdir(parents=True, exist_ok=True)
-    futures = {executor.submit(position_run, run): number for number, run in enumerate(runs)}
+    first = sorted(range(len(runs)), key=lambda number: not (runs[number].out / "run.json").exists())
+    futures = {executor.submit(position_run, runs[number]): number for number in first}
     for count, future in enumerate(as_completed(futures), start=1):
-        number = futures[future]
+        number, is_kept = futures[future], False
         try:
-            results[number] = future.result()
+            results[number], is_kept = future.result()
         except lost as error:
             gone = f"its worker process is gone ({type(error).__name__}), perhaps for lack of memory"
             results[number] = _row(runs[number], status="failed", error=f"{gone}; run the command again")
         results[number]["folder"] = str(runs[number].out.relative_to(out.absolute()))
-        if progress is not None:
+        kept += is_kept
+        if progress is not None and (not is_kept or count == len(runs)):
             failed = sum(row["status"] == "failed" for row in results.values())
-            left = (clock.perf_counter() - began) / count * (len(runs) - count)
-            progress(done=count, failed=failed, total=len(runs), left_s=left)
+            left = (clock.perf_counter() - began) / max(count - kept, 1) * (len(runs) - count)
+            progress(done=count, kept=kept, failed=failed, total=len(runs), left_s=left)
     table = pl.DataFrame([results[number] for number in range(len(runs))], infer_schema_length=None)
     write_whole(out / "campaign.csv", table.write_csv(), what="table of the campaign")
     return table
 
 
-def position_run(run: CampaignRun) -> dict[str, Any]:
-    """Position one run, unless its results are there, and return its row."""
+def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:
+    """Position one run, unless its results are there; return its row, and whether they were."""
     try:
         check_folder(run.out, overwrite="replace")
-        if not run.done:
+        if not (kept := run.done):
             options = run.options.replaced(overwrite="replace")
             run_files(run.inputs, run.config, out=run.out, options=options)
         record = read_record(run.out).record
     except RailfixError as error:
-        return _row(run, status="failed", error=" ".join(str(error).split()))
+        return _row(run, status="failed", error=" ".join(str(error).split())), False
     epochs = sum(antenna["epochs"] for antenna in record["antennas"].values())
-    return _row(run, epochs=epochs, **{name: record[name] for name in ("positioning_rate", "ok_rate", "wall_s")})
+    rates = {name: record[name] for name in ("positioning_rate", "ok_rate", "wall_s")}
+    return _row(run, epochs=epochs, **rates), kept
 
 
 def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from railfix.core.arrays import Datetimes
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import Navigation
@@ -15,6 +16,7 @@ from railfix.motion.samples import SensorSamples
 from railfix.ranges.base_station import LONGEST_AGE_S, LONGEST_KM
 from railfix.ranges.sbas import DfmcService, SbasCorrections
 from railfix.run.processor import BaseLog
+from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally, Tally
 from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
@@ -32,14 +34,30 @@ RECORD_REACH: Final = np.timedelta64(4, "h")
 Span = tuple[np.datetime64, np.datetime64]
 
 
-def navigation_span(navigation: Navigation) -> Span | None:
-    """Return the reference times of the first and the last record; None where there is none."""
+def navigation_times(navigation: Navigation) -> Datetimes:
+    """Return the reference times of all records, in order."""
     times = [navigation.kepler.toe, navigation.glonass.toe]
     if navigation.precise is not None:
         times.append(navigation.precise.time)
     known = np.concatenate(times)
-    known = known[~np.isnat(known)]
-    return (known.min(), known.max()) if len(known) else None
+    return np.sort(known[~np.isnat(known)])
+
+
+def navigation_span(navigation: Navigation) -> Span | None:
+    """Return the reference times of the first and the last record; None where there is none."""
+    times = navigation_times(navigation)
+    return (times[0], times[-1]) if len(times) else None
+
+
+def check_each_file(navigation: Navigation, log: Log) -> None:
+    """Raise MismatchError where one of several files of a log begins more than a day from every navigation record."""
+    times = navigation_times(navigation)
+    for path, first in log.first_epochs() if len(times) else ():
+        if np.abs(times - first).min() > ANOTHER_DAY:
+            raise MismatchError(
+                f"{path}: begins at {str(first)[:16]} (GPS time), more than a day from every navigation record; give "
+                "the navigation file of that day, too"
+            )
 
 
 def _spans(tally: Tally) -> dict[str, Span]:

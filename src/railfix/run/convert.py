@@ -57,7 +57,7 @@ def convert_logs(
     version: Literal["3.04", "4.02"] = "3.04" if rinex == "3" else "4.02"
     lines: list[str] = []
     if out is not None:
-        header, epochs, skipped = _scan(logs, reading)
+        header, epochs, skipped, problems = _scan(logs, reading)
         pieces = (piece for piece in scan_observations(logs, **reading.of_observations) if len(piece))
         observables = {
             system: [kind + signal for signal in signals for kind in "CLDS"]
@@ -66,6 +66,7 @@ def convert_logs(
         write_observations(pieces, out, version=version, observables=observables, header=header)
         lines.append(f"wrote {out}: {epochs:,} epochs, RINEX {version}")
         lines += [f"skipped {count:,} {what}" for what, count in sorted(skipped.items())]
+        lines += [f"note: {problem}" for problem in problems]
     if nav_out is not None:
         navigation, left_out = with_written_messages(read_navigation(logs, **reading.arguments), version)
         write_navigation(navigation, nav_out, version=version)
@@ -75,20 +76,21 @@ def convert_logs(
     return lines
 
 
-def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeader, int, Counter[str]]:
-    """Return the header with the signals of the whole log, number of epochs, and what is passed over."""
+def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeader, int, Counter[str], list[str]]:
+    """Return the header with the signals of the whole log, number of epochs, what is skipped, and notes."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
-    header, epochs, skipped = ObservationHeader(), 0, Counter[str]()
+    header, epochs, skipped, problems = ObservationHeader(), 0, Counter[str](), list[str]()
     for piece in scan_observations(logs, **reading.of_observations):
         header = piece.header if not epochs else header
         channels |= piece.header.glonass_channel
         epochs += len(piece)
         skipped.update(piece.skipped)
+        problems += piece.problems
         for name, signal in zip(piece.satellite.tolist(), piece.signal.tolist(), strict=True):
             signals.setdefault(name[0], set()).add(signal)
     joined = {system: tuple(sorted(codes)) for system, codes in sorted(signals.items())}
-    return replace(header, signals=joined, glonass_channel=channels), epochs, skipped
+    return replace(header, signals=joined, glonass_channel=channels), epochs, skipped, problems
 
 
 _RULE: Final = "\n" + "=" * 80 + "\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,14 +14,15 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
-from railfix.core.files import ending
+from railfix.core.files import LENIENT, ending
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation, scan_observations
-from railfix.io.positions import position_kind, read_positions
+from railfix.io.positions import header_line, position_kind, read_positions
 from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
 from railfix.run.checks import RECORD_REACH, Span, navigation_span, spans_apart
+from railfix.track.quality import check_track, error_note
 from railfix.track.read import read_track
 from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
@@ -30,6 +32,9 @@ _SECOND: Final = np.timedelta64(1, "s")
 _MOST_NOTES: Final = 5  #: Notes on one file that are shown.
 #: Endings of track maps in other forms than tables.
 MAP_ENDINGS: Final = (*VECTOR_ENDINGS, ".geojson", ".json", ".ifc", ".xml", ".landxml", ".railml")
+
+#: Words in the header of a table of positions that one of a track map has not.
+_OF_POSITIONS: Final = ("time", "unix", "tow", "quality", "sigma_north", "antenna")
 
 Kind = Literal["observations", "navigation", "track", "vehicle", "settings", "positions", "unknown"]
 
@@ -100,6 +105,8 @@ def _examine(path: Path) -> FileFinding:
             return _READERS[kind](path)
         except RailfixError as error:
             errors.append(str(error))
+            if "--date" in str(error):  # the kind is known, the date is not
+                return FileFinding(path=path, kind=kind, facts=(), problems=(errors[-1],))
     if len(kinds) == 1:
         return FileFinding(path=path, kind=kinds[0], facts=(), problems=(errors[0],))
     return FileFinding(path=path, kind="unknown", facts=tuple(errors))
@@ -111,7 +118,7 @@ def _find_kinds(path: Path) -> list[Kind]:
         return ["vehicle", "settings"]
     if ending(path) in MAP_ENDINGS:
         return ["positions", "track"] if ending(path) == ".gpx" else ["track"]
-    head = read_head(path)
+    head = read_head(path).removeprefix(codecs.BOM_UTF8)
     first = head.decode("latin-1").split("\n")[0]
     if first[60:80].strip() == "RINEX VERSION / TYPE":
         return ["observations" if first[20:21].upper() == "O" else "navigation"]
@@ -121,10 +128,8 @@ def _find_kinds(path: Path) -> list[Kind]:
     if kind in ("nmea", "novatel", "rtklib"):
         return ["positions"]
     if kind == "csv":
-        names = first.lower()
-        return (
-            ["positions", "track"] if any(word in names for word in ("time", "unix", "tow")) else ["track", "positions"]
-        )
+        names = header_line(head).lower()
+        return ["positions"] if any(word in names for word in _OF_POSITIONS) else ["track"]
     return [*_READERS]
 
 
@@ -228,6 +233,7 @@ def _track(path: Path) -> FileFinding:
             f"{path}: does not say above what its heights are; give --height-datum ellipsoidal, as in the command, "
             "or orthometric with --geoid",
         )
+    problems += tuple(f"{path}: {note}" for note in error_note(check_track(track)))
     length = float(track.chainage_m[-1] - track.chainage_m[0])
     low, high = float(np.min(track.height_m)), float(np.max(track.height_m))
     facts = (
@@ -243,14 +249,21 @@ def _track(path: Path) -> FileFinding:
 
 
 def _positions(path: Path) -> FileFinding:
-    log = read_positions(path, broken_lines="count", heights="optional")
+    options: tuple[str, ...] = ()
+    try:
+        log = read_positions(path, heights="optional", antennas="several")
+    except InputFileError as error:
+        if LENIENT not in str(error):
+            raise
+        log = read_positions(path, broken_lines="count", heights="optional", antennas="several")
+        options = ("--lenient",)
     known = log.time[~np.isnat(log.time)]
-    if not len(known):
-        raise InputFileError(path, "its positions have no time")
-    span = (known.min(), known.max())
+    span = (known.min(), known.max()) if len(known) else None
     place = np.nanmedian(log.ecef_m, axis=0)
-    facts = (f"{len(log.time):,} positions", *_place_facts(place), *(f"note: {n}" for n in log.notes[:_MOST_NOTES]))
-    return FileFinding(path=path, kind="positions", facts=facts, span=span, place_ecef_m=place)
+    of = f" of {' and '.join(log.antennas)}" if log.antennas else ""
+    of += "" if len(known) else " without time"
+    facts = (f"{len(log.time):,} positions{of}", *_place_facts(place), *(f"note: {n}" for n in log.notes[:_MOST_NOTES]))
+    return FileFinding(path=path, kind="positions", facts=facts, span=span, place_ecef_m=place, options=options)
 
 
 def _vehicle(path: Path) -> FileFinding:

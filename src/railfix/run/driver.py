@@ -25,7 +25,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.state import State
-from railfix.run.checks import check_base, check_same_day, check_same_place, check_whole_run
+from railfix.run.checks import check_base, check_each_file, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
@@ -169,6 +169,8 @@ def open_inputs(
         log=positions,
     )  # fmt: skip
     logs = {name: open_log(paths) for name, paths in inputs.logs.items()}
+    for log in logs.values():
+        check_each_file(navigation, log)
     return navigation, line, logs
 
 
@@ -254,11 +256,11 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return likely causes by antenna, of those without a position on the line; blank where none was found."""
+    """Return likely causes by antenna, of those without a position that fits the line; blank where none was found."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]
-        if antenna.observed and antenna.status["off_map"] == antenna.positioned:
+        if antenna.observed and antenna.status["off_map"] + antenna.status["inconsistent"] == antenna.positioned:
             from railfix.run.locate import likely_cause
 
             again = replace(logs[name], problems=[], skipped=Counter())
@@ -327,7 +329,7 @@ def collect_notes(
             doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"
             notes.append(f"{name}: the map {doubt}: {offset.text}")
         notes += [
-            f"{name}: interference: {sign} at {count} epochs from {str(first)[:19]} on"
+            f"{name}: {_describe_sign(sign, antenna.tag_error_s)} at {count} epochs from {str(first)[:19]} on"
             for sign, (count, first) in antenna.interference.items()
         ]
         if antenna.positioned:
@@ -337,6 +339,31 @@ def collect_notes(
             which = "every position is" if off == antenna.positioned else f"{off} of {antenna.positioned} positions are"
             notes.append(f"{name}: {which} off the map; {(causes or {}).get(name) or _TRACK}")
     return tuple(dict.fromkeys(notes))
+
+
+#: Differences of other time scales from GPS time, which tags have by mistake [s].
+_SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
+
+
+def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
+    """Return what a sign of all satellites tells, the beginning of a sentence."""
+    if sign == "left_map":
+        return "the 3-D positions have left the map (column interference_causes)"
+    if sign == "contradicted":
+        return "all positions of the minute before failed a check, so that none of the filter is sure,"
+    if sign != "time_tags":
+        return f"interference: {sign}"
+    low, high = tag_error_s
+    middle, drifting = 0.5 * (low + high), high - low > _STEADY_S
+    size = f"between {low:+.2f} and {high:+.2f} s" if drifting else f"{abs(middle):.2f} s"
+    which = "off (+ late)" if drifting else "early" if middle < 0.0 else "late"
+    scale = next((text for off, text in _SCALES.items() if not drifting and abs(middle - off) < _STEADY_S), None)
+    guess = "do they drift" if drifting else f"are they {scale}, not GPS time" if scale else "are they GPS time"
+    return f"the time tags are {size} {which}, so that no position has a level ({guess}?)"
+
+
+#: Errors of time tags that differ by more are no constant [s].
+_STEADY_S: Final = 0.5
 
 
 def _describe_detectable(detectable_m: Floats) -> str:

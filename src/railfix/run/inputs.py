@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -35,6 +35,10 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
 
 
 #: Texts of options that several commands have.
+NAVIGATION: Final = (
+    "Navigation file, RINEX or a receiver's log; repeat it for several. Without it a receiver's log serves by its own "
+    "ephemerides."
+)
 TRACK: Final = (
     "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route is "
     "found from the log."
@@ -52,6 +56,21 @@ VIRTUAL_BALISES: Final = "Places whose passing is reported with its interval: a 
 
 class InputFiles(Settings):
     """Input files of a command, each field a path, several paths, or None."""
+
+    #: Fields of receiver logs whose own ephemerides serve where no navigation file is given.
+    own_navigation: ClassVar[tuple[str, ...]] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_own_navigation(cls, values: Any) -> Any:
+        """Return the inputs with the receiver logs as navigation files where none is given."""
+        if not cls.own_navigation or not isinstance(values, dict) or values.get("nav"):
+            return values
+        logs = [Path(path) for name in cls.own_navigation for path in values.get(name) or ()]
+        own = tuple(path for path in logs if path.is_file() and is_receiver_log(read_head(path)))
+        if logs and not own:
+            raise ValueError("--nav is missing; name the navigation file, which RINEX observations need")
+        return {**values, "nav": own}
 
     def files_by_name(self) -> Iterator[tuple[str, Path]]:
         """Yield each file with the name of its field."""
@@ -84,12 +103,13 @@ Entries = Sequence[Future[dict[str, Any]]]
 class RunInputs(InputFiles):
     """Input files of a run, each described by its option; those without one are named by the settings."""
 
+    own_navigation = ("front", "rear")
     front: tuple[Path, ...] = input_option(
         "RINEX observation file of the front (or only) antenna; repeat it for a log in several files.",
         (),
         metavar="OBS",
     )
-    nav: tuple[Path, ...] = input_option("RINEX navigation file; repeat it for several.")
+    nav: tuple[Path, ...] = input_option(NAVIGATION, ())
     track: tuple[Path, ...] = input_option(TRACK, (), metavar="TRACK")
     mate: Path | None = input_option(
         "Folder with tables of EGNSS MATE, in place of --front, --track and the sensors; an option beside it goes "

@@ -26,7 +26,8 @@ from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import Located, NoPosition, locate, survey_run
 from railfix.pipeline.received import Received, known_from_start
-from railfix.run.inputs import InputFiles, LogReading, input_option
+from railfix.run.checks import check_each_file
+from railfix.run.inputs import NAVIGATION, InputFiles, LogReading, input_option
 from railfix.run.sources import Log
 from railfix.track.survey.line import Survey, survey_line
 from railfix.track.survey.runs import SurveyLimits, SurveyRun, run_of_log
@@ -37,8 +38,9 @@ from railfix.track.trajectory import Trajectory
 class LocateInputs(InputFiles):
     """Input files of `railfix locate`."""
 
+    own_navigation = ("log",)
     log: tuple[Path, ...] = input_option("Observations of one receiver: RINEX, UBX, SBF, RTCM 3.", metavar="OBS")
-    nav: tuple[Path, ...] = input_option("Navigation files.", metavar="NAV")
+    nav: tuple[Path, ...] = input_option(NAVIGATION, (), metavar="NAV")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +62,7 @@ def locate_files(
     navigation = read_navigation(inputs.nav, **reading.arguments)
     received = known_from_start(config, navigation=navigation)
     log = Log(paths=inputs.log, chunk_epochs=_CHUNK_EPOCHS, reading=reading)
+    check_each_file(navigation, log)
     book = ChannelBook(config)
     parts = [locate(part, received, config, book) for part in log.parts()]
     located = join_rows(parts)

@@ -22,6 +22,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
 from railfix.core.errors import OutputError
+from railfix.core.files import write_error
 
 if TYPE_CHECKING:
     import polars as pl
@@ -353,7 +354,7 @@ class OutputFolder:
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write one JSON file; NaN and infinities, which JSON lacks, are written as words."""
         with _writing(self.path / name):
-            text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
+            text = json.dumps(finite_values(content), indent=2, ensure_ascii=False, allow_nan=False)
             self.stage(name).write_text(text + "\n", encoding="utf-8")
 
     def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
@@ -423,18 +424,17 @@ def _writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise OutputError(f"{path}: cannot be written ({reason}); name a folder that can be written to") from error
+        raise write_error(path, error) from error
     except PolarsError as error:
         raise OutputError(f"{path}: cannot be written ({error})") from error
 
 
-def _finite(value: Any) -> Any:
+def finite_values(value: Any) -> Any:
     """Return the same plain values with NaN and infinities as words."""
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite_values(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return value

@@ -35,6 +35,8 @@ PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka",
 
 
 #: Figures of an antenna without rows.
+#: Limits that levels of the filter are counted at [m].
+WITHIN_M: Final = (20, 50)
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
 
 
@@ -42,7 +44,7 @@ def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[
     """Return percentiles of each antenna from the rows written [m]; None in place of what the run has not.
 
     Of sigma along the line; of protection levels, the finite ones, with epochs by status; of the filter, with epochs by
-    status, and its levels with the number of finite ones.
+    status, and its levels with the numbers of those within `WITHIN_M`.
     """
     return {
         name: {
@@ -82,7 +84,8 @@ def _filter_figures(rows: pl.LazyFrame) -> dict[str, Any]:
     finite = level.filter(level.is_finite())
     words = {word.text: (status == word.text).sum() for word in TrackStatus}
     counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
-    figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95), "finite": finite.len()}
+    figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}
+    figures |= {f"within_{limit}_m": (finite <= limit).sum() for limit in WITHIN_M}
     bound = _figures(rows, figures) if counts.pop("levels") else None
     return {
         "status": counts,
@@ -307,7 +310,9 @@ def _filter_table(filtered: Mapping[str, Facts]) -> Table:
     levels = [each.get("level") for each in found]
     if any(levels):
         rows += _metres("indicative protection level", levels, _OF_LEVEL)
-        rows.append(["  with a level", *(count(None if level is None else level["finite"]) for level in levels)])
+        for limit in WITHIN_M:
+            counts = (None if level is None else level.get(f"within_{limit}_m") for level in levels)
+            rows.append([f"  within {limit} m", *(count(each) for each in counts)])
     return _table("filter", filtered, rows, "Filter along the track (train.csv)")
 
 

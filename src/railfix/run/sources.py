@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -227,7 +229,7 @@ class Log:
     problems: list[str] = field(default_factory=list)  #: Sentences on what was broken and passed over.
     skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
 
-    def parts(self) -> Iterator[Observations]:
+    def parts(self) -> Generator[Observations]:
         """Yield the pieces of the log in order of time; errors as of `railfix.io.rinex.scan_observations`."""
         pieces = scan_observations(
             self.paths,
@@ -242,6 +244,13 @@ class Log:
             self.skipped.update(piece.skipped)
             if len(piece):
                 yield piece
+
+    def first_epochs(self) -> Iterator[tuple[Path, np.datetime64]]:
+        """Yield each of several files with its first epoch within the times of the log; nothing for one file."""
+        for path in self.paths if len(self.paths) > 1 else ():
+            alone = replace(self, paths=(path,), problems=[], skipped=Counter(), chunk_epochs=1)
+            with suppress(MismatchError), closing(alone.parts()) as parts:
+                yield from ((path, part.time[0]) for part in islice(parts, 1))
 
     def _read_to(self, share: float) -> None:
         self.share = share

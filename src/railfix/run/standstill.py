@@ -16,7 +16,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import UncorrectedRanges, locate, uncorrected_ranges
+from railfix.pipeline.locate import RangesWithoutMap, locate, ranges_without_map
 from railfix.pipeline.received import known_from_start
 from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, standstill_fix
@@ -80,7 +80,7 @@ def standstill_codes(
     MismatchError: the antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
-    seen = uncorrected_ranges(obs, received, config, book)
+    seen = ranges_without_map(obs, received, config, book)
     places = locate(obs, received, config, book).ecef_m
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
@@ -98,7 +98,7 @@ def standstill_codes(
     nominal = np.hypot(config.nominal.sigma_m(elevation), received.ionosphere_sigma_m * thin_shell_obliquity(elevation))
     if base is not None:
         of_base, base_ecef_m = base
-        other = uncorrected_ranges(of_base, received, config, book)
+        other = ranges_without_map(of_base, received, config, book)
         mine, its = _common_epochs(obs, of_base)
         columns, opposite = _common_channels(seen, other)
         time = obs.time[mine]
@@ -129,7 +129,7 @@ def standstill_codes(
     )
 
 
-def _residual(seen: UncorrectedRanges, origin_ecef_m: Floats) -> Floats:
+def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
     """Return observed minus computed codes at a place, the Earth's rotation in transit included; NaN where unused."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
@@ -146,7 +146,7 @@ def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Ind
     return mine, its
 
 
-def _common_channels(seen: UncorrectedRanges, other: UncorrectedRanges) -> tuple[Indices, Indices]:
+def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[Indices, Indices]:
     """Return the channels of two receivers with the same satellites and signals."""
     names = [list(zip(s.channels.satellite.tolist(), s.channels.signal.tolist(), strict=True)) for s in (seen, other)]
     shared = [name for name in names[0] if name in names[1]]
@@ -213,7 +213,7 @@ def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
 
 
 #: Log, corrected ranges, place, and the epochs and channels to take of it.
-_Side = tuple[Observations, UncorrectedRanges, Floats, Indices, Indices]
+_Side = tuple[Observations, RangesWithoutMap, Floats, Indices, Indices]
 
 
 def _phases(train: _Side, base: _Side) -> StandstillPhases:

@@ -13,11 +13,12 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
-from railfix.integrity.interference import CAUSES
+from railfix.integrity.interference import CAUSES, Suspicion
 from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antennas import AntennaOrder
 from railfix.pipeline.balises import balise_notes
+from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.smoothing import Replay, smooth
@@ -114,6 +115,8 @@ class AntennaTally:
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     #: Epochs with each sign of interference, and the first of them.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
+    #: Least and largest error of the time tags where that is the cause, + where they are late; NaN without any [s].
+    tag_error_s: tuple[float, float] = (float("nan"), float("nan"))
     #: Least and largest offset across (first column) and up that a window finds; NaN without any window; shape (2, 2).
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
@@ -142,6 +145,7 @@ class AntennaTally:
         if result.interference is not None:
             signs = (result.interference.causes[:, None] & np.array([int(cause) for cause in CAUSES])) != 0
             _count_left_out(self.interference, signs, np.array([str(c.name).lower() for c in CAUSES]), result.time)
+            self._add_tag_error(result.interference)
         if result.protection is not None:
             levels = np.bincount(result.protection.status, minlength=len(LevelStatus))
             self.level_status.update({s.name.lower(): int(levels[s]) for s in LevelStatus})
@@ -153,6 +157,13 @@ class AntennaTally:
         self.conventional += len(offset)
         if len(offset):
             self.conventional_nearest_m = float(np.fmin(self.conventional_nearest_m, offset.min()))
+
+    def _add_tag_error(self, interference: Interference) -> None:
+        error = interference.motion.tag_error_s[interference.suspicion == Suspicion.TIME_TAGS]
+        error = error[np.isfinite(error)]
+        if len(error):
+            low, high = self.tag_error_s
+            self.tag_error_s = float(np.fmin(low, error.min())), float(np.fmax(high, error.max()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
         """Keep the window that contradicts the map most."""

@@ -26,7 +26,7 @@ from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import read_navigation
 from railfix.pipeline.config import Config
 from railfix.positioning.which_track import NONE, StandstillErrors, TrackPosterior, YardTrack, track_posterior
-from railfix.run.inputs import InputFiles, LogReading, TrackReading, input_option
+from railfix.run.inputs import NAVIGATION, InputFiles, LogReading, TrackReading, input_option
 from railfix.run.processor import parse_position
 from railfix.run.sources import Log
 from railfix.run.standstill import StandstillCodes, standstill_codes
@@ -217,10 +217,11 @@ def decide_track(
 class WhichTrackInputs(InputFiles):
     """Input files of `railfix which-track`."""
 
+    own_navigation = ("front", "rear")
     front: tuple[Path, ...] = input_option("Observations of the front, or only, antenna.", metavar="OBS")
     rear: tuple[Path, ...] = input_option("Observations of the rear antenna.", (), metavar="OBS")
     base: tuple[Path, ...] = input_option("Observations of a base station within 10 km.", (), metavar="OBS")
-    nav: tuple[Path, ...] = input_option("Navigation files.", metavar="NAV")
+    nav: tuple[Path, ...] = input_option(NAVIGATION, (), metavar="NAV")
     map: tuple[Path, ...] = input_option("Map files with the tracks of the yard or station.", metavar="MAP")
     last: Path | None = input_option("Probabilities of tracks when the train was last there (--save-last).", None)
 

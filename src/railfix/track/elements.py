@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+import scipy
 from pyproj import CRS, Transformer
-from scipy.integrate import cumulative_simpson
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import InputFileError
@@ -171,7 +171,9 @@ class ProfileElement:
         for _ in range(20):  # the length along the curve whose projection is that in plan
             way = np.linspace(0.0, length, _CLOTHOID_POINTS)
             angle = start + self.bend * way + (turn - self.bend * length) * (way / length) ** 2
-            place, height = (cumulative_simpson(part(angle), x=way, initial=0.0) for part in (np.cos, np.sin))
+            place, height = (
+                scipy.integrate.cumulative_simpson(part(angle), x=way, initial=0.0) for part in (np.cos, np.sin)
+            )
             length *= self.length_m / place[-1]
         return np.asarray(place), np.asarray(height), np.tan(angle)
 

@@ -10,10 +10,10 @@ from typing import Final
 
 import japan_geoid
 import numpy as np
+import scipy
 from pyproj import CRS, Transformer
 from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError, ProjError
-from scipy.ndimage import map_coordinates, spline_filter
 
 from railfix.core.arrays import Floats, read_only
 from railfix.core.errors import InputFileError, SettingsError
@@ -93,7 +93,7 @@ def egm96_heights(latitude_deg: Floats, longitude_deg: Floats) -> Floats:
     of 15' (NGA, WW15MGH), within 5 mm of the published test values.
     """
     place = (90.0 - latitude_deg) * 4.0, (longitude_deg % 360.0) * 4.0 + _WRAP
-    return np.asarray(map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
+    return np.asarray(scipy.ndimage.map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
 
 
 _WRAP: Final = 16  #: Columns of the grid that are repeated at both sides, so that the spline goes round the Earth.
@@ -104,7 +104,7 @@ def _egm96_spline() -> Floats:
     """Return the spline coefficients of the grid, which is kept as differences of centimetres along both axes."""
     with (files("railfix.track") / "egm96_15.npz").open("rb") as file, np.load(file) as data:
         heights = data["second_differences_cm"].astype(np.int64).cumsum(axis=0).cumsum(axis=1) / 100.0
-    return read_only(spline_filter(np.pad(heights, ((0, 0), (_WRAP, _WRAP)), mode="wrap"), order=3))
+    return read_only(scipy.ndimage.spline_filter(np.pad(heights, ((0, 0), (_WRAP, _WRAP)), mode="wrap"), order=3))
 
 
 def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from railfix.core.arrays import Floats, Indices, Integers, RowArrays, join_rows, places_in_groups, read_only
 from railfix.core.errors import MismatchError, SettingsError
@@ -189,7 +189,7 @@ class Network:
         return all(track.crs != UNNAMED for track in self.tracks)
 
     @cached_property
-    def _index(self) -> tuple[cKDTree, Indices, Indices, float]:
+    def _index(self) -> tuple[scipy.spatial.cKDTree, Indices, Indices, float]:
         """Tree of samples of all segments, segment and track of each sample, and how far a piece reaches from it."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         inner = np.ones(len(steps), dtype=np.bool_)
@@ -201,7 +201,7 @@ class Network:
         samples = self.points_m[of] + share[:, None] * (self.points_m[of + 1] - self.points_m[of])
         track = np.searchsorted(self.first_point, of, side="right") - 1
         reach = float((steps[segment] / pieces).max(initial=0.0)) / 2.0
-        return cKDTree(samples, balanced_tree=False), of, track, reach
+        return scipy.spatial.cKDTree(samples, balanced_tree=False), of, track, reach
 
     def _samples_near(self, points_m: Floats, within_m: float, least: int) -> tuple[Floats, Indices]:
         """Distance and number of every sample near each point, `least` at least; infinite where there are fewer."""

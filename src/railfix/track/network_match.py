@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Unpack
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, RowArrays, take_rows
 from railfix.core.errors import MismatchError
@@ -89,7 +89,8 @@ def _check_region(network: Network, log: PlanLog) -> None:
     known = np.isfinite(log.latitude_deg) & np.isfinite(log.longitude_deg)
     if not known.any():
         return
-    latitude, longitude, tree = log.latitude_deg[known], log.longitude_deg[known], cKDTree(network.points_m)
+    latitude, longitude = log.latitude_deg[known], log.longitude_deg[known]
+    tree = scipy.spatial.cKDTree(network.points_m)
     zeros = np.zeros(len(latitude))
     apart = float(np.min(tree.query(ecef_from_geodetic(latitude, longitude, zeros))[0]))
     if apart <= ANOTHER_PLACE_M:

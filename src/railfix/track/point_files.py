@@ -318,7 +318,10 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
         geoid = table.metadata.get("geoid")
     return make_segment(
         place,
-        ellipsoidal_heights(heights, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path),
+        # heights that are all 0 are none, as in files of other formats
+        ellipsoidal_heights(heights, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path)
+        if heights.any()
+        else None,
         source=table.path,
         file=table.path,
         crs=crs,

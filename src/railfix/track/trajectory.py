@@ -9,8 +9,8 @@ from itertools import chain
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, places_in_groups, read_only
 from railfix.core.errors import RailfixWarning
@@ -49,7 +49,7 @@ class NearestOnPolyline:
         share = (piece + 0.5) / pieces[self._segment]
         #: Half the spacing of the samples, which lie in the middle of their pieces [m].
         self.reach_m = float((self._length / pieces).max()) / 2.0 * (1.0 + 1e-9)
-        self._tree = cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
+        self._tree = scipy.spatial.cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
 
     def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
         """Return the segment, distance along it and distance from it, shapes (n,); -1 and NaN for NaN."""
@@ -345,7 +345,7 @@ def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats |
     length, tangent = trajectory.length_m, trajectory.tangent
     middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
     reach = np.broadcast_to(reach_m + 0.5 * length.max(), len(ecef_m))
-    lists = cKDTree(middle).query_ball_point(ecef_m, reach, return_sorted=True)
+    lists = scipy.spatial.cKDTree(middle).query_ball_point(ecef_m, reach, return_sorted=True)
     position = np.repeat(np.arange(len(ecef_m)), [len(x) for x in lists])
     segment = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(position))
     delta = ecef_m[position] - trajectory.ecef_m[segment]

@@ -10,8 +10,9 @@ from enum import IntEnum
 from functools import lru_cache
 from typing import Final
 
-from scipy.special import ndtri
+import scipy
 
+from railfix.kernels.tracking import constants
 from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits
@@ -76,7 +77,7 @@ def budget(limits: TrackingLimits) -> Budget:
     fault that lasts for one independent error, or `CONSTELLATION_FAULT_S` for one of a constellation.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
-    remembered_s = FORGOTTEN * limits.code_correlation_s
+    remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S
     local = 1.0 + remembered_s * limits.level_samples_per_hour / 3600.0
     exposed = [
         min(local * limits.level_fault_prior, 1.0),
@@ -93,14 +94,14 @@ def budget(limits: TrackingLimits) -> Budget:
     of_speed = SPEED_SHARE * risk / (MOST_SOURCES + 1)
 
     def sigmas(share: float) -> tuple[float, ...]:
-        return tuple(float(-ndtri(min(share / prior, 0.5))) if prior else 0.0 for prior in kept)
+        return tuple(float(-scipy.special.ndtri(min(share / prior, 0.5))) if prior else 0.0 for prior in kept)
 
     return Budget(
         risk=risk,
-        k=float(-ndtri(0.5 * risk)),
+        k=float(-scipy.special.ndtri(0.5 * risk)),
         prior=tuple(kept),
         k_fault=sigmas(risk),
-        k_speed=float(-ndtri(0.5 * of_speed)),
+        k_speed=float(-scipy.special.ndtri(0.5 * of_speed)),
         k_speed_fault=sigmas(of_speed),
     )
 

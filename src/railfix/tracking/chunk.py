@@ -9,6 +9,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.timescale import seconds
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import CHANNEL, EPOCH, Records
 from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits
@@ -71,7 +72,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     used = (slot >= 0).nonzero()[0]
     seen[1:, slot[used]] = np.where(any_kind[:, used], epochs.time[:, None], np.datetime64("NaT", "ns"))
     seen = np.fmax.accumulate(seen, axis=0)
-    kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * limits.code_correlation_s
+    kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * constants.CODE_CORRELATION_S
     fresh = np.zeros(kept.shape, dtype=np.bool_)
     fresh[:, slot[used]] = any_kind[:, used]
     state.seen = seen[-1]
@@ -121,11 +122,11 @@ def _pack_epochs(epochs: GnssEpochs, interval: Floats, velocity: Velocity, limit
     return epoch
 
 
-def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:
+def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
     """Make the state ready to be handed on: without satellites long unseen, with the phases of the last epoch."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
     state.previous = Previous(satellite=epochs.satellite, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
-    kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * limits.code_correlation_s
+    kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * constants.CODE_CORRELATION_S
     if not kept.all():
         state.rearrange(kept.nonzero()[0], ())
 

@@ -198,7 +198,7 @@ def track(
         else:
             recursion.search(state, epoch, trace)
             epoch, sought = epoch + 1, False
-    finish_chunk(chunk, epochs, state, limits)
+    finish_chunk(chunk, epochs, state)
     result = Tracked.from_records(epochs.time, recursion.results)
     np.add(result.arc_m, line.round_m(result.arc_m), out=result.arc_m)
     return result, state

@@ -18,7 +18,7 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, copy_with
 from railfix.core.timescale import seconds
-from railfix.kernels.tracking.constants import SCALE_BOUND
+from railfix.kernels.tracking import constants
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs
 from railfix.tracking.filter import track
 from railfix.tracking.limits import TrackingLimits
@@ -47,7 +47,7 @@ class AccumulatedIncrement:
     balises: BaliseEpochs | None = None  #: Balises read since then, as one epoch.
 
 
-def thin_epochs(
+def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
     """Return which epochs are taken, these with what was measured since the one before, and what is left after them.
@@ -158,6 +158,8 @@ def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats
 #: The standard deviation explains a sub-filter up to so many of it away: where a place has no level, where it has one.
 #: One without the faulty satellite lies further away.
 _EXPLAINED: Final = (3.0, 4.0)
+#: Larger levels are none [m]: they are those of a sub-filter that is left without measurements.
+LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
     "status",
@@ -188,7 +190,7 @@ def track_with_levels(
 
     Where the filter with sub-filters takes every epoch its places are those of the filter, which then does not run.
     """
-    taken, some, sensed, since = thin_epochs(epochs, sensors, state.since, limits.level_period_s)
+    taken, some, sensed, since = decimate_epochs(epochs, sensors, state.since, limits.level_period_s)
     place, after = None, state.track
     if some is not None:
         place, after = track(some, line, state.track, limits=limits, sensors=sensed, levels=True)
@@ -249,7 +251,7 @@ def carried_levels(
     straight = np.where(both, np.linalg.norm(points[0] - points[1], axis=1), np.nan)
     bounded = is_bounded(tracked.status)
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
-    amount = np.fmax(level, amount + SCALE_BOUND * np.abs(speed) * tau)
+    amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
     # In doubt the sub-filter furthest off may be the one that is right; else one that the standard deviation does not
     # explain.
@@ -258,12 +260,17 @@ def carried_levels(
     apart = np.where(np.isnan(separation), 0.0, separation)
     spread = np.where(doubt, apart, np.sqrt(np.maximum(apart**2 - explained**2, 0.0)))
     tracked = copy_with(
-        tracked, status=reported, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=level,
-        ground_level_m=widened(ground, straight), level_noise_m=np.where(known, noise, np.nan),
+        tracked, status=reported, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=_useful(level),
+        ground_level_m=_useful(widened(ground, straight)), level_noise_m=np.where(known, noise, np.nan),
         level_speed_mps=np.where(known, of_speed, np.nan), separation_m=np.where(known, separation, np.nan),
-        amount_m=np.where(known, amount, np.nan),
+        amount_m=_useful(np.where(known, amount, np.nan)),
     )  # fmt: skip
     return tracked, copy_with(state, time=times[-1], values=values[-1])
+
+
+def _useful(level_m: Floats) -> Floats:
+    """Return levels, those beyond `LARGEST_LEVEL_M` infinite: a sub-filter without data diverges."""
+    return np.where(level_m > LARGEST_LEVEL_M, np.inf, level_m)
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:

@@ -65,79 +65,25 @@ class TrackingLimits(Settings):
     #: their mean delay is not bounded. Chosen on the logs of Hong Kong and California among 0.4, 1 and 4 (the same on
     #: both sides); Berlin, and Hong Kong two years earlier, were not used, and gain alike (docs/filter.md).
     late_degrees_of_freedom: float = Field(default=1.0, gt=0)
-    passes: int = Field(default=4, ge=1)  #: Rounds of reweighting an epoch.
-    #: Time and travel over which the multipath of a satellite's code changes: a reflector of a street or a station is
-    #: passed within about 100 m; at rest the fringe of one 10 m away lasts about a minute.
-    code_correlation_s: float = Field(default=60.0, gt=0)
-    code_correlation_m: float = Field(default=100.0, gt=0)
     #: White part of a code's error, over its standard deviation; per second, not per epoch.
     code_white_share: float = Field(default=1.0, gt=0)
     #: Codes count once in this time where phases or Dopplers carry on: their errors last for a minute, so the epochs
     #: between tell nothing new. 0 takes those of every epoch.
     code_period_s: float = Field(default=1.0, ge=0)
-    #: Displacement by orbits and ionosphere, and how long it lasts: about 1 m a satellite with a dilution of one;
-    #: averaging over epochs does not take it away.
+    #: Displacement by orbits and ionosphere over hours: about 1 m a satellite with a dilution of one; averaging over
+    #: epochs does not take it away.
     slow_code_m: float = Field(default=1.0, ge=1e-6)
-    slow_code_s: float = Field(default=7200.0, gt=0)
     #: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
-    #: Time-correlated error of the speed by Dopplers: its least size, its share of the speed (a reflected signal is
-    #: shifted by up to the speed, at rest not at all) and its correlation time.
-    doppler_error_mps: float = Field(default=0.01, gt=0)
-    doppler_error_share: float = Field(default=0.02, ge=0)
-    doppler_correlation_s: float = Field(default=10.0, gt=0)
     #: The same of the change of a carrier phase over an epoch.
     phase_floor_m: float = Field(default=0.01, gt=0)
     phase_zenith_m: float = Field(default=0.01, gt=0)
-    #: Displacement in the square root of a second by slow errors of all phases: ionosphere, troposphere, orbits and
-    #: clocks, 0.5 mm/s along the line for half an hour.
-    phase_walk_m: float = Field(default=0.03, ge=0)
-    #: Change of the drift of the receiver's clock in the square root of a second: 1.7e-9 of the frequency, what quartz
-    #: oscillators without an oven show when shaken.
-    clock_walk_mps: float = Field(default=0.5, gt=0)
-    #: Change of the offset between two constellations in the square root of a second.
-    offset_walk_m: float = Field(default=0.02, gt=0)
-    offset_prior_m: float = Field(default=30.0, gt=0)  #: Standard deviation of such an offset at first.
-    #: Least local error of the map across and up, and the length over which it changes. The map's stated accuracy
-    #: counts where it is more, of heights the half.
-    map_roughness_m: float = Field(default=0.3, gt=0)
-    map_correlation_m: float = Field(default=50.0, gt=0)
-    map_scale_m: float = Field(default=0.03, gt=0)  #: Error of a length along the map [m per square root of m].
-    #: A larger one is shown by a mean innovation over `map_misfit_s` of so many sigmas; what was learnt is forgotten
-    #: within `map_misfit_kept_s`.
+    #: Errors of lengths along the map larger than assumed are shown by a mean innovation of half a minute of so many
+    #: sigmas.
     map_misfit_sigmas: float = Field(default=3.0, gt=0)
-    map_misfit_s: float = Field(default=30.0, gt=0)
-    map_misfit_kept_s: float = Field(default=300.0, gt=0)
-    #: Length over which the absolute error of the map changes (sigmas are those of the trajectory).
-    map_absolute_m: float = Field(default=500.0, gt=0)
-    #: Least distance of two branches at which half of their difference is the map's: three times an error of 2 m.
-    map_branch_m: float = Field(default=6.0, gt=0)
-    #: Standard deviation of an error that the codes have in common across the line: reflections off one side of a
-    #: street.
-    code_common_m: float = Field(default=10.0, gt=0)
-    #: Time and distance over which that error lasts.
-    code_common_s: float = Field(default=120.0, gt=0)
-    code_common_travel_m: float = Field(default=500.0, gt=0)
-    #: Codes alone leave a branch this near at least this probability.
-    branch_floor: float = Field(default=1e-3, gt=0, lt=0.5)
-    branch_floor_m: float = Field(default=30.0, gt=0)
-    #: Hypotheses are dropped only after this much travel: before, motion does not separate branches.
-    decided_travel_m: float = Field(default=60.0, ge=0)
-    #: Hypotheses below it are dropped: a hundredth of the risk of an independent error.
-    least_probability: float = Field(default=1e-11, gt=0, lt=0.5)
     most_hypotheses: int = Field(default=24, ge=1)  #: Places at most, the most probable ones.
-    start_sigma_m: float = Field(default=30.0, gt=0)  #: Standard deviation of a hypothesis when it begins.
     start_separation_m: float = Field(default=60.0, gt=0)  #: Two places of the first epoch this close are one.
-    gap_s: float = Field(default=5.0, gt=0)  #: Time without measurements after which places are sought again.
-    #: The track is lost when the mean weight of motion, or of codes, was below these for so long; 1 is the weight of an
-    #: error of one standard deviation. Epochs above them count down.
-    lost_motion_weight: float = Field(default=0.45, ge=0)
-    lost_motion_s: float = Field(default=6.0, gt=0)
-    lost_code_weight: float = Field(default=0.5, ge=0)
-    lost_code_s: float = Field(default=20.0, gt=0)
-    #: Where motion contradicts the track, places so far (and twice) before and behind are tried.
-    bend_m: float = Field(default=20.0, gt=0)
     #: Whether a bank of sub-filters gives a protection level; it costs as many filters as there are satellites.
     level: Literal["on", "off"] = "on"
     #: Time between the epochs that the bank takes: codes of neighbouring epochs have the same errors.
@@ -167,18 +113,6 @@ class TrackingLimits(Settings):
     #: Probability that the map is wrong by more than its sigma, and by how much. An assumption.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
-    level_passes: int = Field(default=3, ge=1)  #: Rounds of reweighting of the sub-filters.
-    #: A filter contradicted by its motion, or codes, for longer bounds nothing; mean weights are those of a lost track.
-    #: A contradiction of single epochs is noise, which is in the standard deviation.
-    level_doubt_s: float = Field(default=3.0, ge=0)
-    level_doubt_code_s: float = Field(default=8.0, ge=0)
-    #: After a start no level before a place has a probability of 0.99, at most so long; none for so long after the
-    #: track was lost.
-    level_start_s: float = Field(default=15.0, ge=0)
-    level_hold_s: float = Field(default=5.0, ge=0)  #: A level comes back so long after the last contradiction.
-    #: Beyond an open end with motion in doubt for so long, the track is lost.
-    end_doubt_s: float = Field(default=0.9, ge=0)
-    expired_sigma_m: float = Field(default=200.0, gt=0)  #: Largest standard deviation of a predicted position.
 
     @property
     def tails(self) -> Tails:

@@ -9,7 +9,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.timescale import seconds, timedelta
-from railfix.kernels.tracking import layout
+from railfix.kernels.tracking import constants, layout
 from railfix.kernels.tracking.layout import Records
 from railfix.tracking import bank
 from railfix.tracking.epochs import SensorEpochs
@@ -18,7 +18,7 @@ from railfix.tracking.line import Line
 from railfix.tracking.search import begin
 from railfix.tracking.state import CLOCKS, HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
 
-#: Least `map_branch_m` in standard deviations of the map across.
+#: Least `MAP_BRANCH_M` in standard deviations of the map across.
 _BRANCH_SIGMAS = 3.0
 
 
@@ -27,7 +27,7 @@ def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
     """Return the numbers among the settings, and the budget of the level; shape (1,)."""
     budget = bank.budget(limits)
     values = {name: value for name, value in dict(limits).items() if isinstance(value, (int, float))}
-    values["map_branch_m"] = max(limits.map_branch_m, _BRANCH_SIGMAS * sigma_plan_m)
+    values["map_branch_m"] = max(constants.MAP_BRANCH_M, _BRANCH_SIGMAS * sigma_plan_m)
     values |= {"level_risk": budget.risk, "level_k": budget.k, "level_k_speed": budget.k_speed}
     record = np.zeros(1, dtype=layout.record_of({name: type(value) for name, value in values.items()}))
     for name, value in values.items():
@@ -105,7 +105,7 @@ def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
 
 def compute_start_variance(state: TrackState, line: Line, limits: TrackingLimits) -> Floats:
     """Return the variance of each unknown where nothing is known of it, shape (N,)."""
-    start = np.full(1, limits.expired_sigma_m)
+    start = np.full(1, constants.EXPIRED_SIGMA_M)
     _, covariance = begin(np.zeros(1), start, len(state.satellite), line, limits)
     return np.diagonal(covariance[0]).copy()
 

@@ -10,23 +10,15 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
-from railfix.kernels.tracking.constants import (
-    ACROSS_DOUBT,
-    ACROSS_LOST,
-    ACROSS_TAKEN,
-    BESIDE_AFTER_S,
-    CODE_CLOCK_SIGMA_M,
-    MOTION_FIT,
-    STEP_HOLD_S,
-)
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import CODE
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, CLOCKS, OFFSETS, SATELLITES, StateIndex, TrackState
 
-#: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between, and codes
-#: count with the error that a place between two points makes [m].
+#: The line is searched at points this far apart at most; a Gaussian of `START_SIGMA_M` covers what lies between, and
+#: codes count with the error that a place between two points makes [m].
 _SPACING_M: Final = 15.0
 #: Codes beyond place and clocks that places are sought with: with one alone a wrong place fits as well.
 REDUNDANT: Final = 2
@@ -40,7 +32,7 @@ _ANY_DRIFT_MPS: Final = 1e3
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
-#: Places beside in `bend_m`, how many, standard deviation of their speed [m/s], and share of probability that they get.
+#: Places beside in `BEND_M`, how many, standard deviation of their speed [m/s], and share of probability that they get.
 _BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])
 _BESIDE: Final = len(_BESIDE_STEPS)
 _BEND_SPEED_MPS: Final = 10.0
@@ -58,7 +50,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
         Local maxima of the likelihood with Student's t errors, the best first; empty with fewer than `REDUNDANT`
         codes beyond the unknowns.
     sigma_m : ndarray, shape (C,) [m]
-        `start_sigma_m` for each.
+        `START_SIGMA_M` for each.
     """
     channel = chunk.channel[epoch]
     has = channel["has"][:, CODE] != 0
@@ -66,8 +58,9 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
         return np.empty(0), np.empty(0)
-    keep = _thin(line)
-    arc, points = line.arc_m[keep], line.ecef_m[keep]
+    # between the vertices too: a map with few of them would be searched with gaps
+    arc = np.linspace(line.arc_m[0], line.arc_m[-1], 1 + int(np.ceil((line.arc_m[-1] - line.arc_m[0]) / _SPACING_M)))
+    points, _ = line.at(arc)
     likelihood = np.zeros(len(arc))
     tails = limits.tails
     for group in groups:
@@ -75,7 +68,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
         residual = channel["measured"][group, CODE] - distance
         variance = (1.0 + limits.code_white_share**2) * channel["code_sigma_m"][group] ** 2 + _SPACING_M**2 / 12.0
         clock = np.median(residual, axis=1, keepdims=True)
-        for _ in range(limits.passes):
+        for _ in range(constants.PASSES):
             away = residual - clock
             weight = tails.weight(away, away**2 / variance, away.shape[1]) / variance
             clock = (weight * residual).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
@@ -90,14 +83,8 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
             chosen.append(candidate)
         if len(chosen) == limits.most_hypotheses:
             break
-    sigma = np.full(len(chosen), limits.start_sigma_m)
+    sigma = np.full(len(chosen), constants.START_SIGMA_M)
     return arc[chosen], sigma
-
-
-def _thin(line: Line) -> Indices:
-    """Return the vertices about `_SPACING_M` apart."""
-    marks = np.arange(line.arc_m[0], line.arc_m[-1] + _SPACING_M, _SPACING_M)
-    return np.unique(np.minimum(np.searchsorted(line.arc_m, marks), len(line.arc_m) - 1))
 
 
 def begin(
@@ -132,16 +119,16 @@ def begin(
     variance[:, StateIndex.MAP_RIGHT] = line.sigma_plan_m**2
     variance[:, StateIndex.MAP_UP] = line.sigma_height_m**2
     variance[:, StateIndex.SLOW_CODE] = limits.slow_code_m**2
-    variance[:, StateIndex.DOPPLER_SPEED] = limits.doppler_error_mps**2
+    variance[:, StateIndex.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
     variance[:, StateIndex.WHEEL] = WHEEL_PRIOR**2
     variance[:, StateIndex.FORCE_OFFSET] = FORCE_PRIOR_MPS2**2
     variance[:, StateIndex.RADAR] = RADAR_PRIOR**2
-    variance[:, OFFSETS:SATELLITES] = limits.offset_prior_m**2
+    variance[:, OFFSETS:SATELLITES] = constants.OFFSET_PRIOR_M**2
     covariance = np.zeros((len(arc_m), width, width))
     diagonal = np.arange(width)
     covariance[:, diagonal, diagonal] = variance
-    covariance[:, StateIndex.CODE_CLOCK, StateIndex.CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
-    covariance[:, StateIndex.PHASE_CLOCK, StateIndex.PHASE_CLOCK] = CODE_CLOCK_SIGMA_M**2
+    covariance[:, StateIndex.CODE_CLOCK, StateIndex.CODE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
+    covariance[:, StateIndex.PHASE_CLOCK, StateIndex.PHASE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
     if known is not None:
         mean[:, _KEPT] = known[0][_KEPT]
         covariance[:, _KEPT[:, None], _KEPT] = known[1][_KEPT[:, None], _KEPT]
@@ -182,11 +169,11 @@ def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Fl
     mean, covariance : ndarray, shapes (N,), (N, N)
     limits : TrackingLimits
     """
-    steps = limits.bend_m * _BESIDE_STEPS
+    steps = constants.BEND_M * _BESIDE_STEPS
     gain = np.zeros(len(mean))
     gain[[StateIndex.ARC, StateIndex.PREVIOUS_ARC]] = 1.0
     means = mean + gain * steps[:, None]
-    wider = covariance + np.outer(gain, gain) * (0.5 * limits.bend_m) ** 2
+    wider = covariance + np.outer(gain, gain) * (0.5 * constants.BEND_M) ** 2
     for unknown, sigma in ((StateIndex.SPEED, _BEND_SPEED_MPS), (StateIndex.ACCELERATION, limits.acceleration_mps2)):
         wider[unknown, unknown] += sigma**2
     covariances = np.repeat(wider[None], len(steps), axis=0)
@@ -232,13 +219,13 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         _start_branches(state)
         return Sought(lost=False, parent=np.full(len(arc), -1), splits=None)
     monitors, parent = state.monitors, np.arange(state.hypotheses)
-    weak = monitors.weak_motion_s >= limits.lost_motion_s or monitors.weak_code_s >= limits.lost_code_s
-    lost = weak or monitors.across >= ACROSS_LOST
-    gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
-    wide = state.covariance[:, StateIndex.ARC, StateIndex.ARC] > limits.start_sigma_m**2
+    weak = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
+    lost = weak or monitors.across >= constants.ACROSS_LOST
+    gap = bool(seconds(chunk.time[epoch] - state.measured) > constants.GAP_S)
+    wide = state.covariance[:, StateIndex.ARC, StateIndex.ARC] > constants.START_SIGMA_M**2
     if not (lost or (gap and wide.any())):
-        contradicted = monitors.weak_motion_s >= BESIDE_AFTER_S or monitors.across >= ACROSS_DOUBT
-        contradicted = contradicted or monitors.motion_misfit > 1.0 - MOTION_FIT
+        contradicted = monitors.weak_motion_s >= constants.BESIDE_AFTER_S or monitors.across >= constants.ACROSS_DOUBT
+        contradicted = contradicted or monitors.motion_misfit > 1.0 - constants.MOTION_FIT
         if contradicted and state.measured >= state.time:
             parent = np.append(parent, np.full(_try_beside(state, line, limits), -1))
         return Sought(lost=False, parent=parent, splits=None)
@@ -258,7 +245,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     parent = np.full(state.hypotheses, -1)
     if splits is not None:
         parent = np.array([k if item is None else item.parent for k, item in enumerate(splits)])
-    _reset_monitors(state, limits, lost=lost, weak=weak)
+    _reset_monitors(state, lost=lost, weak=weak)
     return Sought(lost=lost, parent=parent, splits=splits)
 
 
@@ -268,15 +255,15 @@ def _start_branches(state: TrackState) -> None:
     state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
 
 
-def _reset_monitors(state: TrackState, limits: TrackingLimits, *, lost: bool, weak: bool) -> None:
+def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
     """Reset what contradicted the earlier places, and hold the level back where the track was lost."""
     _start_branches(state)
     hold = state.monitors.level_hold_s
-    if lost and state.monitors.weak_code_s >= limits.lost_code_s:
+    if lost and state.monitors.weak_code_s >= constants.LOST_CODE_S:
         # Codes have contradicted the place that motion carried: the next place is theirs alone.
-        hold = max(hold, STEP_HOLD_S)
+        hold = max(hold, constants.STEP_HOLD_S)
     if weak:
-        hold = max(hold, limits.level_start_s)
+        hold = max(hold, constants.LEVEL_START_S)
     state.monitors = replace(
         state.monitors, level_hold_s=hold, weak_motion_s=0.0, weak_code_s=0.0, across=0.0, code_shift=0.0,
         code_shift_variance=0.0, least_speed_mps=ANY_SPEED[0], most_speed_mps=ANY_SPEED[1],
@@ -308,7 +295,7 @@ def _split_wide(
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
     """Return hypotheses at places away from those of a lost track; `weak`: its weights were low for long."""
     best = int(np.argmax(state.log_probability))
-    elsewhere = 1.0 if weak or state.monitors.across >= ACROSS_TAKEN else _ELSEWHERE
+    elsewhere = 1.0 if weak or state.monitors.across >= constants.ACROSS_TAKEN else _ELSEWHERE
     # One that is less probable than a new place has drifted from where codes would begin it.
     alive = state.log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, StateIndex.ARC] if weak else state.mean[alive, StateIndex.ARC]
@@ -317,7 +304,7 @@ def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: Trackin
     # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
     # the hypotheses go on as they are.
     arc = np.concatenate([going, arc]) if weak else arc
-    sigma = np.full(len(arc), limits.start_sigma_m)
+    sigma = np.full(len(arc), constants.START_SIGMA_M)
     known = state.mean[best], state.covariance[best]
     fresh = begin(arc, sigma, len(state.satellite), line, limits, known=known)
     return (*fresh, np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc, np.zeros(len(arc)))

@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import EPOCH
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.packing import pack_parameters
 from railfix.tracking.search import SplitHypothesis
 from railfix.tracking.state import SATELLITES, StateIndex, TrackState
 from railfix.tracking.velocity import singer
@@ -96,7 +96,7 @@ def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 
     epoch = np.zeros(1, dtype=EPOCH)
     epoch["interval_s"], epoch["step"] = dt, singer(dt, limits.acceleration_mps2, limits.acceleration_s)[0]
-    return transition_matrix(float(mean[StateIndex.SPEED]), epoch[0], pack_parameters(limits, 0.0)[0], len(mean))
+    return transition_matrix(float(mean[StateIndex.SPEED]), epoch[0], len(mean))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +158,7 @@ def smooth_steps(
         mean, covariance = step.mean[index], step.covariance[index]
         row = covariance[StateIndex.ARC]
         variance = row[StateIndex.ARC] - row @ matrix @ row
-        if covariance[StateIndex.ARC, StateIndex.ARC] <= limits.expired_sigma_m**2:
+        if covariance[StateIndex.ARC, StateIndex.ARC] <= constants.EXPIRED_SIGMA_M**2:
             arc[t], sigma[t] = mean[StateIndex.ARC] + row @ vector, np.sqrt(max(variance, 0.0))
             speed[t] = mean[StateIndex.SPEED] + covariance[StateIndex.SPEED] @ vector
         vector, matrix = step.before(index, vector, matrix)

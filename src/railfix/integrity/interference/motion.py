@@ -8,9 +8,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array, masked_median
 from railfix.core.channel_state import join_channels
-from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.integrity.interference.limits import InterferenceLimits
 
@@ -20,6 +20,15 @@ _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
 _LEAST_FREEDOM: Final = 3  #: Redundant ranges or Dopplers that their noise is taken from: fewer can agree by chance.
 _LEAST_MPS: Final = 0.05  #: Least noise of Dopplers [m/s].
 _RIDGE: Final = 1e-9  #: Weight of the unknowns by themselves, for what a satellite is missing for.
+_RATE_MPS: Final = 500.0  #: Range rate of a satellite, by its order: unit of the column of the time tags [m/s].
+#: The error of the time tags is a median over so many epochs at most and at least, none older than the window.
+_TAG_EPOCHS: Final = 10
+_TAG_LEAST: Final = 3
+_TAG_WINDOW: Final = np.timedelta64(60, "s")
+_TAG_STEPS: Final = 4  #: Steps of the fit of the time tags.
+_TAG_LINEAR_S: Final = 0.05  #: Errors up to this need one step [s].
+_FITS_WELL: Final = 3.0  #: Residuals up to so many times the median one have their full weight.
+_ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])
 _SIZE: Final = 4  #: Unknowns that two constellations give by themselves: position and clock.
 
 
@@ -46,10 +55,10 @@ class MotionInputs(NamedTuple):
     clock_sigma_m: Floats
     off_line_m: Floats  #: Distance of the 3-D position from the line across it; NaN beyond an end; shape (T,).
 
-    def take(self, rows: slice) -> MotionInputs:
+    def take(self, rows: slice | Indices) -> MotionInputs:
         """Return those of some epochs."""
-        own = {name: values[rows] for name, values in self._asdict().items()}
-        return MotionInputs(**{**own, "channel": self.channel, "group": self.group})
+        own = {n: values if n in ("channel", "group") else values[rows] for n, values in self._asdict().items()}
+        return MotionInputs(**own)
 
 
 class Fix(NamedTuple):
@@ -65,6 +74,18 @@ class Fix(NamedTuple):
         """Return those of some epochs."""
         time, ecef, sigma, velocity, velocity_sigma = self
         return Fix(time[rows], ecef[rows], sigma[rows], velocity[rows], velocity_sigma[rows])
+
+
+class TagErrors(NamedTuple):
+    """Errors of the time tags at single epochs and their standard deviations, shape (N,) each."""
+
+    time: Datetimes
+    error_s: Floats
+    sigma_s: Floats
+
+
+def _no_tags() -> TagErrors:
+    return TagErrors(np.zeros(0, dtype="datetime64[ns]"), np.zeros(0), np.zeros(0))
 
 
 def _no_fix() -> Fix:
@@ -90,6 +111,7 @@ class MotionSignState:
     position: Fix = field(default_factory=_no_fix)
     velocity: Fix = field(default_factory=_no_fix)
     on_map: bool = False  #: A position has been on the map.
+    tags: TagErrors = field(default_factory=_no_tags)  #: Of the last epochs.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +131,9 @@ class MotionSigns:
     #: Distance of the 3-D position from the line, once a position has been on it; shape (T,).
     off_line_m: Floats
     off_line_sigmas: Floats
+    #: Median error of the time tags over the last epochs, + where they are late; also in standard deviations; (T,).
+    tag_error_s: Floats
+    tag_error_sigmas: Floats
 
 
 class MotionFit(NamedTuple):
@@ -116,16 +141,20 @@ class MotionFit(NamedTuple):
 
     fixes: Fix
     part_sigmas: Floats  #: Of `MotionSigns`.
+    #: Error of the time tags, + where they are late, and its standard deviation; NaN without redundancy; shape (T,).
+    tag_error_s: Floats
+    tag_sigma_s: Floats
 
     def take(self, rows: slice) -> MotionFit:
         """Return those of some epochs."""
-        return MotionFit(self.fixes.take(rows), self.part_sigmas[rows])
+        return MotionFit(self.fixes.take(rows), self.part_sigmas[rows], self.tag_error_s[rows], self.tag_sigma_s[rows])
 
 
 def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
     """Return positions and velocities, and how far constellations are apart."""
     linear = _misfit(inputs)
-    return MotionFit(fit_motion_fixes(inputs, linear), _parts(inputs, linear, limits.least_satellites - 1))
+    parts = _parts(inputs, linear, limits.least_satellites - 1)
+    return MotionFit(fit_motion_fixes(inputs, linear), parts, *fit_time_tags(inputs, linear))
 
 
 def motion_signs(
@@ -134,7 +163,9 @@ def motion_signs(
     """Return the statistics of clock, velocity and position of T epochs, and the state to pass on."""
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
-    fixes, part_sigmas = fitted or fit_motion(inputs, limits)
+    fixes, part_sigmas, tag_error, tag_sigma = fitted or fit_motion(inputs, limits)
+    tags = TagErrors(inputs.time, tag_error, tag_sigma)
+    median, sigmas, last_tags = _median_tag_error(tags, state.tags)
     position, last_position = _before(fixes, state.position, fixes.sigma_m <= limits.largest_sigma_m)
     velocity, last_velocity = _before(fixes, state.velocity, fixes.velocity_sigma_mps <= limits.largest_speed_sigma_mps)
     speed, speed_sigmas, drift, drift_sigmas = _speed_jump(fixes, velocity, limits)
@@ -148,10 +179,12 @@ def motion_signs(
         speed_jump_sigmas=speed_sigmas, position_jump_m=jump, position_jump_sigmas=jump_sigmas,
         part_sigmas=part_sigmas, off_line_m=off,
         off_line_sigmas=np.maximum(off - limits.position_jump_m, 0.0) / fixes.sigma_m,
+        tag_error_s=median, tag_error_sigmas=sigmas,
     )  # fmt: skip
     after = MotionSignState(
         time=inputs.time[-1], channel=last_codes[0], code_m=last_codes[1], rate_mps=last_codes[2],
         since=last_codes[3], position=last_position, velocity=last_velocity, on_map=bool(been[-1]),
+        tags=last_tags,
     )  # fmt: skip
     return signs, after
 
@@ -176,6 +209,51 @@ def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]
         inputs.time, near + step[:, :3], scale * _length(covariance), velocity,
         np.maximum(noise, _LEAST_MPS) * _length(of_velocity),
     )  # fmt: skip
+
+
+def fit_time_tags(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats]:
+    """Return the common error of the time tags, + where they are late, and its standard deviation, shape (T,) [s].
+
+    Satellites were where they are not at the tags: position, clocks and the error are fitted together, the column of
+    the error being the range rate of the satellites with its sign changed. Ranges that fit badly count less.
+    """
+    groups = np.arange(inputs.group.max(initial=-1) + 1)
+    clocks = (inputs.group[:, None] == groups).astype(np.float64)
+    error, sigma = np.full(len(inputs.time), np.nan), np.full(len(inputs.time), np.nan)
+    rows, late, moved = np.arange(len(inputs.time)), np.zeros(len(inputs.time)), inputs
+    for _ in range(_TAG_STEPS):
+        near, sight, misfit = linear
+        rate = (sight * moved.sat_velocity_mps).sum(axis=2)
+        columns = -sight, -rate[..., None] / _RATE_MPS, np.broadcast_to(clocks, (len(near), *clocks.shape))
+        design = np.concatenate(columns, axis=2)
+        weight = np.where(moved.used, 1.0 / moved.sigma_m**2, 0.0)
+        for _ in range(2):
+            step, covariance, scale = _fit(design, misfit, weight, least=1)
+            left = np.abs(misfit - (design @ step[..., None])[..., 0]) * np.sqrt(weight)
+            typical = masked_median(left, weight > 0)[:, None]
+            weight = weight / np.maximum(left / (_FITS_WELL * typical), 1.0) ** 2
+        late = late + step[:, 3] / _RATE_MPS
+        error[rows], sigma[rows] = late, np.maximum(scale, 1.0) * np.sqrt(covariance[:, 3, 3]) / _RATE_MPS
+        again = np.abs(step[:, 3]) > _TAG_LINEAR_S * _RATE_MPS
+        if not again.any():
+            break
+        rows, late = rows[again], late[again]
+        own = inputs.take(rows)
+        moved = _move_satellites(own, late)._replace(near_ecef_m=near[again] + step[again, :3])
+        linear = _misfit(moved)
+    return error, sigma
+
+
+def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
+    """Return the ranges with the satellites where they were `late_s` before, shape (T,)."""
+    place, velocity, before = inputs.sat_ecef_m, inputs.sat_velocity_mps, -late_s[:, None, None]
+    gravity = -GM_GPS / np.linalg.norm(place, axis=2, keepdims=True) ** 3 + EARTH_ROTATION_RATE**2 * _ACROSS_AXIS
+    coriolis = 2.0 * EARTH_ROTATION_RATE * np.stack([velocity[..., 1], -velocity[..., 0], 0.0 * velocity[..., 0]], 2)
+    acceleration = gravity * place + coriolis
+    return inputs._replace(
+        sat_ecef_m=place + velocity * before + 0.5 * acceleration * before**2,
+        sat_velocity_mps=velocity + acceleration * before,
+    )
 
 
 def _misfit(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
@@ -209,6 +287,30 @@ def _fit(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[
 def _length(covariance: Floats) -> Floats:
     """Return the square root of the first three variances together, shape (T,)."""
     return np.asarray(np.sqrt(covariance[:, :3, :3].trace(axis1=1, axis2=2)))
+
+
+def _median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
+    """Return the median error of the time tags over the last epochs, also in standard deviations, and those to keep.
+
+    The standard deviation is the median one of the epochs, or that of their spread where it is larger. NaN for fewer
+    than `_TAG_LEAST` epochs.
+    """
+    tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
+    lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))
+    time, error, sigma = (
+        np.lib.stride_tricks.sliding_window_view(np.concatenate([a, b]), _TAG_EPOCHS)[len(before.time) :]
+        for a, b in zip(lead, tags, strict=True)
+    )
+    known = (now.time[:, None] - time <= _TAG_WINDOW) & np.isfinite(error)
+    known &= known.sum(axis=1, keepdims=True) >= _TAG_LEAST
+    median = masked_median(error, known)
+    spread = 1.4826 * masked_median(np.abs(error - median[:, None]), known)
+    typical = masked_median(sigma, known)
+    return (
+        median,
+        np.abs(median) / np.maximum(typical, spread),
+        TagErrors._make(each[1 - _TAG_EPOCHS :] for each in tags),
+    )
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:

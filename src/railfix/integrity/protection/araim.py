@@ -20,8 +20,8 @@ from itertools import combinations
 from typing import Annotated, Final, Literal, NamedTuple, Self
 
 import numpy as np
+import scipy
 from pydantic import Field, model_validator
-from scipy.special import ndtr
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
@@ -202,7 +202,7 @@ def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Float
     low, high = np.zeros(risk.shape), np.full(risk.shape, _LONGEST_M)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        spent = (weight[..., None] * ndtr((offset - middle[:, None]) / sigma)).sum(axis=1)
+        spent = (weight[..., None] * scipy.special.ndtr((offset - middle[:, None]) / sigma)).sum(axis=1)
         over = spent > risk
         low, high = np.where(over, middle, low), np.where(over, high, middle)
     return np.where(high >= _LONGEST_M, np.inf, high)

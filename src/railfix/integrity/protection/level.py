@@ -19,8 +19,8 @@ from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import comb
 
 from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
@@ -206,7 +206,7 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
     used = model.used[rows].sum(axis=1)
-    sizes = np.cumsum(comb(used[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
+    sizes = np.cumsum(scipy.special.comb(used[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
     sizes = np.concatenate([sizes, np.zeros((len(rows), 1))], axis=1)
     count = np.take_along_axis(sizes, plan.order[rows], axis=1).sum(axis=1)
     order = np.lexsort((used, count))

@@ -18,9 +18,9 @@ from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple, Self
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
-from scipy.special import comb, ndtri
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
@@ -49,12 +49,12 @@ def k_factor(risk: float) -> float:
     """
     if not 0.0 < risk <= 1.0:
         raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
-    return float(-ndtri(risk / 2.0))
+    return float(-scipy.special.ndtri(risk / 2.0))
 
 
 def one_sided_k(probability: Floats) -> Floats:
     """Return sigmas that noise exceeds on one side with this probability; -inf from 1 on, inf at 0 and below."""
-    return np.asarray(-ndtri(np.clip(probability, 0.0, 1.0)))
+    return np.asarray(-scipy.special.ndtri(np.clip(probability, 0.0, 1.0)))
 
 
 Probability = Annotated[float, Field(ge=0, lt=1)]  #: A probability below 1.
@@ -302,7 +302,7 @@ def _allocate(
     pairs = (of_pairs > parts[2]) | (order[:, 0] > 2)
     order[:, 0] = np.where(pairs, order[:, 0], 1)
     mapped = np.array([s.wrong_map for s in shared])
-    sizes = np.cumsum(comb(n[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
+    sizes = np.cumsum(scipy.special.comb(n[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
     sizes = np.concatenate([sizes, np.zeros((len(n), 1))], axis=1)
     tests = np.where(mapped, 0.0, np.take_along_axis(sizes, order, axis=1)).sum(axis=1) - 1.0
     asked = [0, *(b for b in range(1, len(shared)) if (order[:, b] >= 0).any())]
@@ -357,7 +357,7 @@ class _Classes:
         satellite.
         """
         sizes = np.arange(MOST_TOGETHER + 1)
-        feasible = comb(used[:, None], sizes) <= _MOST_SETS
+        feasible = scipy.special.comb(used[:, None], sizes) <= _MOST_SETS
         alone = (self.each[..., None] * self.sums[:, None, :-1] > share) & feasible[:, None]
         order = np.maximum(np.max(np.where(alone, sizes, -1), axis=2), self.least)
         order = np.where(self.each > 0.0, order, -1)

@@ -13,9 +13,9 @@ from functools import cached_property, lru_cache
 from typing import Final, Literal, Self
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
-from scipy.special import chdtri
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
@@ -62,12 +62,12 @@ class RaimLimits(Settings):
     @cached_property
     def separation(self) -> float:
         """WSSE by which another exclusion must fit worse, in noise variances."""
-        return float(chdtri(1, self.separation_risk))
+        return float(scipy.special.chdtri(1, self.separation_risk))
 
     @cached_property
     def own_error(self) -> float:
         """Square of an excluded satellite's own error over its sigma that noise does not reach."""
-        return float(chdtri(1, self.false_alarm))
+        return float(scipy.special.chdtri(1, self.false_alarm))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +138,7 @@ def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats
 def _chi_square_table(false_alarm: float, size: int) -> Floats:
     """Return the chi-square thresholds of 0 (NaN) to size - 1 degrees of freedom."""
     table = np.full(size, np.nan)
-    table[1:] = chdtri(np.arange(1, size), false_alarm)
+    table[1:] = scipy.special.chdtri(np.arange(1, size), false_alarm)
     table.flags.writeable = False
     return table
 

@@ -15,8 +15,8 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.special import chdtri, chndtrinc, ndtri
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
@@ -80,7 +80,9 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
     fault = np.where(located & (model.freedom < 1), np.inf, largest * root)
     # K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane
     risk = limits.noise_risk
-    noise = sigma * (float(-ndtri(risk / 2.0)) if model.interest == 1 else math.sqrt(-2.0 * math.log(risk)))
+    noise = sigma * (
+        float(-scipy.special.ndtri(risk / 2.0)) if model.interest == 1 else math.sqrt(-2.0 * math.log(risk))
+    )
     level = fault + noise
     return Reliability(
         noncentrality=root**2,
@@ -109,7 +111,7 @@ def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Fl
 @lru_cache(maxsize=1024)
 def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) -> float:
     """Return the lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
-    return float(chndtrinc(chdtri(freedom, false_alarm), freedom, missed_detection))
+    return float(scipy.special.chndtrinc(scipy.special.chdtri(freedom, false_alarm), freedom, missed_detection))
 
 
 def _longest_axis(covariance: Floats) -> Floats:

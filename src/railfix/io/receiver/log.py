@@ -390,7 +390,7 @@ def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
             frames = find_frames(np.frombuffer(rest + block, dtype=np.uint8), at_end=False)
             if not len(frames.of("rtcm3")):
                 break
-            own, rest = rtcm.ephemeris_date(frames), frames.data[frames.consumed :].tobytes()
+            own, rest = rtcm.ephemeris_date(frames, date), frames.data[frames.consumed :].tobytes()
     if date is None or np.isnat(own):
         return own if date is None else date.astype("datetime64[ns]")
     if abs(own - date) > _SAME_WEEK:

@@ -365,19 +365,26 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 
-def ephemeris_date(frames: Frames) -> np.datetime64:
+#: GPS week of the first log with MSM (July 2011, RTCM 10403.1 amendment 5): no earlier week is meant.
+_FIRST_MSM_WEEK: Final = 1642
+
+
+def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
     """Return the time of the ephemerides of a log, which tells the week of its observations; NaT without any.
 
-    The weeks of Galileo and BeiDou are unique; that of GPS, modulo 1024, is the latest one that is not to come.
+    The weeks of Galileo and BeiDou are unique; that of GPS, modulo 1024, is the one nearest to `near`, without it the
+    first since MSM were defined (July 2011 to February 2031): the machine's clock has no part in it.
     """
+    cycle_begin = _FIRST_MSM_WEEK
+    if near is not None:
+        cycle_begin = int((near - np.datetime64("1980-01-06", "D")) / np.timedelta64(7, "D")) - 512
     found: dict[int, list[np.datetime64]] = {}
     for _, number, values in ephemeris_fields(frames):
         if number in _WEEKS:
             origin, cycle = _WEEKS[number]
             week = int(values["week"]) + origin
             if cycle == 1024:
-                today = int((np.datetime64("now", "D") - np.datetime64("1980-01-06", "D")) / np.timedelta64(7, "D"))
-                week += (today - week) // cycle * cycle
+                week += -((week - cycle_begin) // cycle) * cycle
             found.setdefault(cycle, []).append(from_week([week], [values["toe_sow_s"]])[0])
     times = found.get(4096) or found.get(8192) or found.get(1024)
     return np.datetime64("NaT", "ns") if not times else np.sort(np.array(times))[len(times) // 2]

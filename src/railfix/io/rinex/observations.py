@@ -255,7 +255,7 @@ def _of_files(
             if progress is not None:
                 progress((k + reader.share) / len(readers))
             yield run
-        if not reader.epochs and selection.broken_lines == "stop":
+        if not reader.epochs and (selection.broken_lines == "stop" or len(readers) == 1):
             raise InputFileError(reader.path, "has a header but no epochs; the recording is empty or cut short")
 
 

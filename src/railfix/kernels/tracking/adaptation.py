@@ -14,26 +14,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import (
-    BIAS_FAULTY,
-    BIAS_MEMORY_S,
-    BIAS_MOST,
-    BIAS_SATELLITES,
-    BIAS_SHORT,
-    CODE_LEAK,
-    LARGEST_SCALE,
-    LEAST_SCALE,
-    MISFIT_CLIPPED,
-    MISFIT_CODES,
-    MISFIT_LARGEST,
-    MISFIT_LEARNT_S,
-    MISFIT_MOST,
-    MOTION_FIT_S,
-    MOTION_LEAK,
-    NOMINAL_M,
-    SCALE_S,
-    STEP_SIGMAS,
-)
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import FORCE_COLUMN, Given, Record, Rows, State
 from railfix.kernels.tracking.update import Equations, Fit, mean_weights
 
@@ -51,27 +32,27 @@ def mean_square(rows: Rows, own: slice, found: Fit) -> float:
 def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
     """Return the logarithm of a variance's scale after an epoch with some mean square; NaN leaves it."""
     if not math.isnan(mean_square):
-        log_scale += (1.0 - math.exp(-min(dt, 1.0) / SCALE_S)) * math.log(mean_square)
-    return min(max(log_scale, LEAST_SCALE), LARGEST_SCALE)
+        log_scale += (1.0 - math.exp(-min(dt, 1.0) / constants.SCALE_S)) * math.log(mean_square)
+    return min(max(log_scale, constants.LEAST_SCALE), constants.LARGEST_SCALE)
 
 
 @inner
-def update_doubt(parameters: Record, monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
+def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
     """Count how long motion and codes have had low weights, and filter the misfit of Dopplers and phases."""
     code, motion = mean_weights(rows, rows.variance, found.weight)
-    if motion < parameters.lost_motion_weight:
+    if motion < constants.LOST_MOTION_WEIGHT:
         monitors.weak_motion_s += dt
     else:
-        monitors.weak_motion_s = max(monitors.weak_motion_s - MOTION_LEAK * dt, 0.0)
+        monitors.weak_motion_s = max(monitors.weak_motion_s - constants.MOTION_LEAK * dt, 0.0)
     misfit = 0.0 if math.isnan(motion) else 1.0 - motion
     for j in range(rows.sensor.start, rows.sensor.stop):
         misfit = 0.0 if rows.channel[j] < FORCE_COLUMN else misfit  # a sensor measures the speed
-    monitors.motion_misfit += (1.0 - math.exp(-dt / MOTION_FIT_S)) * (misfit - monitors.motion_misfit)
+    monitors.motion_misfit += (1.0 - math.exp(-dt / constants.MOTION_FIT_S)) * (misfit - monitors.motion_misfit)
     if rows.code_s > 0.0:
-        if code < parameters.lost_code_weight:
+        if code < constants.LOST_CODE_WEIGHT:
             monitors.weak_code_s += rows.code_s
         else:
-            monitors.weak_code_s = max(monitors.weak_code_s - CODE_LEAK * rows.code_s, 0.0)
+            monitors.weak_code_s = max(monitors.weak_code_s - constants.CODE_LEAK * rows.code_s, 0.0)
 
 
 @inner
@@ -84,34 +65,34 @@ def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation
     of_dopplers, of_phases = mean_square(rows, rows.doppler, found), mean_square(rows, rows.phase, found)
     monitors.log_doppler_scale = update_scale(monitors.log_doppler_scale, of_dopplers, dt)
     monitors.log_phase_scale = update_scale(monitors.log_phase_scale, of_phases, dt)
-    update_doubt(parameters, monitors, rows, found, dt)
+    update_doubt(monitors, rows, found, dt)
     update_map_scale(monitors, shift, rows.code_s, parameters)
     beyond, early, excluded = 0, 0, False
     for j in range(rows.code.start, rows.code.stop):
         channel = given.channel[t, rows.channel[j]]
         sigma = channel.code_sigma_m * math.sqrt(1.0 + parameters.code_white_share**2)
         bias = state.code_bias[channel.satellite]
-        if abs(bias) > BIAS_FAULTY and abs(bias) * sigma > NOMINAL_M:
+        if abs(bias) > constants.BIAS_FAULTY and abs(bias) * sigma > constants.NOMINAL_M:
             beyond += 1
             early += bias < 0.0
         state.code_bias[channel.satellite] = update_bias(bias, innovation[j] / sigma, rows.code_s)
         excluded = excluded or (is_faulty(state.code_bias[channel.satellite]) and not is_faulty(bias))
-    if early and beyond > BIAS_SATELLITES:
-        monitors.level_hold_s = max(monitors.level_hold_s, parameters.level_hold_s)
+    if early and beyond > constants.BIAS_SATELLITES:
+        monitors.level_hold_s = max(monitors.level_hold_s, constants.LEVEL_HOLD_S)
     return bool(excluded)
 
 
 @inner
 def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
     """Return a satellite's mean innovation after another one, over its standard deviation."""
-    share = 1.0 - math.exp(-min(code_s, 1.0) / BIAS_MEMORY_S)
-    return code_bias + share * (min(max(innovation, -BIAS_MOST), BIAS_MOST) - code_bias)
+    share = 1.0 - math.exp(-min(code_s, 1.0) / constants.BIAS_MEMORY_S)
+    return code_bias + share * (min(max(innovation, -constants.BIAS_MOST), constants.BIAS_MOST) - code_bias)
 
 
 @inner
 def is_faulty(code_bias: float) -> bool:
     """Return whether a mean of innovations is that of a satellite whose codes are left out."""
-    return bool(code_bias > BIAS_FAULTY or code_bias < BIAS_SHORT)
+    return bool(code_bias > constants.BIAS_FAULTY or code_bias < constants.BIAS_SHORT)
 
 
 @inner
@@ -129,7 +110,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
         First weights; those above 1 count as 1.
     """
     codes = rows.code.stop
-    if codes < MISFIT_CODES:
+    if codes < constants.MISFIT_CODES:
         return 0.0
     S, h, v = covariance[:codes, :codes].copy(), equations.coefficient[:codes, 0].copy(), equations.value[:codes].copy()
     for j in range(codes):
@@ -145,20 +126,22 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
             S[j, i:] -= share * S[i, i:]
     if not information > 0.0:
         return 0.0
-    return float(min(max(score / math.sqrt(information), -MISFIT_MOST), MISFIT_MOST))
+    return float(min(max(score / math.sqrt(information), -constants.MISFIT_MOST), constants.MISFIT_MOST))
 
 
 @inner
 def update_map_scale(monitors: Record, shift: float, dt: float, parameters: Record) -> None:
     """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
     dt = min(dt, 1.0)
-    share = 1.0 - math.exp(-dt / parameters.map_misfit_s)
-    shift = 0.0 if abs(shift) > STEP_SIGMAS else min(max(shift, -MISFIT_CLIPPED), MISFIT_CLIPPED)
+    share = 1.0 - math.exp(-dt / constants.MAP_MISFIT_S)
+    if abs(shift) > constants.STEP_SIGMAS:
+        shift = 0.0
+    shift = min(max(shift, -constants.MISFIT_CLIPPED), constants.MISFIT_CLIPPED)
     mean = (1.0 - share) * monitors.code_shift + share * shift
     variance = (1.0 - share) ** 2 * monitors.code_shift_variance + share**2
     monitors.code_shift, monitors.code_shift_variance = mean, variance
     beyond = abs(mean) / (np.sqrt(variance) * parameters.map_misfit_sigmas)
-    scale = monitors.map_log_variance * math.exp(-dt / parameters.map_misfit_kept_s)
+    scale = monitors.map_log_variance * math.exp(-dt / constants.MAP_MISFIT_KEPT_S)
     if beyond > 1.0:
-        scale += 2.0 * math.log(beyond) * dt / MISFIT_LEARNT_S
-    monitors.map_log_variance = min(scale, MISFIT_LARGEST)
+        scale += 2.0 * math.log(beyond) * dt / constants.MISFIT_LEARNT_S
+    monitors.map_log_variance = min(scale, constants.MISFIT_LARGEST)

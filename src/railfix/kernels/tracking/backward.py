@@ -19,9 +19,9 @@ def before_measurements(
 ) -> tuple[Floats, Floats]:
     """Return what later epochs say of the unknowns before an epoch's measurements, with these.
 
-    Of one measurement with row h, innovation d and ``s = h' P h + r`` (G. J. Bierman, 1973)::
+    Of one measurement with row h, innovation y and ``S = h' P h + r`` (G. J. Bierman, 1973)::
 
-        l = h d / s + (I - h g' / s) l          L = h h' / s + (I - h g' / s) L (I - g h' / s)          g = P h
+        l = h y / S + (I - h g' / S) l          L = h h' / S + (I - h g' / S) L (I - g h' / S)          g = P h
 
     The measurements are taken in the order of the filter, and backward from the last.
 
@@ -44,19 +44,19 @@ def before_measurements(
     vector, matrix = vector.copy(), matrix.copy()
     for j in range(count - 1, -1, -1):
         if total[j] < math.inf:
-            h, g, s = row[j], covariance[j], total[j]
-            vector += h * ((innovation[j] - g @ vector) / s)
+            h, g, S = row[j], covariance[j], total[j]
+            vector += h * ((innovation[j] - g @ vector) / S)
             across = matrix @ g
             for a in range(size):
-                matrix[a] -= (h[a] * across + across[a] * h) / s
-                matrix[a] += h[a] * h * (1.0 + g @ across / s) / s
+                matrix[a] -= (h[a] * across + across[a] * h) / S
+                matrix[a] += h[a] * h * (1.0 + g @ across / S) / S
     return vector, matrix
 
 
 @kernel
-def transition_matrix(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Floats:
+def transition_matrix(speed: float, epoch: Record, unknowns: int) -> Floats:
     """Return F as a matrix, shape (N, N)."""
-    F, matrix = compute_transition(speed, epoch, parameters, unknowns), np.zeros((unknowns, unknowns))
+    F, matrix = compute_transition(speed, epoch, unknowns), np.zeros((unknowns, unknowns))
     for i in range(unknowns):
         for k in range(3):
             matrix[i, F.unknown[i, k]] += F.coefficient[i, k]

@@ -23,6 +23,33 @@ DOUBTFUL: Final = 9
 SPOOFING_SUSPECTED: Final = 10
 
 # Prediction.
+#: Time and travel over which the multipath of a satellite's code changes: a reflector of a street or a station is
+#: passed within about 100 m; at rest the fringe of one 10 m away lasts about a minute.
+CODE_CORRELATION_S: Final = 60.0
+CODE_CORRELATION_M: Final = 100.0
+#: Correlation time of the displacement by orbits and ionosphere, `TrackingLimits.slow_code_m`.
+SLOW_CODE_S: Final = 7200.0
+#: Time-correlated error of the speed by Dopplers: its least size, its share of the speed (a reflected signal is
+#: shifted by up to the speed, at rest not at all) and its correlation time.
+DOPPLER_ERROR_MPS: Final = 0.01
+DOPPLER_ERROR_SHARE: Final = 0.02
+DOPPLER_CORRELATION_S: Final = 10.0
+#: Displacement in the square root of a second by slow errors of all phases: ionosphere, troposphere, orbits and
+#: clocks, 0.5 mm/s along the line for half an hour.
+PHASE_WALK_M: Final = 0.03
+#: Change of the drift of the receiver's clock in the square root of a second: 1.7e-9 of the frequency, what quartz
+#: oscillators without an oven show when shaken.
+CLOCK_WALK_MPS: Final = 0.5
+#: Change of the offset between two constellations in the square root of a second.
+OFFSET_WALK_M: Final = 0.02
+OFFSET_PRIOR_M: Final = 30.0  #: Standard deviation of such an offset at first.
+#: Least local error of the map across and up, and the length over which it changes. The map's stated accuracy
+#: counts where it is more, of heights the half.
+MAP_ROUGHNESS_M: Final = 0.3
+MAP_CORRELATION_M: Final = 50.0
+MAP_SCALE_M: Final = 0.03  #: Error of a length along the map [m per square root of m].
+#: Length over which the absolute error of the map changes (sigmas are those of the trajectory).
+MAP_ABSOLUTE_M: Final = 500.0
 #: Standard deviation of the clock of the codes about the median of an epoch [m].
 CODE_CLOCK_SIGMA_M: Final = 1e3
 #: Random walks of the sensors' scales and offset in the square root of a second. A wheel of a car wandered over 2 %
@@ -30,7 +57,7 @@ CODE_CLOCK_SIGMA_M: Final = 1e3
 WHEEL_WALK: Final = 5e-4
 FORCE_WALK_MPS2: Final = 1e-3
 RADAR_WALK: Final = 2e-4
-#: Share of the map's error of height that changes over `map_correlation_m`; across it is the whole: heights of a survey
+#: Share of the map's error of height that changes over `MAP_CORRELATION_M`; across it is the whole: heights of a survey
 #: or a terrain model are wrong over longer distances.
 HEIGHT_ROUGHNESS: Final = 0.5
 #: Least variance of a step of the place [m2], keeps matrices regular.
@@ -59,6 +86,8 @@ UNKNOWN_CLOCK: Final = 100.0
 FIRST_OFFSET_M2: Final = 1e-4
 
 # Reweighting.
+PASSES: Final = 4  #: Rounds of reweighting an epoch.
+LEVEL_PASSES: Final = 3  #: Rounds of reweighting of the sub-filters.
 #: Mean weight of codes, or of phases and Dopplers, under which another start of the reweighting is tried.
 WEAK_FIT: Final = 0.7
 #: Variances of place and speed added for that start [m2, m2/s2].
@@ -100,6 +129,10 @@ INFLATED_M: Final = 15.0
 INFLATED_SIGMAS: Final = 3.0
 
 # Lengths of the map.
+#: Time over which codes are to contradict the length (`TrackingLimits.map_misfit_sigmas`), and within which a larger
+#: error of it is forgotten.
+MAP_MISFIT_S: Final = 30.0
+MAP_MISFIT_KEPT_S: Final = 300.0
 #: Fewer codes of an epoch do not tell a shift from clocks.
 MISFIT_CODES: Final = 4
 #: A single epoch counts with at most so many standard deviations; beyond `STEP_SIGMAS` it is a step of all codes and
@@ -115,14 +148,40 @@ MISFIT_LARGEST: Final = 8.0
 SPEED_SIGMAS: Final = 4.0
 
 # Branches.
+#: Least distance of two branches at which half of their difference is the map's: three times an error of 2 m.
+MAP_BRANCH_M: Final = 6.0
+#: Standard deviation of an error that the codes have in common across the line: reflections off one side of a
+#: street.
+CODE_COMMON_M: Final = 10.0
+#: Time and distance over which that error lasts.
+CODE_COMMON_S: Final = 120.0
+CODE_COMMON_TRAVEL_M: Final = 500.0
+#: Codes alone leave a branch this near at least this probability.
+BRANCH_FLOOR: Final = 1e-3
+BRANCH_FLOOR_M: Final = 30.0
+#: Hypotheses are dropped only after this much travel: before, motion does not separate branches.
+DECIDED_TRAVEL_M: Final = 60.0
+#: Hypotheses below it are dropped: a hundredth of the risk of an independent error.
+LEAST_PROBABILITY: Final = 1e-11
+START_SIGMA_M: Final = 30.0  #: Standard deviation of a hypothesis when it begins.
+GAP_S: Final = 5.0  #: Time without measurements after which places are sought again.
+#: The track is lost when the mean weight of motion, or of codes, was below these for so long; 1 is the weight of an
+#: error of one standard deviation. Epochs above them count down.
+LOST_MOTION_WEIGHT: Final = 0.45
+LOST_MOTION_S: Final = 6.0
+LOST_CODE_WEIGHT: Final = 0.5
+LOST_CODE_S: Final = 20.0
+#: Where motion contradicts the track, places so far (and twice) before and behind are tried.
+BEND_M: Final = 20.0
+EXPIRED_SIGMA_M: Final = 200.0  #: Largest standard deviation of a predicted position.
 #: How much more probable another place must be to be gone by: near-equal ones would take turns.
 SWITCH: Final = 3.0
-#: Among laps within so many `map_branch_m` of each other, which nothing distinguishes for good, the filter goes by the
+#: Among laps within so many `MAP_BRANCH_M` of each other, which nothing distinguishes for good, the filter goes by the
 #: one that codes have preferred lately: a mean of so many seconds, of odds whose logarithm is no larger than this.
 ALIKE: Final = 1.5
 RECENT_S: Final = 30.0
 RECENT_MOST: Final = 3.0
-#: Logarithm of the odds that a difference of one `map_branch_m` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
+#: Logarithm of the odds that a difference of one `MAP_BRANCH_M` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
 MOST_ODDS: Final = 2.25
 #: Largest logarithm of the odds that motion gives in a second, or in an epoch: more is a reflection.
 MOST_MOTION: Final = 5.0
@@ -136,10 +195,19 @@ TAKEOVER_AFTER_S: Final = 15.0
 MOTION_SATELLITES: Final = 4
 #: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
 MOTION_M: Final = 3.0
-#: Places beside are tried once motion has been contradicted for so long [s]: shorter it is a reflection, at any rate.
+#: Places beside are tried, and beyond an open end the track is lost, once motion has been contradicted for so long [s]:
+#: shorter it is a reflection, at any rate.
 BESIDE_AFTER_S: Final = 0.9
 
 # Monitors of the place.
+#: A filter contradicted by its motion, or codes, for longer bounds nothing; mean weights are those of a lost track.
+#: A contradiction of single epochs is noise, which is in the standard deviation.
+LEVEL_DOUBT_S: Final = 3.0
+LEVEL_DOUBT_CODE_S: Final = 8.0
+#: After a start no level before a place has a probability of 0.99, at most so long; none for so long after the
+#: track was lost.
+LEVEL_START_S: Final = 15.0
+LEVEL_HOLD_S: Final = 5.0  #: A level comes back so long after the last contradiction.
 #: The velocity is compared with the line at the place and so many of its standard deviations, or metres, beside it.
 REACH_SIGMAS: Final = 2.0
 REACH_M: Final = 3.0

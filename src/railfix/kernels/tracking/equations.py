@@ -2,14 +2,14 @@ r"""Measurement equations of one epoch, linearised at one Gaussian: the rows of 
 
 With u the unit vector from receiver to satellite, e the tangent, c and h the axes to the right and up::
 
-    code    P = range(s + z) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
-    Doppler r = A + slope (v + w) - u.(c q_c + h q_h) / dt + d + noise
-    phase   change L = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
-    wheel   W (1 + k) = s - s' + q_a, radar alike;  force f = (v - v') / dt + g sin(gradient) + beta;  place = s
-    balise  place = s - age v + age^2 a / 2;  range R = |unit - antenna(s - age v, m_c, m_h)|
+    code    rho = range(s + n) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
+    Doppler rate = A + slope (v + w) - u.(c q_c + h q_h) / dt + f + noise
+    phase   change = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
+    wheel   W (1 + k) = s - s' + q_a, radar alike;  force F = (v - v') / dt + g sin(gradient) + beta;  place = s
+    balise  place = s - age v + age^2 a / 2;  range = |unit - antenna(s - age v, m_c, m_h)|
 
 s' and v' are those of the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
-of its constellation's code clock, w the time-correlated error of Dopplers, z the slow error of the codes, m the map's
+of its constellation's code clock, w the time-correlated error of Dopplers, n the slow error of the codes, m the map's
 error, q the error of the map's displacement over the epoch (along, right, up: q_a, q_c, q_h), A the satellite's part of
 the range rate, slope what the speed adds to it, W the distance by the wheel, k its scale-factor error, beta the offset
 of the accelerometer. The phase's change has one direction g for both ends, that of the chord. With a direction
@@ -26,7 +26,7 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import GRAVITY_MPS2, SPEED_OF_LIGHT
 from railfix.kernels.compiling import inner
 from railfix.kernels.sight import TURN, sight
-from railfix.kernels.tracking.constants import CHORD_M, DIRECTION_MPS
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     ARC,
@@ -70,6 +70,9 @@ from railfix.kernels.tracking.layout import (
 from railfix.kernels.tracking.line import gradient_at, nearest_arc, wrap_arc, write_point
 from railfix.kernels.tracking.update import Equations
 
+#: Unknowns of the distance run since the epoch before: s - s' + q_a.
+DISTANCE = (ARC, PREVIOUS_ARC, MAP_LENGTH_ERROR)
+
 
 @inner
 def new_equations(rows: Rows) -> Equations:
@@ -79,12 +82,6 @@ def new_equations(rows: Rows) -> Equations:
     return Equations(
         np.zeros((size, TERMS), dtype=np.intp), np.zeros((size, TERMS)), np.zeros((count, MOTION)), np.zeros(count)
     )
-
-
-@inner
-def _set(equations: Equations, q: int, term: int, unknown: int, coefficient: float) -> None:
-    """Set one term of a quantity."""
-    equations.unknown[q, term], equations.coefficient[q, term] = unknown, coefficient
 
 
 @inner
@@ -101,12 +98,10 @@ def linearise(
     write_point(vertex, line, at[0], point, axes)
     write_point(vertex, line, at[1], before, unused)
     seen = _compute_sights(given, t, point, axes)
-    _write_motion_quantities(rows.code.stop, equations)
     _write_codes(given, t, rows, x, seen, x[ARC] - at[0], equations)
-    cx, cy, cz = _compute_chord(point, before, axes, at)
-    moved = x[ARC] - at[0] - (x[PREVIOUS_ARC] - at[1])
-    _write_phases(given, t, rows, x, seen, before, (moved, cx, cy, cz), equations)
-    _write_dopplers(given, t, rows, x, seen, point, axes, equations)
+    motion = _write_motion_quantities(rows.code.stop, x, at, equations)
+    _write_phases(given, t, rows, motion, seen, before, _compute_chord(point, before, axes, at), equations)
+    _write_dopplers(given, t, rows, motion, seen, point, axes, equations)
     _write_sensors(given, t, rows, x, direction, equations)
 
 
@@ -135,24 +130,27 @@ def _compute_chord(point: Floats, before: Floats, axes: Floats, at: tuple[float,
     """Return the direction of the displacement since the epoch before; that of the tangent near rest."""
     cx, cy, cz = point[0] - before[0], point[1] - before[1], point[2] - before[2]
     length = math.sqrt(cx * cx + cy * cy + cz * cz)
-    if length > CHORD_M:
+    if length > constants.CHORD_M:
         sign = (1.0 if at[0] >= at[1] else -1.0) / length
         return sign * cx, sign * cy, sign * cz
     return axes[0, 0], axes[0, 1], axes[0, 2]
 
 
 @inner
-def _write_motion_quantities(first: int, equations: Equations) -> None:
-    """Write the six quantities of phases and Dopplers, from quantity `first` on."""
-    _set(equations, first + M_DISTANCE, 0, ARC, 1.0)
-    _set(equations, first + M_DISTANCE, 1, PREVIOUS_ARC, -1.0)
-    _set(equations, first + M_DISTANCE, 2, MAP_LENGTH_ERROR, 1.0)
-    _set(equations, first + M_CLOCK, 0, PHASE_CLOCK, 1.0)
-    _set(equations, first + M_RIGHT, 0, STEP_RIGHT, 1.0)
-    _set(equations, first + M_UP, 0, STEP_UP, 1.0)
-    _set(equations, first + M_SPEED, 0, SPEED, 1.0)
-    _set(equations, first + M_SPEED, 1, DOPPLER_SPEED, 1.0)
-    _set(equations, first + M_DRIFT, 0, DRIFT, 1.0)
+def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equations: Equations) -> Floats:
+    """Write the six quantities of phases and Dopplers, from quantity `first` on; return those of the mean, shape (6,).
+
+    Of the distance it is what the mean is away from the points at the arc lengths `at`. The error of a length of the
+    map belongs to it: phases measure the distance run, not that on the map.
+    """
+    unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(MOTION)
+    unknown[first + M_DISTANCE, :3], coefficient[first + M_DISTANCE, :3] = DISTANCE, (1.0, -1.0, 1.0)
+    unknown[first + M_SPEED, :2], coefficient[first + M_SPEED, :2] = (SPEED, DOPPLER_SPEED), (1.0, 1.0)
+    for q, i in ((M_CLOCK, PHASE_CLOCK), (M_RIGHT, STEP_RIGHT), (M_UP, STEP_UP), (M_DRIFT, DRIFT)):
+        unknown[first + q, 0], coefficient[first + q, 0], motion[q] = i, 1.0, x[i]
+    motion[M_DISTANCE] = x[ARC] - at[0] - (x[PREVIOUS_ARC] - at[1]) + x[MAP_LENGTH_ERROR]
+    motion[M_SPEED] = x[SPEED] + x[DOPPLER_SPEED]
+    return motion
 
 
 @inner
@@ -161,21 +159,30 @@ def _write_codes(given: Given, t: int, rows: Rows, x: Floats, seen: Floats, move
 
     `seen` is that of `_compute_sights`; `moved` is the mean's arc length less that of the point [m].
     """
+    unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
-        along, right, up = -seen[k, 4], -seen[k, 5], -seen[k, 6]
+        along, right, up, sigma = -seen[k, 4], -seen[k, 5], -seen[k, 6], channel.code_sigma_m
         offset, satellite = OFFSETS + channel.clock, SATELLITES + channel.satellite
-        _set(equations, j, 0, ARC, along)
-        _set(equations, j, 1, SLOW_CODE, along)
-        _set(equations, j, 2, MAP_RIGHT, right)
-        _set(equations, j, 3, MAP_UP, up)
-        _set(equations, j, 4, offset, 1.0)
-        _set(equations, j, 5, satellite, channel.code_sigma_m)
-        _set(equations, j, CLOCK_TERM, CODE_CLOCK, 1.0)
+        unknown[j, 0], coefficient[j, 0] = ARC, along
+        unknown[j, 1], coefficient[j, 1] = SLOW_CODE, along
+        unknown[j, 2], coefficient[j, 2] = MAP_RIGHT, right
+        unknown[j, 3], coefficient[j, 3] = MAP_UP, up
+        unknown[j, 4], coefficient[j, 4] = offset, 1.0
+        unknown[j, 5], coefficient[j, 5] = satellite, sigma
+        unknown[j, CLOCK_TERM], coefficient[j, CLOCK_TERM] = CODE_CLOCK, 1.0
         predicted = along * (moved + x[SLOW_CODE]) + right * x[MAP_RIGHT] + up * x[MAP_UP]
-        predicted += x[offset] + x[CODE_CLOCK] + channel.code_sigma_m * x[satellite]
+        predicted += x[offset] + x[CODE_CLOCK] + sigma * x[satellite]
         equations.value[j] = channel.measured[CODE] - seen[k, 0] - predicted
+
+
+@inner
+def _write_motion_value(value: float, j: int, motion: Floats, equations: Equations) -> None:
+    """Write the innovation of a phase or Doppler: a value less what the motion of the mean explains."""
+    for a in range(MOTION):
+        value -= equations.design[j, a] * motion[a]
+    equations.value[j] = value
 
 
 @inner
@@ -183,36 +190,35 @@ def _write_phases(
     given: Given,
     t: int,
     rows: Rows,
-    x: Floats,
+    motion: Floats,
     seen: Floats,
     before: Floats,
-    moved: tuple[float, float, float, float],
+    chord: tuple[float, float, float],
     equations: Equations,
 ) -> None:
     """Write the changes of the phases.
 
-    `seen` is that of `_compute_sights`; `before` the point at the epoch before [m], shape (3,);
-    `moved`: the mean's displacement less that of the points [m], and the direction of the chord between these.
+    `motion` is that of `_write_motion_quantities`, `seen` that of `_compute_sights`, `before` the point at the epoch
+    before [m], shape (3,), `chord` the direction from there.
     """
-    displacement, cx, cy, cz = moved
+    design, (cx, cy, cz) = equations.design, chord
     for j in range(rows.phase.start, rows.phase.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
         sat = channel.before_ecef_m
         distance = sight(sat[0], sat[1], sat[2], before[0], before[1], before[2])[0]
         gradient = -(seen[k, 1] * cx + seen[k, 2] * cy + seen[k, 3] * cz)
-        equations.design[j, M_DISTANCE], equations.design[j, M_CLOCK] = gradient, 1.0
-        equations.design[j, M_RIGHT], equations.design[j, M_UP] = -seen[k, 5], -seen[k, 6]
-        predicted = seen[k, 0] - distance + gradient * displacement
-        equations.value[j] = channel.measured[PHASE] - predicted - x[PHASE_CLOCK]
+        design[j, M_DISTANCE], design[j, M_CLOCK] = gradient, 1.0
+        design[j, M_RIGHT], design[j, M_UP] = -seen[k, 5], -seen[k, 6]
+        _write_motion_value(channel.measured[PHASE] - (seen[k, 0] - distance), j, motion, equations)
 
 
 @inner
 def _write_dopplers(
-    given: Given, t: int, rows: Rows, x: Floats, seen: Floats, point: Floats, axes: Floats, equations: Equations
+    given: Given, t: int, rows: Rows, motion: Floats, seen: Floats, point: Floats, axes: Floats, equations: Equations
 ) -> None:
     """Write the range rates by Doppler, with the turning of the earth and the signal's stretching."""
-    dt = given.epoch[t].interval_s
+    dt, design = given.epoch[t].interval_s, equations.design
     for j in range(rows.doppler.start, rows.doppler.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
@@ -221,10 +227,9 @@ def _write_dopplers(
         moving += TURN * (velocity[0] * point[1] - velocity[1] * point[0])
         stretch = 1.0 + moving / SPEED_OF_LIGHT
         slope = (-seen[k, 4] + TURN * (sat[0] * axes[0, 1] - sat[1] * axes[0, 0])) / stretch
-        equations.design[j, M_RIGHT], equations.design[j, M_UP] = -seen[k, 5] / dt, -seen[k, 6] / dt
-        equations.design[j, M_SPEED], equations.design[j, M_DRIFT] = slope, 1.0
-        predicted = moving / stretch + slope * (x[SPEED] + x[DOPPLER_SPEED]) + x[DRIFT]
-        equations.value[j] = channel.measured[DOPPLER] - predicted
+        design[j, M_RIGHT], design[j, M_UP] = -seen[k, 5] / dt, -seen[k, 6] / dt
+        design[j, M_SPEED], design[j, M_DRIFT] = slope, 1.0
+        _write_motion_value(channel.measured[DOPPLER] - moving / stretch, j, motion, equations)
 
 
 @inner
@@ -233,28 +238,21 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, direction: float
     dt, vertex, line, value = given.epoch[t].interval_s, given.vertex, given.line[0], equations.value
     for j in range(rows.sensor.start, rows.sensor.stop):
         column, q = rows.channel[j], rows.code.stop + MOTION + j - rows.sensor.start
-        sensor = given.sensor[t, column]
+        sensor, unknown, coefficient = given.sensor[t, column], equations.unknown[q], equations.coefficient[q]
         measured, age = sensor.value, sensor.age_s
         if column in (WHEEL_COLUMN, RADAR_COLUMN):
             if sensor.unsigned:
-                measured *= math.copysign(1.0, x[SPEED]) if abs(x[SPEED]) > DIRECTION_MPS else direction
-            scale = WHEEL if column == WHEEL_COLUMN else RADAR
-            _set(equations, q, 0, ARC, 1.0)
-            _set(equations, q, 1, PREVIOUS_ARC, -1.0)
-            _set(equations, q, 2, scale, -measured)
-            _set(equations, q, 3, MAP_LENGTH_ERROR, 1.0)
-            value[j] = measured * (1.0 + x[scale]) - (x[ARC] - x[PREVIOUS_ARC])
+                measured *= math.copysign(1.0, x[SPEED]) if abs(x[SPEED]) > constants.DIRECTION_MPS else direction
+            unknown[:3], coefficient[:3] = DISTANCE, (1.0, -1.0, 1.0)
+            unknown[3], coefficient[3] = WHEEL if column == WHEEL_COLUMN else RADAR, -measured
+            value[j] = measured * (1.0 + x[unknown[3]]) - (x[ARC] - x[PREVIOUS_ARC] + x[MAP_LENGTH_ERROR])
         elif column == FORCE_COLUMN:
             slope = gradient_at(vertex, line, 0.5 * (x[ARC] + x[PREVIOUS_ARC]))
             gravity = GRAVITY_MPS2 * slope / math.sqrt(1.0 + slope**2)
-            _set(equations, q, 0, SPEED, 1.0 / dt)
-            _set(equations, q, 1, PREVIOUS_SPEED, -1.0 / dt)
-            _set(equations, q, 2, FORCE_OFFSET, 1.0)
+            unknown[:3], coefficient[:3] = (SPEED, PREVIOUS_SPEED, FORCE_OFFSET), (1.0 / dt, -1.0 / dt, 1.0)
             value[j] = measured - (x[SPEED] - x[PREVIOUS_SPEED]) / dt - gravity - x[FORCE_OFFSET]
         elif column < RANGE_COLUMN:
-            _set(equations, q, 0, ARC, 1.0)
-            _set(equations, q, 1, SPEED, -age)
-            _set(equations, q, 2, ACCELERATION, 0.5 * age**2)
+            unknown[:3], coefficient[:3] = (ARC, SPEED, ACCELERATION), (1.0, -age, 0.5 * age**2)
             there = nearest_arc(vertex, line, wrap_arc(vertex, line, measured), x[ARC])
             value[j] = there - x[ARC] + age * x[SPEED] - 0.5 * age**2 * x[ACCELERATION]
         else:
@@ -276,10 +274,8 @@ def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations
         right -= away * axes[1, c]
         up -= away * axes[2, c]
     distance = math.sqrt(square)
-    _set(equations, q, 0, ARC, along / distance)
-    _set(equations, q, 1, SPEED, -age * along / distance)
-    _set(equations, q, 2, MAP_RIGHT, right / distance)
-    _set(equations, q, 3, MAP_UP, up / distance)
+    equations.unknown[q, :4] = ARC, SPEED, MAP_RIGHT, MAP_UP
+    equations.coefficient[q, :4] = along / distance, -age * along / distance, right / distance, up / distance
     return distance
 
 
@@ -292,6 +288,5 @@ def shift_sensors(rows: Rows, x: Floats, other_x: Floats, other: Equations, equa
         for k in range(TERMS):
             unknown, coefficient = other.unknown[q, k], other.coefficient[q, k]
             equations.unknown[q, k], equations.coefficient[q, k] = unknown, coefficient
-            if unknown != MAP_LENGTH_ERROR:
-                value -= coefficient * (x[unknown] - other_x[unknown])
+            value -= coefficient * (x[unknown] - other_x[unknown])
         equations.value[j] = value

@@ -6,7 +6,7 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import FREEDOM_PLACE_M2, FREEDOM_SPEED_M2PS2, MOTION_SATELLITES
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import ARC, SPEED, TERMS, Rows
 from railfix.kernels.tracking.update import (
     Correction,
@@ -30,9 +30,9 @@ def compute_evidence(rows: Rows, degrees: tuple[float, float], rounds: int, one:
     found.weight[:] = one.fit.weight
     reweight(rows, one.equations, one.covariance, without_codes, degrees, rounds, found)
     motion = compute_log_evidence(rows, without_codes, degrees, found)
-    codes = joint - motion if rows.code.stop >= MOTION_SATELLITES else 0.0
+    codes = joint - motion if rows.code.stop >= constants.MOTION_SATELLITES else 0.0
     satellites = max(rows.phase.stop - rows.phase.start, rows.doppler.stop - rows.doppler.start)
-    if satellites < MOTION_SATELLITES and rows.sensor.stop == rows.sensor.start:
+    if satellites < constants.MOTION_SATELLITES and rows.sensor.stop == rows.sensor.start:
         motion = 0.0
     return motion, codes
 
@@ -51,7 +51,7 @@ def _find_coefficient(equations: Equations, q: int, unknown: int) -> float:
 def _inflate(one: Correction) -> tuple[Floats, Floats]:
     """Return the covariance of the quantities, and its diagonal without clocks, with place and speed set free."""
     covariance, without_clock = one.covariance.copy(), one.without_clock.copy()
-    for unknown, variance in ((ARC, FREEDOM_PLACE_M2), (SPEED, FREEDOM_SPEED_M2PS2)):
+    for unknown, variance in ((ARC, constants.FREEDOM_PLACE_M2), (SPEED, constants.FREEDOM_SPEED_M2PS2)):
         for i in range(len(covariance)):
             own = variance * _find_coefficient(one.equations, i, unknown)
             if own != 0.0:

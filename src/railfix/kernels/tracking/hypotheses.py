@@ -8,15 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import (
-    ALIKE,
-    MOST_MOTION,
-    MOST_ODDS,
-    MOTION_M,
-    RECENT_MOST,
-    RECENT_S,
-    SWITCH,
-)
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import ARC, Record, Records, State
 
 
@@ -51,9 +43,9 @@ def reweigh(
     nor than one for `MOTION_M` of travel.
 
     Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
-    ``n d^2 / (2 code_common_m^2)``, what n independent epochs with such an error can say, n being 1 and one more in
-    `code_common_s` or `code_common_travel_m`; between branches that are closer than `branch_floor_m` now never below
-    `branch_floor`, whatever was gained while they were apart.
+    ``n d^2 / (2 CODE_COMMON_M^2)``, what n independent epochs with such an error can say, n being 1 and one more in
+    `CODE_COMMON_S` or `CODE_COMMON_TRAVEL_M`; between branches that are closer than `BRANCH_FLOOR_M` now never below
+    `BRANCH_FLOOR`, whatever was gained while they were apart.
 
     Between laps within `ALIKE` times map_branch_m what codes say now is kept as `log_recent`, for `find_leading` alone.
 
@@ -67,14 +59,14 @@ def reweigh(
     """
     hypothesis, monitors, count = state.hypothesis, state.monitors[0], len(evidence)
     travel = monitors.branch_m
-    independent = 1.0 + monitors.branch_s / parameters.code_common_s + travel / parameters.code_common_travel_m
+    independent = 1.0 + monitors.branch_s / constants.CODE_COMMON_S + travel / constants.CODE_COMMON_TRAVEL_M
     best = 0
     for h in range(1, count):
         if hypothesis[h].log_probability > hypothesis[best].log_probability:
             best = h
     first, first_code = hypothesis[best].log_probability, hypothesis[best].log_code
     of_second = min(dt, 1.0)
-    most, floor = MOST_MOTION * of_second, math.log(parameters.branch_floor)
+    most, floor = constants.MOST_MOTION * of_second, math.log(constants.BRANCH_FLOOR)
     after, after_code = np.empty(count), np.empty(count)
     for h in range(count):
         one = hypothesis[h]
@@ -82,19 +74,19 @@ def reweigh(
         for c in range(3):
             square += (points[h, c] - points[best, c]) ** 2
         part = square / (square + parameters.map_branch_m**2)
-        reach = min(MOST_ODDS * square / parameters.map_branch_m**2, travel / MOTION_M)
+        reach = min(constants.MOST_ODDS * square / parameters.map_branch_m**2, travel / constants.MOTION_M)
         gained = min(max(of_second * (evidence[h] - evidence[best]), -most), most)
         motion = clip_odds(one.log_probability - one.log_code - (first - first_code), part * gained, reach)
-        reach = independent * square / (2.0 * parameters.code_common_m**2)
+        reach = independent * square / (2.0 * constants.CODE_COMMON_M**2)
         gained = code_evidence[h] - code_evidence[best]
         code = clip_odds(one.log_code - first_code, part * gained, reach)
-        if square < parameters.branch_floor_m**2:
+        if square < constants.BRANCH_FLOOR_M**2:
             code = min(max(code, floor), -floor)
-        recent = math.exp(-dt / RECENT_S) * one.log_recent
+        recent = math.exp(-dt / constants.RECENT_S) * one.log_recent
         apart = abs(arc[h] - arc[best]) > parameters.start_separation_m
-        if apart and square < (ALIKE * parameters.map_branch_m) ** 2:
+        if apart and square < (constants.ALIKE * parameters.map_branch_m) ** 2:
             recent += part * gained
-        one.log_recent = min(max(recent, -RECENT_MOST), RECENT_MOST)
+        one.log_recent = min(max(recent, -constants.RECENT_MOST), constants.RECENT_MOST)
         after[h], after_code[h] = motion + code, code
     total = log_sum(after)
     for h in range(count):
@@ -111,7 +103,7 @@ def find_leading(hypothesis: Records, count: int) -> int:
             best = h
     lead = hypothesis[best].log_probability + hypothesis[best].log_recent
     lead -= hypothesis[0].log_probability + hypothesis[0].log_recent
-    return best if lead > math.log(SWITCH) else 0
+    return best if lead > math.log(constants.SWITCH) else 0
 
 
 @inner
@@ -123,10 +115,10 @@ def prune(parameters: Record, state: State) -> Indices:
     kept, log_probability = _merge_twins(state, _rank(state.hypothesis, state.monitors[0].hypotheses))
     size = min(len(kept), parameters.most_hypotheses)
     kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
-    if abs(state.x[kept[0], ARC] - state.hypothesis[kept[0]].origin_m) >= parameters.decided_travel_m:
+    if abs(state.x[kept[0], ARC] - state.hypothesis[kept[0]].origin_m) >= constants.DECIDED_TRAVEL_M:
         size = 0
         for j in range(len(kept)):
-            if log_probability[j] > math.log(parameters.least_probability):
+            if log_probability[j] > math.log(constants.LEAST_PROBABILITY):
                 kept[size], log_probability[size] = kept[j], log_probability[j]
                 size += 1
         kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])

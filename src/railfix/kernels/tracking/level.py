@@ -21,7 +21,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import PAIR_LEFT, PAIR_SHARE, PRECISION_M, ROUNDS
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import (
     ALL_IN_VIEW,
     ARC,
@@ -111,12 +111,12 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
             if not source[other].running:
                 continue
             remaining, prior = information[one] - whole + information[other], source[one].prior * source[other].prior
-            if remaining <= PAIR_LEFT * whole:
+            if remaining <= constants.PAIR_LEFT * whole:
                 spent += prior
                 continue
             distance = abs(shift[one] - whole_shift + shift[other]) / remaining
             tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))  # on the far side it is less
-            if tail < PAIR_SHARE * risk:
+            if tail < constants.PAIR_SHARE * risk:
                 spent += tail
                 continue
             away[size], sigma[size], probability[size] = distance, 1.0 / math.sqrt(remaining), prior
@@ -129,7 +129,7 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
     """Write the level of the first hypothesis and its parts.
 
     Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
-    `TrackingLimits.level_doubt_s`: it has settled somewhere else, or began where the fault of its source had led the
+    `constants.LEVEL_DOUBT_S`: it has settled somewhere else, or began where the fault of its source had led the
     filter, and bounds nothing; and where pairs of satellites that nothing bounds are more probable than the risk. Along
     the line it is infinite where another place of it, further away than a bound may
     reach, is more probable than the risk; the straight distance is bounded with all branches and a map that lies aside.
@@ -140,7 +140,7 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
     start, contradicted = noise, False
     for b in range(others + ALL_IN_VIEW):
         if source[b].running:
-            contradicted = contradicted or source[b].contradicted_s > parameters.level_doubt_s
+            contradicted = contradicted or source[b].contradicted_s > constants.LEVEL_DOUBT_S
             away = abs(state.x[first + b, ARC] - state.x[0, ARC])
             if b < others + CODES_AHEAD or b > others + CODES_BEHIND:  # without half of the codes: apart by noise
                 apart = away if math.isnan(apart) else max(apart, away)
@@ -190,7 +190,7 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
         k = math.sqrt(2.0 * math.log(excess)) if excess > 1.0 else 0.0
         level = max(level, distance[a] + k * own[a])
     low, high = 0.0, math.inf
-    for _ in range(ROUNDS):
+    for _ in range(constants.ROUNDS):
         away = level / sigma
         spent = math.erfc(away / math.sqrt(2.0))
         slope = 2.0 * math.exp(-0.5 * away * away) / sigma
@@ -208,7 +208,7 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
         if not low <= level + step <= high:
             step = (0.5 * (low + high) if high < math.inf else 2.0 * level) - level
         level += step
-        if abs(step) < PRECISION_M:
+        if abs(step) < constants.PRECISION_M:
             break
     return level
 

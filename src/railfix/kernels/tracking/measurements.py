@@ -8,15 +8,8 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.adaptation import is_faulty
-from railfix.kernels.tracking.constants import (
-    BIAS_INFLATED,
-    DIRECTION_MPS,
-    FIRST_OFFSET_M2,
-    STEPPED,
-    STILL_MPS,
-    UNKNOWN_CLOCK,
-)
 from railfix.kernels.tracking.layout import (
     CLOCK_COUNT,
     CODE,
@@ -61,10 +54,10 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
 def _is_sensor_used(given: Given, t: int, column: int, state: State) -> bool:
     """Return whether a sensor has measured; a wheel without a sign needs a direction, a range to a unit a speed."""
     sensor, monitors = given.sensor[t, column], state.monitors[0]
-    used = math.isfinite(sensor.value) and (column < RANGE_COLUMN or abs(state.x[0, SPEED]) >= STILL_MPS)
+    used = math.isfinite(sensor.value) and (column < RANGE_COLUMN or abs(state.x[0, SPEED]) >= constants.STILL_MPS)
     if column == WHEEL_COLUMN and sensor.unsigned and monitors.direction == 0.0:
         for h in range(monitors.hypotheses):
-            used = used and abs(state.x[h, SPEED]) > DIRECTION_MPS
+            used = used and abs(state.x[h, SPEED]) > constants.DIRECTION_MPS
     return used
 
 
@@ -92,7 +85,7 @@ def choose_measurements(given: Given, t: int, state: State) -> Rows:
                 known = not given.fresh[t, record.satellite]
                 if known and is_faulty(state.code_bias[record.satellite]):
                     left_out[size] = True
-                    variance[size] *= BIAS_INFLATED
+                    variance[size] *= constants.BIAS_INFLATED
             size += 1
         ends[kind] = size
     for column in range(sensors):
@@ -123,10 +116,10 @@ def start_clocks(
             continue
         away, unknown = median(equations.value[own]), PHASE_CLOCK if kind == PHASE else DRIFT
         variance = P[unknown, unknown]
-        if variance > UNKNOWN_CLOCK**2 or abs(away) > STEPPED * math.sqrt(variance + 0.25):
+        if variance > constants.UNKNOWN_CLOCK**2 or abs(away) > constants.STEPPED * math.sqrt(variance + 0.25):
             x[unknown] += away
             equations.value[own] -= away
-            restart(P, unknown, UNKNOWN_CLOCK**2)
+            restart(P, unknown, constants.UNKNOWN_CLOCK**2)
             restarted[kind - 1] = True
 
 
@@ -147,7 +140,7 @@ def _start_code_clocks(
     for g in range(CLOCK_COUNT):
         begins = begins and not known[g]
     if begins:
-        P[OFFSETS + first, OFFSETS + first] = FIRST_OFFSET_M2
+        P[OFFSETS + first, OFFSETS + first] = constants.FIRST_OFFSET_M2
     settled = np.empty(CLOCK_COUNT, dtype=np.bool_)
     for g in range(CLOCK_COUNT):
         settled[g] = known[g] if some else g == first

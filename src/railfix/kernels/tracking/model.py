@@ -1,18 +1,18 @@
 r"""Process model: transition F and noise Q of all unknowns from one epoch to the next, for filter, bank and smoother.
 
-With dt the interval, v the speed and ``d = |v| dt`` the travel::
+With dt the interval, v the speed and ``D = |v| dt`` the travel::
 
-    s, v, a             Singer's model: the acceleration is correlated over `acceleration_s`
+    s, v, a             Singer's model: the acceleration is correlated over `TrackingLimits.acceleration_s`
     s', v'              arc length and speed before: copies
-    phase clock, drift  B = dt d', d = d' + walk
+    phase clock, drift  B = dt f', f = f' + walk
     code clock          new at every epoch
-    map right, up       Gauss-Markov over `map_absolute_m` of travel
-    map displacement    new at every epoch: right, up with `map_roughness_m` over `map_correlation_m`, along with
-                        `map_scale_m` a square root of a metre; the bend of the line where the place is uncertain
-    Doppler speed error Gauss-Markov over `doppler_correlation_s`
-    slow code           Gauss-Markov over `slow_code_s`
+    map right, up       Gauss-Markov over `MAP_ABSOLUTE_M` of travel
+    map displacement    new at every epoch: right, up with `MAP_ROUGHNESS_M` over `MAP_CORRELATION_M`, along with
+                        `MAP_SCALE_M` a square root of a metre; the bend of the line where the place is uncertain
+    Doppler speed error Gauss-Markov over `DOPPLER_CORRELATION_S`
+    slow code           Gauss-Markov over `SLOW_CODE_S`
     clock offsets, sensors' scales and offset    random walks
-    satellite's code error    Gauss-Markov over `code_correlation_s` and `code_correlation_m`, of variance 1
+    satellite's code error    Gauss-Markov over `CODE_CORRELATION_S` and `CODE_CORRELATION_M`, of variance 1
 
 The prediction's own standard deviation of the speed grows with every epoch without redundancy, so that reflections off
 one wall, which agree with each other, can give a wrong speed; `narrow_speed_range` follows what a train can do.
@@ -27,15 +27,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import (
-    CODE_CLOCK_SIGMA_M,
-    FORCE_WALK_MPS2,
-    HEIGHT_ROUGHNESS,
-    LEAST_STEP_M2,
-    RADAR_WALK,
-    SPEED_SIGMAS,
-    WHEEL_WALK,
-)
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import (
     ARC,
     CODE_CLOCK,
@@ -62,7 +54,7 @@ from railfix.kernels.tracking.layout import (
     Rows,
 )
 from railfix.kernels.tracking.line import write_point
-from railfix.kernels.tracking.update import add_scaled
+from railfix.kernels.tracking.update import add_row
 
 #: Least variance of displacements and clocks that begin at an epoch [m2]: it keeps them from being exactly known.
 _LEAST_M2 = 1e-8
@@ -77,7 +69,7 @@ class Transition(NamedTuple):
 
 
 @inner
-def compute_transition(speed: float, epoch: Record, parameters: Record, unknowns: int) -> Transition:
+def compute_transition(speed: float, epoch: Record, unknowns: int) -> Transition:
     """Return the transition to an epoch from a state of some speed [m/s]."""
     dt, travel = epoch.interval_s, abs(speed) * epoch.interval_s
     unknown, coefficient = np.zeros((unknowns, 3), dtype=np.intp), np.zeros((unknowns, 3))
@@ -90,10 +82,10 @@ def compute_transition(speed: float, epoch: Record, parameters: Record, unknowns
     unknown[PHASE_CLOCK, 0], coefficient[PHASE_CLOCK, 0] = DRIFT, dt
     for i in PER_EPOCH:
         coefficient[i, 0] = 0.0
-    coefficient[MAP_RIGHT, 0] = coefficient[MAP_UP, 0] = math.exp(-travel / parameters.map_absolute_m)
-    coefficient[DOPPLER_SPEED, 0] = math.exp(-dt / parameters.doppler_correlation_s)
-    coefficient[SLOW_CODE, 0] = math.exp(-dt / parameters.slow_code_s)
-    kept = math.exp(-dt / parameters.code_correlation_s - travel / parameters.code_correlation_m)
+    coefficient[MAP_RIGHT, 0] = coefficient[MAP_UP, 0] = math.exp(-travel / constants.MAP_ABSOLUTE_M)
+    coefficient[DOPPLER_SPEED, 0] = math.exp(-dt / constants.DOPPLER_CORRELATION_S)
+    coefficient[SLOW_CODE, 0] = math.exp(-dt / constants.SLOW_CODE_S)
+    kept = math.exp(-dt / constants.CODE_CORRELATION_S - travel / constants.CODE_CORRELATION_M)
     for i in range(SATELLITES, unknowns):
         coefficient[i, 0] = kept
     return Transition(unknown, coefficient)
@@ -107,7 +99,7 @@ def _multiply(F: Transition, matrix: Floats, product: Floats) -> None:
         row[:] = 0.0
         for k in range(3):
             if F.coefficient[i, k] != 0.0:
-                add_scaled(row, F.coefficient[i, k], matrix[F.unknown[i, k]])
+                add_row(row, F.coefficient[i, k], matrix, F.unknown[i, k])
         for j in range(len(row)):
             product[j, i] = row[j]
 
@@ -121,16 +113,15 @@ def predict(
     `map_log_variance` is that of `Monitors`, `wrong_map_m` a standard deviation of the map beside the line's own [m];
     `scratch`, shape (N, N), is overwritten.
     """
-    epoch, parameters = given.epoch[t], given.parameters[0]
-    speed, before = x[SPEED], x.copy()
-    F = compute_transition(speed, epoch, parameters, len(x))
+    epoch, speed, before = given.epoch[t], x[SPEED], x.copy()
+    F = compute_transition(speed, epoch, len(x))
     for i in range(len(x)):
         x[i] = 0.0
         for k in range(3):
             x[i] += F.coefficient[i, k] * before[F.unknown[i, k]]
     _multiply(F, P, scratch)  # (F P)' = P F'
     _multiply(F, scratch, P)  # (F P F')' = F P F'
-    _add_noise(epoch, given.line[0], parameters, speed, (map_log_variance, wrong_map_m), F, P)
+    _add_noise(epoch, given.line[0], given.parameters[0], speed, (map_log_variance, wrong_map_m), F, P)
 
 
 @inner
@@ -148,37 +139,37 @@ def _add_noise(
     for i in range(3):
         for j in range(3):
             P[i, j] += epoch.noise[i, j]
-    P[ARC, ARC] += LEAST_STEP_M2
-    P[SPEED, SPEED] += LEAST_STEP_M2
-    walk = parameters.clock_walk_mps**2  # of the drift; the phases' clock is its integral
+    P[ARC, ARC] += constants.LEAST_STEP_M2
+    P[SPEED, SPEED] += constants.LEAST_STEP_M2
+    walk = constants.CLOCK_WALK_MPS**2  # of the drift; the phases' clock is its integral
     P[DRIFT, DRIFT] += walk * dt
     P[PHASE_CLOCK, PHASE_CLOCK] += walk * dt**3 / 3.0 + _LEAST_CLOCK_M2
     P[PHASE_CLOCK, DRIFT] += walk * dt**2 / 2.0
     P[DRIFT, PHASE_CLOCK] += walk * dt**2 / 2.0
-    P[CODE_CLOCK, CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
+    P[CODE_CLOCK, CODE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
     # Gauss-Markov: sigma^2 (1 - kept^2)
     changed = 1.0 - F.coefficient[MAP_RIGHT, 0] ** 2
     P[MAP_RIGHT, MAP_RIGHT] += (line.sigma_plan_m**2 + wrong_map_m**2) * changed
     P[MAP_UP, MAP_UP] += (line.sigma_height_m**2 + wrong_map_m**2) * changed
     P[SLOW_CODE, SLOW_CODE] += parameters.slow_code_m**2 * (1.0 - F.coefficient[SLOW_CODE, 0] ** 2)
-    doppler_mps = parameters.doppler_error_mps + parameters.doppler_error_share * abs(speed)
+    doppler_mps = constants.DOPPLER_ERROR_MPS + constants.DOPPLER_ERROR_SHARE * abs(speed)
     P[DOPPLER_SPEED, DOPPLER_SPEED] += doppler_mps**2 * (1.0 - F.coefficient[DOPPLER_SPEED, 0] ** 2)
     for i in range(SATELLITES, len(P)):
         P[i, i] += 1.0 - F.coefficient[i, 0] ** 2
     # random walks
-    P[WHEEL, WHEEL] += WHEEL_WALK**2 * dt
-    P[FORCE_OFFSET, FORCE_OFFSET] += FORCE_WALK_MPS2**2 * dt
-    P[RADAR, RADAR] += RADAR_WALK**2 * dt
+    P[WHEEL, WHEEL] += constants.WHEEL_WALK**2 * dt
+    P[FORCE_OFFSET, FORCE_OFFSET] += constants.FORCE_WALK_MPS2**2 * dt
+    P[RADAR, RADAR] += constants.RADAR_WALK**2 * dt
     for i in range(OFFSETS, SATELLITES):
-        P[i, i] += parameters.offset_walk_m**2 * dt
+        P[i, i] += constants.OFFSET_WALK_M**2 * dt
     # displacement of the map
-    changed = 2.0 * (1.0 - math.exp(-travel / parameters.map_correlation_m))
-    across = max(parameters.map_roughness_m, line.sigma_plan_m)
-    above = max(parameters.map_roughness_m, HEIGHT_ROUGHNESS * line.sigma_height_m)
+    changed = 2.0 * (1.0 - math.exp(-travel / constants.MAP_CORRELATION_M))
+    across = max(constants.MAP_ROUGHNESS_M, line.sigma_plan_m)
+    above = max(constants.MAP_ROUGHNESS_M, constants.HEIGHT_ROUGHNESS * line.sigma_height_m)
     P[STEP_RIGHT, STEP_RIGHT] = across**2 * changed + _LEAST_M2
     P[STEP_UP, STEP_UP] = above**2 * changed + _LEAST_M2
     # The distance on the map is the distance run less the error of the length: codes see it, phases do not.
-    length = parameters.map_scale_m**2 * math.exp(map_log_variance) * travel + parameters.phase_walk_m**2 * dt
+    length = constants.MAP_SCALE_M**2 * math.exp(map_log_variance) * travel + constants.PHASE_WALK_M**2 * dt
     P[ARC, ARC] += length
     P[MAP_LENGTH_ERROR, MAP_LENGTH_ERROR] = length + _LEAST_M2
     P[ARC, MAP_LENGTH_ERROR] = P[MAP_LENGTH_ERROR, ARC] = -length
@@ -194,7 +185,7 @@ def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
     write_point(given.vertex, given.line[0], at[0], point, axes)
     write_point(given.vertex, given.line[0], at[1], point, before)
     length = P[MAP_LENGTH_ERROR, MAP_LENGTH_ERROR] - _LEAST_M2
-    position_variance = min(P[ARC, ARC] - length, given.parameters[0].start_sigma_m ** 2)
+    position_variance = min(P[ARC, ARC] - length, constants.START_SIGMA_M**2)
     right = up = 0.0
     for c in range(3):
         change = axes[0, c] - before[0, c]
@@ -229,7 +220,7 @@ def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: 
             sensed = rows.sensor.stop > rows.sensor.start
             if not 0 < satellites < parameters.trusted_satellites or sensed:
                 low, high = -math.inf, math.inf
-            reach = SPEED_SIGMAS * sigma
+            reach = constants.SPEED_SIGMAS * sigma
             if speed + reach < low or speed - reach > high:
                 change = parameters.level_acceleration_mps2 * dt
                 monitors.least_speed_mps, monitors.most_speed_mps = low - change, high + change

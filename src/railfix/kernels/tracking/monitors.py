@@ -11,26 +11,7 @@ import math
 import numpy as np
 
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import (
-    ACROSS_DOUBT,
-    ACROSS_LOST,
-    ALLOWED_SQUARE,
-    BESIDE_M,
-    BESIDE_SIGMAS,
-    DIRECTION_SHARE,
-    DRIFT_LOG,
-    DRIFT_SIGMAS,
-    LARGEST_SQUARE,
-    MOTION_FIT,
-    REACH_M,
-    REACH_SIGMAS,
-    STEP_HOLD_S,
-    STEP_S,
-    STEP_SIGMAS,
-    VELOCITY_FLOOR_MPS,
-    YOUNG,
-    YOUNG_HOLD_S,
-)
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import ACCELERATION, ARC, MAP_RIGHT, SPEED, WRONG_MAP, Given, Record, State
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.subfilters import find_others
@@ -46,13 +27,13 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
     velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance
     if not math.isfinite(velocity[0]):
         return math.nan
-    reach = max(REACH_M, REACH_SIGMAS * math.sqrt(P[ARC, ARC]))
+    reach = max(constants.REACH_M, constants.REACH_SIGMAS * math.sqrt(P[ARC, ARC]))
     speed = x[SPEED] - epoch.velocity_age_s * x[ACCELERATION]
     square, least, point, axes = 0.0, math.inf, np.empty(3), np.empty((3, 3))
     for c in range(3):
         square += velocity[c] * velocity[c]
-    direction = max(DIRECTION_SHARE, math.sqrt(2.0) * line.sigma_plan_m / given.parameters[0].map_correlation_m)
-    floor = VELOCITY_FLOOR_MPS**2 + direction**2 * square
+    direction = max(constants.DIRECTION_SHARE, math.sqrt(2.0) * line.sigma_plan_m / constants.MAP_CORRELATION_M)
+    floor = constants.VELOCITY_FLOOR_MPS**2 + direction**2 * square
     for turn in (-1.0, 0.0, 1.0):
         write_point(given.vertex, line, x[ARC] - epoch.velocity_age_s * speed + turn * reach, point, axes)
         total = 0.0
@@ -70,9 +51,7 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
 
 
 @inner
-def update_monitors(
-    parameters: Record, state: State, square: float, shift: float, beyond_m: float, dt: float, code_s: float
-) -> None:
+def update_monitors(state: State, square: float, shift: float, beyond_m: float, dt: float, code_s: float) -> None:
     """Take the contradictions of an epoch into the state.
 
     `square` is `compute_contradiction` of the hypothesis reported, `shift` the one that its codes imply, `beyond_m` how
@@ -80,51 +59,51 @@ def update_monitors(
     """
     monitors = state.monitors[0]
     if not math.isnan(square):
-        gained = (min(square, LARGEST_SQUARE) - ALLOWED_SQUARE) * min(dt, 1.0)
+        gained = (min(square, constants.LARGEST_SQUARE) - constants.ALLOWED_SQUARE) * min(dt, 1.0)
         monitors.across = max(monitors.across + gained, 0.0)
-    if beyond_m > 0.0 and monitors.weak_motion_s >= parameters.end_doubt_s:
-        monitors.across = ACROSS_LOST
-    if code_s > 0.0 and abs(shift) > STEP_SIGMAS:
+    if beyond_m > 0.0 and monitors.weak_motion_s >= constants.BESIDE_AFTER_S:
+        monitors.across = constants.ACROSS_LOST
+    if code_s > 0.0 and abs(shift) > constants.STEP_SIGMAS:
         monitors.step_s += code_s
     elif code_s > 0.0:
         monitors.step_s = max(monitors.step_s - 0.5 * code_s, 0.0)
     hold = 0.0
-    if _is_doubtful(parameters, monitors) or beyond_m > 0.0:
-        hold = parameters.level_hold_s
-    if monitors.branch_s < parameters.level_start_s:
+    if _is_doubtful(monitors) or beyond_m > 0.0:
+        hold = constants.LEVEL_HOLD_S
+    if monitors.branch_s < constants.LEVEL_START_S:
         largest = -math.inf
         for h in range(monitors.hypotheses):
             largest = max(largest, state.hypothesis[h].log_probability)
-        if largest < math.log(YOUNG):
-            hold = YOUNG_HOLD_S
-    drift = monitors.code_shift**2 > DRIFT_SIGMAS**2 * monitors.code_shift_variance
-    if drift or monitors.map_log_variance > DRIFT_LOG or _is_contradicted_by_subfilter(parameters, state):
-        hold = parameters.level_hold_s
-    if monitors.step_s >= STEP_S:
-        hold = STEP_HOLD_S
+        if largest < math.log(constants.YOUNG):
+            hold = constants.YOUNG_HOLD_S
+    drift = monitors.code_shift**2 > constants.DRIFT_SIGMAS**2 * monitors.code_shift_variance
+    if drift or monitors.map_log_variance > constants.DRIFT_LOG or _is_contradicted_by_subfilter(state):
+        hold = constants.LEVEL_HOLD_S
+    if monitors.step_s >= constants.STEP_S:
+        hold = constants.STEP_HOLD_S
     monitors.level_hold_s = max(monitors.level_hold_s - dt, hold)
 
 
 @inner
-def _is_doubtful(parameters: Record, monitors: Record) -> bool:
+def _is_doubtful(monitors: Record) -> bool:
     """Return whether codes, motion or the velocity across the line contradict the place."""
     return bool(
-        monitors.weak_code_s > parameters.level_doubt_code_s
-        or monitors.weak_motion_s > parameters.level_doubt_s
-        or monitors.motion_misfit > 1.0 - MOTION_FIT
-        or monitors.across > ACROSS_DOUBT
+        monitors.weak_code_s > constants.LEVEL_DOUBT_CODE_S
+        or monitors.weak_motion_s > constants.LEVEL_DOUBT_S
+        or monitors.motion_misfit > 1.0 - constants.MOTION_FIT
+        or monitors.across > constants.ACROSS_DOUBT
     )
 
 
 @inner
-def _is_contradicted_by_subfilter(parameters: Record, state: State) -> bool:
+def _is_contradicted_by_subfilter(state: State) -> bool:
     """Return whether a sub-filter is contradicted by its measurements, or that of the map lies aside."""
     for b in range(len(state.source)):
-        if state.source[b].running and state.source[b].contradicted_s > parameters.level_doubt_s:
+        if state.source[b].running and state.source[b].contradicted_s > constants.LEVEL_DOUBT_S:
             return True
     wrong = find_others(state) + WRONG_MAP
     if wrong < 0 or not state.source[wrong].running:
         return False
     row = len(state.hypothesis) + wrong
-    reach = BESIDE_SIGMAS * math.sqrt(state.P[row, MAP_RIGHT, MAP_RIGHT])
-    return bool(abs(state.x[row, MAP_RIGHT]) > max(BESIDE_M, reach))
+    reach = constants.BESIDE_SIGMAS * math.sqrt(state.P[row, MAP_RIGHT, MAP_RIGHT])
+    return bool(abs(state.x[row, MAP_RIGHT]) > max(constants.BESIDE_M, reach))

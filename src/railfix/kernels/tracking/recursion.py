@@ -12,30 +12,8 @@ import math
 import numpy as np
 
 from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
-from railfix.kernels.tracking.constants import (
-    ACROSS_DOUBT,
-    ACROSS_LOST,
-    ACROSS_TAKEN,
-    BESIDE_AFTER_S,
-    COASTING,
-    DIRECTION_MPS,
-    DOUBTFUL,
-    EXPIRED,
-    INFLATED_M,
-    INFLATED_SIGMAS,
-    LEAST_RISE,
-    LOST,
-    MOTION_FIT,
-    MOVED_M,
-    RELINEARISED,
-    SCALE_BOUND,
-    SEVERAL_BRANCHES,
-    TAKEOVER,
-    TAKEOVER_AFTER_S,
-    TRACKING,
-    WEAK_FIT,
-)
 from railfix.kernels.tracking.equations import linearise, new_equations
 from railfix.kernels.tracking.evidence import compute_evidence, refit_inflated_prior
 from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
@@ -87,15 +65,15 @@ from railfix.kernels.tracking.update import (
 def _needs_search(given: Given, t: int, state: State) -> bool:
     """Return whether places have to be sought before an epoch: the track is lost or in doubt, or after a gap."""
     epoch, parameters, monitors = given.epoch[t], given.parameters[0], state.monitors[0]
-    lost = monitors.weak_motion_s >= parameters.lost_motion_s or monitors.weak_code_s >= parameters.lost_code_s
-    lost = lost or monitors.across >= ACROSS_LOST
-    doubtful = monitors.weak_motion_s >= BESIDE_AFTER_S or monitors.across >= ACROSS_DOUBT
-    doubtful = doubtful or monitors.motion_misfit > 1.0 - MOTION_FIT
+    lost = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
+    lost = lost or monitors.across >= constants.ACROSS_LOST
+    doubtful = monitors.weak_motion_s >= constants.BESIDE_AFTER_S or monitors.across >= constants.ACROSS_DOUBT
+    doubtful = doubtful or monitors.motion_misfit > 1.0 - constants.MOTION_FIT
     doubtful = doubtful and monitors.measured_s > epoch.time_s - 1.5 * epoch.interval_s
     coded = False
     for k in range(given.channel.shape[1]):
         coded = coded or given.channel[t, k].has[CODE]
-    gap = coded and epoch.time_s - monitors.measured_s > parameters.gap_s
+    gap = coded and epoch.time_s - monitors.measured_s > constants.GAP_S
     return bool(lost or gap or (doubtful and monitors.hypotheses <= parameters.most_hypotheses // 2))
 
 
@@ -154,7 +132,7 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
     The equations are made again about the corrected place while it moves by more than `MOVED_M`.
     """
     parameters, count = given.parameters[0], state.monitors[0].hypotheses
-    degrees, rounds = (parameters.degrees_of_freedom, parameters.late_degrees_of_freedom), parameters.passes
+    degrees, rounds = (parameters.degrees_of_freedom, parameters.late_degrees_of_freedom), constants.PASSES
     corrections = [_start_correction(given, t, state, rows, h) for h in range(count)]
     for one in corrections:
         expected = one.covariance, one.without_clock
@@ -165,15 +143,15 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
     for one in corrections:
         reweight(rows, one.equations, one.covariance, rows.variance, degrees, rounds, one.fit)
         code, motion = mean_weights(rows, rows.variance, one.fit.weight)
-        doubtful = doubtful or code < WEAK_FIT or motion < WEAK_FIT
+        doubtful = doubtful or code < constants.WEAK_FIT or motion < constants.WEAK_FIT
     furthest = 0.0
     for one in corrections:
         if doubtful:
             refit_inflated_prior(rows, degrees, rounds, one)
         correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
         furthest = max(furthest, abs(one.x[ARC] - one.x_prior[ARC]))
-    for _ in range(RELINEARISED):
-        if furthest < MOVED_M:
+    for _ in range(constants.RELINEARISED):
+        if furthest < constants.MOVED_M:
             break
         furthest = 0.0
         for one in corrections:
@@ -189,7 +167,7 @@ def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction
     linearise(given, t, rows, one.x_prior, (arc, one.x[PREVIOUS_ARC]), state.monitors[0].direction, one.equations)
     covariance, without_clock = predict_quantities(one.P_prior, one.equations)
     one.covariance[:], one.without_clock[:] = covariance, without_clock
-    reweight(rows, one.equations, covariance, rows.variance, degrees, parameters.passes, one.fit)
+    reweight(rows, one.equations, covariance, rows.variance, degrees, constants.PASSES, one.fit)
     one.x[:], one.P[:] = one.x_prior, one.P_prior
     correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
     return float(abs(one.x[ARC] - arc))
@@ -203,7 +181,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
     motion, code, arc = np.empty(count), np.empty(count), np.empty(count)
     points, axes = np.empty((count, 3)), np.empty((3, 3))
     for h in range(count):
-        motion[h], code[h] = compute_evidence(rows, degrees, parameters.passes, corrections[h])
+        motion[h], code[h] = compute_evidence(rows, degrees, constants.PASSES, corrections[h])
         arc[h] = corrections[h].x[ARC]
         write_point(given.vertex, given.line[0], arc[h], points[h], axes)
     reweigh(parameters, state, motion, code, points, arc, given.epoch[t].interval_s)
@@ -212,7 +190,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
 @inner
 def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float) -> int:
     """Take over corrected hypotheses, adapt and monitor, and correct the sub-filters; return the leading hypothesis."""
-    monitors, parameters = state.monitors[0], given.parameters[0]
+    monitors = state.monitors[0]
     for h, one in enumerate(corrections):
         state.x[h], state.P[h] = one.x, one.P
     monitors.measured_s = given.epoch[t].time_s
@@ -226,11 +204,11 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
     excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leads)
-    if excluded and abs(shift) < INFLATED_SIGMAS:  # its codes have led the place so far
-        state.P[:, ARC, ARC] += INFLATED_M**2
+    if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have led the place so far
+        state.P[:, ARC, ARC] += constants.INFLATED_M**2
     square = compute_contradiction(given, t, state, leads)
     beyond_m = excess_beyond_end(given.line[0], best.x[ARC], math.sqrt(best.P[ARC, ARC]))
-    update_monitors(parameters, state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
+    update_monitors(state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
     return leads
 
 
@@ -282,20 +260,20 @@ def _finish(given: Given, t: int, leads: int, state: State, trace: Trace) -> Non
     """Count direction, time and distance on the branches, and prune the hypotheses."""
     monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
     speed = state.x[leads, SPEED]
-    if abs(speed) > DIRECTION_MPS:
+    if abs(speed) > constants.DIRECTION_MPS:
         monitors.direction = math.copysign(1.0, speed)
     monitors.branch_s += dt
     monitors.branch_m += abs(speed) * dt
     for h in range(monitors.hypotheses):
         one = state.hypothesis[h]
-        one.log_least = min(one.log_least + LEAST_RISE * dt, one.log_probability)
+        one.log_least = min(one.log_least + constants.LEAST_RISE * dt, one.log_probability)
     if monitors.hypotheses > 1:
         kept = prune(parameters, state)
         if len(trace.kept):
             trace.kept[: len(kept)] = kept
-    if monitors.branch_s > TAKEOVER_AFTER_S and state.hypothesis[0].log_least < TAKEOVER:
-        monitors.across = ACROSS_TAKEN
-        monitors.level_hold_s = max(monitors.level_hold_s, parameters.level_hold_s)
+    if monitors.branch_s > constants.TAKEOVER_AFTER_S and state.hypothesis[0].log_least < constants.TAKEOVER:
+        monitors.across = constants.ACROSS_TAKEN
+        monitors.level_hold_s = max(monitors.level_hold_s, constants.LEVEL_HOLD_S)
 
 
 @inner
@@ -305,8 +283,8 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ARC, ARC])
     result.hypotheses, result.probability = monitors.hypotheses, math.exp(state.hypothesis[0].log_probability)
-    if not sigma <= parameters.expired_sigma_m:
-        result.status = EXPIRED
+    if not sigma <= constants.EXPIRED_SIGMA_M:
+        result.status = constants.EXPIRED
         return
     branches, far = find_branches(given, state)
     spread = sigma * sigma
@@ -319,7 +297,7 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
     result.wheel_scale, result.force_offset_mps2, result.radar_scale = x[WHEEL], x[FORCE_OFFSET], x[RADAR]
     result.map_scale = math.exp(0.5 * monitors.map_log_variance)
     if far > parameters.level_risk:
-        monitors.ambiguity_hold_s = parameters.level_hold_s
+        monitors.ambiguity_hold_s = constants.LEVEL_HOLD_S
     else:
         monitors.ambiguity_hold_s = max(monitors.ambiguity_hold_s - given.epoch[t].interval_s, 0.0)
     if len(state.source):
@@ -328,12 +306,12 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
             result.ground_level_m = math.inf
         if monitors.level_hold_s > 0.0 or monitors.ambiguity_hold_s > 0.0:
             result.level_m = math.inf
-        result.amount_m = max(result.level_m, SCALE_BOUND * monitors.distance_since_code_m)
+        result.amount_m = max(result.level_m, constants.SCALE_BOUND * monitors.distance_since_code_m)
         result.level_speed_mps = bound_speed(parameters, state, result.speed_sigma_mps)
-    if status != LOST and monitors.ambiguity_hold_s > 0.0:
-        status = SEVERAL_BRANCHES
-    elif status != LOST and monitors.level_hold_s > 0.0:
-        status = DOUBTFUL
+    if status != constants.LOST and monitors.ambiguity_hold_s > 0.0:
+        status = constants.SEVERAL_BRANCHES
+    elif status != constants.LOST and monitors.level_hold_s > 0.0:
+        status = constants.DOUBTFUL
     result.status = status
 
 
@@ -366,8 +344,8 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
     if believed and rows.code.stop > 0:
         monitors.distance_since_code_m = 0.0
     _finish(given, t, leads, state, trace)
-    status = TRACKING if believed else COASTING
-    _write_place(given, t, LOST if lost else status, state, results)
+    status = constants.TRACKING if believed else constants.COASTING
+    _write_place(given, t, constants.LOST if lost else status, state, results)
 
 
 @kernel

@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Masks
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import AHEAD, JOINED
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.equations import linearise, new_equations, shift_sensors
 from railfix.kernels.tracking.layout import (
     ALL_DOPPLERS,
@@ -109,7 +109,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
         satellite = b < satellites
         if leads or (satellite and not given.within_memory[t, b]):
             one.running = False
-        if one.running and one.contradicted_s >= given.parameters[0].lost_motion_s:
+        if one.running and one.contradicted_s >= constants.LOST_MOTION_S:
             one.running, absorbed[b] = False, True
         x, P = state.x[first + b], state.P[first + b]
         fresh = satellite and before and needed[b] and not one.running and not absorbed[b] and one.prior > 0.0
@@ -128,7 +128,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
             _begin(given, state, b, before and not absorbed[b], best)
         else:
             continue
-        variance = _downdate(given, t, rows, state, b, best.equations)
+        variance = _exclude_source(given, t, rows, state, b, best.equations)
         _correct(given, t, rows, variance, best, (x, P), equations, found)
         _update_contradiction(given, t, rows, state, b, variance, found)
 
@@ -137,8 +137,8 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
 def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
     """Return whether a sub-filter has become the filter: place and sigma within `JOINED`."""
     sigma = math.sqrt(P[ARC, ARC])
-    near = abs(x[ARC] - best.x_prior[ARC]) < JOINED * sigma
-    return near and sigma < (1.0 + JOINED) * math.sqrt(best.P_prior[ARC, ARC])
+    near = abs(x[ARC] - best.x_prior[ARC]) < constants.JOINED * sigma
+    return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ARC, ARC])
 
 
 @inner
@@ -187,7 +187,7 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
 
 
 @inner
-def _downdate(given: Given, t: int, rows: Rows, state: State, b: int, equations: Equations) -> Floats:
+def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equations: Equations) -> Floats:
     """Return the variances of the measurements for a sub-filter, infinite for those of its source, shape (M,).
 
     Nothing is taken out of the Gaussian: a measurement of infinite variance is not used. `equations` are those of the
@@ -210,7 +210,7 @@ def _downdate(given: Given, t: int, rows: Rows, state: State, b: int, equations:
     elif b in (others + CODES_AHEAD, others + CODES_BEHIND):
         side = 1.0 if b == others + CODES_AHEAD else -1.0
         for j in range(rows.code.start, rows.code.stop):
-            if side * equations.coefficient[j, 0] < -AHEAD:  # moving ahead shortens its range
+            if side * equations.coefficient[j, 0] < -constants.AHEAD:  # moving ahead shortens its range
                 variance[j] = math.inf
     return variance
 
@@ -241,7 +241,7 @@ def _correct(
     covariance, without_clock = predict_quantities(P, equations)
     degrees = given.parameters[0].degrees_of_freedom, given.parameters[0].late_degrees_of_freedom
     write_first_weights(rows, equations, (covariance, without_clock), variance, degrees, found.weight)
-    for _ in range(given.parameters[0].level_passes - 1):
+    for _ in range(constants.LEVEL_PASSES - 1):
         fit(rows, equations, covariance, variance, found)
         write_weights(rows, variance, degrees, found)
     correct_state(rows, equations, variance, found.weight, x, P)
@@ -250,11 +250,11 @@ def _correct(
 @inner
 def _update_contradiction(given: Given, t: int, rows: Rows, state: State, b: int, variance: Floats, found: Fit) -> None:
     """Count how long the measurements of a sub-filter have contradicted it by low weights."""
-    one, parameters = state.source[b], given.parameters[0]
+    one = state.source[b]
     code, motion = mean_weights(rows, variance, found.weight)
-    if code < parameters.lost_code_weight or motion < parameters.lost_motion_weight:
+    if code < constants.LOST_CODE_WEIGHT or motion < constants.LOST_MOTION_WEIGHT:
         one.contradicted_s += given.epoch[t].interval_s
     elif rows.code.stop > 0:
         one.contradicted_s = 0.0
     if not math.isfinite(state.x[len(state.hypothesis) + b, ARC]):  # it restarts, and bounds nothing before
-        one.contradicted_s = parameters.lost_motion_s + parameters.level_doubt_s
+        one.contradicted_s = constants.LOST_MOTION_S + constants.LEVEL_DOUBT_S

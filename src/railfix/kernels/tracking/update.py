@@ -3,7 +3,7 @@ r"""Correction of Gaussians by the measurements of an epoch, one after the other
 A Gaussian x ~ N(x, P) sees an epoch through Q quantities ``q = H x``: each code, six of the motion that all phases and
 Dopplers share, each sensor. A code or a sensor measures its quantity, a phase or a Doppler a sum of the six::
 
-    code, sensor      v_j = q_j + e_j                phase, Doppler    v_j = design_j q_motion + e_j
+    code, sensor      y_j = q_j + e_j                phase, Doppler    y_j = design_j q_motion + e_j
 
 with e_j ~ N(0, r_j / w_j). The weights w of Student's t follow from the residuals and the weights in turn: rounds of
 reweighting. Three things keep that cheap without an inverse of any matrix:
@@ -24,7 +24,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.constants import LEAST_PIVOT
+from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import CLOCK_TERM, M_CLOCK, M_DRIFT, MOTION, TERMS, Rows
 
 
@@ -36,7 +36,7 @@ class Equations(NamedTuple):
     coefficient: Floats
     #: Coefficients of phases and Dopplers over the six quantities of the motion; 0 for others; shape (M, MOTION).
     design: Floats
-    value: Floats  #: Innovations v [m, m/s, units of the sensors]; shape (M,).
+    value: Floats  #: Innovations y [m, m/s, units of the sensors]; shape (M,).
 
 
 class Fit(NamedTuple):
@@ -76,15 +76,15 @@ def new_fit(rows: Rows) -> Fit:
 
 
 @inner
-def add_scaled(target: Floats, factor: float, source: Floats) -> None:
-    """Add a multiple of a row to another."""
+def add_row(target: Floats, factor: float, matrix: Floats, i: int) -> None:
+    """Add a multiple of row i of a matrix to a vector; a view of the row would cost more than the sum."""
     for a in range(len(target)):
-        target[a] += factor * source[a]
+        target[a] += factor * matrix[i, a]
 
 
 @inner
 def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float, gain: Floats) -> None:
-    """Correct a Gaussian by one measurement: ``K = g / s``, ``x + K d``, ``P - K g'``.
+    """Correct a Gaussian by one measurement: ``K = g / S``, ``x + K y``, ``P - K g'``.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
     g : ndarray, shape (N,)
         Covariance P h of the unknowns with the measurement.
     innovation, variance : float
-        d, and ``s = h' P h + r``.
+        y, and ``S = h' P h + r``.
     gain : ndarray, shape (N,)
         Gets K.
     """
@@ -101,8 +101,10 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
         gain[a] = g[a] / variance
         x[a] += gain[a] * innovation
     for a in range(len(g)):
-        if gain[a] != 0.0:
-            add_scaled(P[a], -gain[a], g)
+        k = gain[a]
+        if k != 0.0:
+            for b in range(len(g)):
+                P[a, b] -= k * g[b]
 
 
 @inner
@@ -115,13 +117,13 @@ def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]
         g[:] = 0.0
         for k in range(CLOCK_TERM):
             if coefficient[j, k] != 0.0:
-                add_scaled(g, coefficient[j, k], P[unknown[j, k]])
+                add_row(g, coefficient[j, k], P, unknown[j, k])
         total = 0.0
         for k in range(CLOCK_TERM):
             total += coefficient[j, k] * g[unknown[j, k]]
         without_clock[j] = total
         if coefficient[j, CLOCK_TERM] != 0.0:
-            add_scaled(g, coefficient[j, CLOCK_TERM], P[unknown[j, CLOCK_TERM]])
+            add_row(g, coefficient[j, CLOCK_TERM], P, unknown[j, CLOCK_TERM])
         for i in range(j + 1):
             total = 0.0
             for k in range(TERMS):
@@ -151,7 +153,7 @@ def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats,
     for a in range(MOTION):
         diagonal[a] = T[a, a]
     for a in range(MOTION):
-        if T[a, a] <= LEAST_PIVOT * diagonal[a]:
+        if T[a, a] <= constants.LEAST_PIVOT * diagonal[a]:
             z[a], T[a] = 0.0, 0.0
             continue
         scale = 1.0 / math.sqrt(T[a, a])
@@ -226,7 +228,7 @@ def write_first_weights(
 def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
     """Correct the quantities, ``N(0, covariance)``, at the weights of `found`; write the rest of it."""
     size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
-    y, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
+    mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
     T, z = np.empty((MOTION, MOTION)), np.empty(MOTION)
     compress(rows, equations, variance, weight, T, z)
     log_determinant = square = 0.0
@@ -235,44 +237,44 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
             r = q - codes
             if T[r, r] == 0.0:
                 continue
-            g[:], d, s, noise = 0.0, z[r], 1.0, 1.0
+            g[:], y, S, noise = 0.0, z[r], 1.0, 1.0
             for c in range(r, MOTION):
-                add_scaled(g, T[r, c], C[codes + c])
-                d -= T[r, c] * y[codes + c]
+                add_row(g, T[r, c], C, codes + c)
+                y -= T[r, c] * mean[codes + c]
             for c in range(r, MOTION):
-                s += T[r, c] * g[codes + c]
+                S += T[r, c] * g[codes + c]
         else:
             j = q if q < codes else q - codes - MOTION + rows.sensor.start
             if variance[j] == math.inf:
                 continue
             g[:], noise = C[q], variance[j] / weight[j]
-            d, s = value[j] - y[q], g[q] + noise
-        correct(y, C, g, d, s, gain)
-        log_determinant += math.log(s / noise)
-        square += d * d / s
+            y, S = value[j] - mean[q], g[q] + noise
+        correct(mean, C, g, y, S, gain)
+        log_determinant += math.log(S / noise)
+        square += y * y / S
     for r in range(MOTION):
         rest = z[r]
         for c in range(r, MOTION):
-            rest -= T[r, c] * y[codes + c]
+            rest -= T[r, c] * mean[codes + c]
         square -= rest * rest
-    square -= _write_residuals(rows, equations, y, C, variance, found)
+    square -= _write_residuals(rows, equations, mean, C, variance, found)
     found.summary[0], found.summary[1] = log_determinant, square
 
 
 @inner
-def _write_residuals(rows: Rows, equations: Equations, y: Floats, C: Floats, variance: Floats, found: Fit) -> float:
+def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, variance: Floats, found: Fit) -> float:
     """Write residuals and variances of the fitted quantities; return the weighted square sum of codes and sensors."""
     design, value, codes, square = equations.design, equations.value, rows.code.stop, 0.0
     for j in range(rows.sensor.stop):
         residual, fitted = value[j], 0.0
         if codes <= j < rows.sensor.start:
             for a in range(MOTION):
-                residual -= design[j, a] * y[codes + a]
+                residual -= design[j, a] * mean[codes + a]
                 for b in range(MOTION):
                     fitted += design[j, a] * design[j, b] * C[codes + a, codes + b]
         else:
             q = j if j < codes else j - rows.sensor.start + codes + MOTION
-            residual, fitted = residual - y[q], C[q, q]
+            residual, fitted = residual - mean[q], C[q, q]
             if variance[j] < math.inf:
                 square += found.weight[j] * residual * residual / variance[j]
         found.residual[j], found.fitted[j] = residual, fitted
@@ -321,18 +323,18 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
             r = q - codes
             if T[r, r] == 0.0:
                 continue
-            d, s = z[r], 1.0
+            y, S = z[r], 1.0
             for c in range(r, MOTION):
-                d -= _add_quantity(equations, codes + c, T[r, c], P, change, g)
+                y -= _add_quantity(equations, codes + c, T[r, c], P, change, g)
             for c in range(r, MOTION):
-                s += T[r, c] * _project(equations, codes + c, g)
+                S += T[r, c] * _project(equations, codes + c, g)
         else:
             j = q if q < codes else q - codes - MOTION + rows.sensor.start
             if variance[j] == math.inf:
                 continue
-            d = value[j] - _add_quantity(equations, q, 1.0, P, change, g)
-            s = variance[j] / weight[j] + _project(equations, q, g)
-        correct(change, P, g, d, s, gain)
+            y = value[j] - _add_quantity(equations, q, 1.0, P, change, g)
+            S = variance[j] / weight[j] + _project(equations, q, g)
+        correct(change, P, g, y, S, gain)
     for a in range(len(x)):
         x[a] += change[a]
 
@@ -354,7 +356,7 @@ def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, change
         f = factor * equations.coefficient[q, k]
         if f != 0.0:
             total += f * change[equations.unknown[q, k]]
-            add_scaled(g, f, P[equations.unknown[q, k]])
+            add_row(g, f, P, equations.unknown[q, k])
     return total
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.range_arrays import ClockTies, Ranges
+from railfix.positioning.range_arrays import InterSystemBiases, Ranges
 from railfix.track.trajectory import Trajectory
 
 PhaseClocks = Literal["own", "shared"]
@@ -155,7 +155,7 @@ def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
     return np.where(weight > 0, used - mean[:, None], 0.0), mean
 
 
-def _ties(ties: ClockTies) -> tuple[Floats, Floats]:
+def _ties(ties: InterSystemBiases) -> tuple[Floats, Floats]:
     """Return matrix and right-hand side of the known clock offsets, a common clock eliminated."""
     mass = 1.0 / np.maximum(ties.sigma_m, _LEAST_TIE_M) ** 2
     share = mass / mass.sum(axis=1, keepdims=True)

@@ -16,6 +16,7 @@ from railfix.report.plots.errors import (
     error_over_chainage,
     error_over_time,
     error_ranges,
+    errors_of_runs,
     levels_over_chainage,
     levels_over_time,
     stanford,
@@ -35,6 +36,7 @@ plot_plan: Final = plotter(plan)
 plot_error_over_time: Final = plotter(error_over_time)
 plot_error_over_chainage: Final = plotter(error_over_chainage)
 plot_error_ranges: Final = plotter(error_ranges)
+plot_errors_of_runs: Final = plotter(errors_of_runs)
 plot_stanford: Final = plotter(stanford)
 plot_levels_over_time: Final = plotter(levels_over_time)
 plot_levels_over_chainage: Final = plotter(levels_over_chainage)
@@ -58,6 +60,7 @@ __all__ = [
     "error_over_chainage",
     "error_over_time",
     "error_ranges",
+    "errors_of_runs",
     "interval_distribution",
     "interval_over_chainage",
     "levels_over_chainage",
@@ -67,6 +70,7 @@ __all__ = [
     "plot_error_over_chainage",
     "plot_error_over_time",
     "plot_error_ranges",
+    "plot_errors_of_runs",
     "plot_interval_distribution",
     "plot_interval_over_chainage",
     "plot_levels_over_chainage",

@@ -199,6 +199,28 @@ def error_ranges(runs: Mapping[str, pl.DataFrame]) -> Chart:
     )
 
 
+def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
+    """Return the errors of several runs over the chainage of their references, in one chart (P1 figure 8)."""
+    layers, shown, total, every = [], 0, 0, [np.empty(0)]
+    for number, (run, errors) in enumerate(runs.items()):
+        x, y = floats(errors, "chainage_m"), good_errors(errors, "error_m")
+        rows = spread(x, y)
+        shown, total = shown + len(rows), total + int(np.isfinite(x + y).sum())
+        every.append(y)
+        colour = CYCLE[number % len(CYCLE)]
+        epoch = since(errors, find_start(errors))
+        layers.append(Points(label=run, colour=colour, shape="dot", x=x[rows], y=y[rows], epoch_s=epoch[rows]))
+    return Chart(
+        name="errors-of-runs",
+        title="Errors of all runs over chainage",
+        caption=f"Single epochs. {_SIGN}{counts_sentence(shown, total)}",
+        x_label="chainage of the reference [m]",
+        y_label=_ERROR_LABEL,
+        layers=tuple(layers),
+        **error_scale(np.concatenate(every)),
+    )
+
+
 #: Parts of the level, and the level itself.
 _PARTS: Final = (
     ("fault-free part", "protection_fault_free_m"),

@@ -1,0 +1,160 @@
+"""Signs and units of Dopplers and carrier phases, by the range rates of the satellites.
+
+A satellite's own motion changes its range by up to 800 m/s, much more than a train's or a receiver clock's. The factor
+by which a constellation's Dopplers, or changes of its phases, follow it is 1; it is -1 with the wrong sign, and the
+wavelength where metres stand for cycles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, copy_with, masked_median
+from railfix.core.channel_state import join_channels
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import Observations
+from railfix.ranges.corrected import CorrectedRanges
+
+#: Least range rate of a satellite, against the median one of its constellation, that a factor is taken from [m/s].
+_LEAST_RATE_MPS: Final = 100.0
+#: Satellites that give a factor, and how far most of their factors are from the median one.
+_LEAST_SATELLITES: Final = 3
+_SPREAD: Final = 0.3
+#: Factors up to so far from 1 are right: a train's own speed is in them.
+_RIGHT: Final = 0.5
+#: Phases of epochs farther apart are not compared [s].
+_LONGEST_S: Final = 35.0
+_KINDS: Final = ("Dopplers", "phases")
+_UNITS: Final = ("Hz", "cycles")
+_NAMES: Final = {"G": "GPS", "J": "QZSS", "E": "Galileo", "C": "BeiDou", "R": "GLONASS"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservableState:
+    """State of the checks of one antenna after a chunk."""
+
+    #: Last factors of Dopplers and of phases, NaN for none so far, shape (2, L), by letter of the constellation, ""
+    #: for all together, shape (L,).
+    factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
+    letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
+    #: Phases of the last epoch and range rates of the satellites, shape (K,).
+    channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U6"))
+    phase_m: Floats = field(default_factory=lambda: np.zeros(0))
+    rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+
+
+class CheckedObservables(NamedTuple):
+    """Ranges without Dopplers and phases of the wrong sign or unit."""
+
+    corrected: CorrectedRanges
+    notes: tuple[str, ...]  #: One sentence for each kind of a constellation.
+    state: ObservableState
+
+
+def check_observables(corrected: CorrectedRanges, state: ObservableState) -> CheckedObservables:
+    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, a sentence on each.
+
+    A factor counts until the next one of its constellation; before the first one, that of all constellations does.
+    """
+    sight = corrected.satellites.position_ecef_m - corrected.near_ecef_m[:, None, :]
+    sight = sight / np.linalg.norm(sight, axis=2, keepdims=True)
+    rate = (sight * corrected.satellites.velocity_ecef_mps).sum(axis=2)
+    wavelength = SPEED_OF_LIGHT / corrected.frequency_hz
+    phase = wavelength * corrected.observations.phase_cycles[:, corrected.columns]
+    changes, after = _phase_rates(corrected.time, corrected.channels.names, phase, rate, state)
+    letters = corrected.satellite.astype("<U1")
+    bad: dict[int, Masks] = {}
+    notes: list[str] = []
+    before = dict(zip(state.letter.tolist(), state.factor.T.tolist(), strict=True))
+    factors = {letter: before.get(letter, [np.nan, np.nan]) for letter in {**before, **dict.fromkeys(["", *letters])}}
+    for kind, (observed, expected) in enumerate(((-wavelength * corrected.doppler_hz, rate), changes)):
+        wrong, found = np.zeros(observed.shape, dtype=np.bool_), {}
+        for letter in ["", *np.unique(letters).tolist()]:
+            own = (letters == letter) | (letter == "")
+            found[letter] = _held(rate_factor(observed[:, own], expected[:, own]), factors[letter][kind])
+            factors[letter][kind] = float(found[letter][-1]) if len(rate) else factors[letter][kind]
+            factor = np.where(np.isnan(found[letter]), found[""], found[letter])
+            seen = np.isfinite(observed[:, own] - expected[:, own]).any(axis=1)
+            off = (np.abs(factor - 1.0) > _RIGHT) & seen
+            if letter and off.any():
+                wrong[:, own] = off[:, None]
+                notes.append(_sentence(kind, letter, float(np.median(factor[off])), float(np.median(wavelength[own]))))
+        if wrong.any():
+            bad[kind] = wrong
+    if bad:
+        corrected = _without(corrected, letters, bad)
+    last = copy_with(after, letter=np.array(list(factors), dtype="<U1"), factor=np.array(list(factors.values())).T)
+    return CheckedObservables(corrected, tuple(notes), last)
+
+
+def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
+    """Return the factor by which observed rates follow those of the satellites, shape (T,); NaN where it is unclear.
+
+    The median over satellites of one constellation, shape (T, K), each against their median.
+    """
+    known = np.isfinite(observed_mps) & np.isfinite(expected_mps)
+    few = known.sum(axis=1) <= _LEAST_SATELLITES
+    observed, expected = (
+        np.where(known, each, np.nan) - masked_median(each, known)[:, None] for each in (observed_mps, expected_mps)
+    )
+    clear = known & (np.abs(np.nan_to_num(expected)) >= _LEAST_RATE_MPS)
+    ratio = np.where(clear, observed, np.nan) / np.where(clear, expected, 1.0)
+    factor = masked_median(ratio, clear)
+    near = clear & (np.abs(ratio - factor[:, None]) <= _SPREAD)
+    unclear = few | (clear.sum(axis=1) < _LEAST_SATELLITES) | (near.sum(axis=1) < 0.75 * clear.sum(axis=1))
+    return np.where(unclear, np.nan, factor)
+
+
+def _held(factor: Floats, before: float) -> Floats:
+    """Return the factors with each gap filled by the one before it."""
+    values = np.concatenate([[before], factor])
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+    return np.asarray(values[last][1:])
+
+
+def _phase_rates(
+    time: Datetimes, channel: Strings, phase_m: Floats, rate_mps: Floats, state: ObservableState
+) -> tuple[tuple[Floats, Floats], ObservableState]:
+    """Return changes of the phases since the epoch before and mean range rates [m/s], shape (T, K), and the state."""
+    if not len(time):
+        return (phase_m, rate_mps), state
+    joined = join_channels(channel, [state.channel])
+    phase, rate = (
+        np.concatenate([joined.arrange(before, np.nan)[None], joined.widen(now, np.nan)])
+        for before, now in ((state.phase_m, phase_m), (state.rate_mps, rate_mps))
+    )
+    interval = seconds(np.diff(time, prepend=np.array([state.time], dtype=time.dtype)))
+    interval = np.where(interval <= _LONGEST_S, interval, np.nan)
+    change, mean = np.diff(phase, axis=0) / interval[:, None], 0.5 * (rate[1:] + rate[:-1])
+    known = slice(0, joined.present)
+    after = ObservableState(channel=channel, phase_m=phase_m[-1], rate_mps=rate_mps[-1], time=time[-1])
+    return (change[:, known], mean[:, known]), after
+
+
+def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]) -> CorrectedRanges:
+    """Return the ranges without Dopplers and phases, all signals of the constellations; `bad`: by kind, (T, K)."""
+    obs: Observations = corrected.observations
+    of_channel: Indices = (obs.satellite.astype("<U1")[:, None] == letters).astype(np.intp)
+    values = {"doppler_hz": obs.doppler_hz, "phase_cycles": obs.phase_cycles}
+    for kind, name in enumerate(values):
+        if kind in bad:
+            values[name] = np.where(bad[kind].astype(np.intp) @ of_channel.T > 0, np.nan, values[name])
+    doppler = np.where(bad[0], np.nan, corrected.doppler_hz) if 0 in bad else corrected.doppler_hz
+    return copy_with(corrected, observations=copy_with(obs, **values), doppler_hz=doppler)
+
+
+def _sentence(kind: int, letter: str, factor: float, wavelength_m: float) -> str:
+    """Return what is wrong with the Dopplers or phases of a constellation."""
+    if abs(factor + 1.0) <= _RIGHT:
+        wrong = "have the wrong sign"
+    elif abs(abs(factor) - wavelength_m) < 0.1:
+        metres = "metres a second" if kind == 0 else "metres"
+        wrong = f"are in {metres}, not in {_UNITS[kind]}{', and have the wrong sign' if factor < 0.0 else ''}"
+    else:
+        wrong = f"are {factor:.2g} times what the satellites' motion gives: their unit is not {_UNITS[kind]}"
+    return f"the {_KINDS[kind]} of {_NAMES.get(letter, letter)} {wrong}; they are not used"

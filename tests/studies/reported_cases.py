@@ -1,0 +1,209 @@
+"""Files that users reported, through every command that reads them: a table of what each command makes of it.
+
+Usage: ``python tests/studies/reported_cases.py [WORD]``; the files are those of ``shared/data/cases`` beside the
+checkout. `WORD` restricts the table to rows that contain it.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from typer.testing import CliRunner
+
+from railfix.cli import app
+from railfix.core.geodesy import geodetic_from_ecef
+
+#: Where the antenna of base.rnx is (ECEF) [m].
+STATION_ECEF_M = np.array([3516213.4380, 781859.8595, 5246037.9660])
+#: Commands that read a log of observations; ``{log}``, ``{nav}``, ``{line}`` and ``{out}`` are replaced.
+LOG_COMMANDS = {
+    "locate": "locate --log {log} --nav {nav} --out {out}/place.pos --overwrite",
+    "convert": "convert {log} --out {out}/log.obs --overwrite",
+    "run": "run --front {log} --nav {nav} --track {line} --set filter=off --out {out}/run --overwrite",
+    "doctor": "doctor {log} {nav} {line}",
+}
+#: Commands that read a track map, with the options that state its heights.
+MAP_COMMANDS = {
+    "check": "map check {map} {heights}",
+    "network": "map network {map}",
+    "doctor": "doctor {map}",
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One file through one command: exit code, and an expression that the output contains."""
+
+    file: str
+    command: str
+    words: str
+    exit_code: int | tuple[int, ...]
+    expected: str
+
+
+def _log_rows() -> Iterator[Row]:
+    epochs = {
+        "base.rnx": 8, "code-1km-off-G18.rnx": 8, "code-200m-off-G16.rnx": 8, "comment-in-data.rnx": 8,
+        "two-files-joined.rnx": 8, "cut-last-line.rnx": 7, "time-system-one-column-off.rnx": 8,
+    }  # fmt: skip
+    notes = {
+        "cut-last-line.rnx": "file ends in the middle of an epoch",
+        "two-files-joined.rnx": "a further header begins here",
+        "time-system-one-column-off.rnx": "TIME OF FIRST OBS is not in its columns",
+    }
+    for name, n in epochs.items():
+        note = notes.get(name, "")
+        for command, words in LOG_COMMANDS.items():
+            texts = {
+                "locate": f"{n} epochs, {n} positions.*{note}",
+                "convert": rf"{n} epochs, RINEX 3.*{note}",
+                "run": f"a position in {n} of {n} epochs.*{note}",
+                "doctor": f"the files fit together.*{n} epochs.*{note}",
+            }
+            yield Row(name, command, words.replace("{log}", "reports/" + name), 0, texts[command])
+
+
+def _navigation_rows() -> Iterator[Row]:
+    rejected = {
+        "orbit-one-galileo.nav": r"1 record of Galileo rejected \(E03\)",
+        "orbit-all-galileo.nav": "9 records of Galileo rejected",
+        "galileo-type-E.nav": "",
+    }
+    for name, text in rejected.items():
+        for command in ("locate", "run", "doctor"):
+            words = LOG_COMMANDS[command].replace("{log}", "reports/base.rnx").replace("{nav}", "reports/" + name)
+            found = {"locate": "8 positions", "run": "a position in 8 of 8", "doctor": "the files fit together"}
+            yield Row(name, command, words, 0, f"{found[command]}.*{text}")
+    yield Row("galileo-type-E.nav", "doctor", "doctor reports/galileo-type-E.nav", 5, "9 ephemerides: E 9")
+    for command, code in (("locate", 3), ("run", 3), ("doctor", 5)):
+        words = LOG_COMMANDS[command].replace("{log}", "reports/base.rnx")
+        words = words.replace("{nav}", "reports/glonass-xyz-equal.nav")
+        yield Row("glonass-xyz-equal.nav", command, words, code, "3 records of GLONASS rejected .R03, R04, R10")
+
+
+def _position_rows() -> Iterator[Row]:
+    expected = {
+        "one-2d-fix.nmea": ("12 positions", "1 of 12 fixes have no height"),
+        "separation-zero.nmea": ("12 positions", r"separation is 0 in every fix, the geoid lies 50 m"),
+        "date-one-day-back.csv": ("8 positions", "line 6: the time goes back by 86,399"),
+    }
+    line = "reports/line.geojson --height-datum ellipsoidal"
+    for name, (count, note) in expected.items():
+        yield Row(
+            name, "match", f"map match {line} --log reports/{name} --out {{out}}/matched.csv --overwrite", 0,
+            f"{count}.* 0 with a probability below 0.9.*{note}",
+        )  # fmt: skip
+        yield Row(name, "doctor", f"doctor reports/{name}", 5, f"positions.*{count}.*{note}")
+        made = f"map from-positions reports/{name} --out {{out}}/made.csv --overwrite"
+        backward = name.startswith("date")
+        text = "line 6: the time is before that of the position above; sort them" if backward else note
+        yield Row(name, "from-positions", made, 3 if backward else 0, text)
+
+
+def _map_rows() -> Iterator[Row]:
+    heights = "--height-datum ellipsoidal"
+    lengths = {
+        "reports/null-geometry.geojson": (heights, "10 points.*1 feature 1 without geometry"),
+        "reports/zero-length-line.xml": (heights, r"890\.1 m"),  # 889.776 m on the grid
+        "reports/easting-first.xml": (heights, r"890\.1 m.*easting before northing"),
+        "reports/wgs84-egm96.fgb": ("", "12 points.*EGM96"),
+        "newcomer/line.kml": (heights, "253 points"),
+        "newcomer/names.csv": (heights, "253 points"),
+        "newcomer/simple.csv": (heights, "253 points"),
+        "newcomer/bom.csv": ("", "253 points"),
+        "newcomer/feet2.csv": ("", "253 points"),
+        "newcomer/shuf.csv": ("", "253 points.*direction turns by 17"),
+    }
+    for name, (given, text) in lengths.items():
+        short = name.partition("/")[2]
+        check = MAP_COMMANDS["check"].replace("{map}", name).replace("{heights}", given)
+        yield Row(short, "check", check, 6 if name.startswith("newcomer") else 0, text)
+        findings = "|".join(["map check.*errors" if name.startswith("newcomer") else "track"])
+        yield Row(short, "doctor", f"doctor {name}", 5, rf"{text.partition('.*')[0].removesuffix('.1 m')}.*|{findings}")
+    refused = {
+        "zero-heights.geojson": (heights, 3, "the coordinates have no height"),
+        "rd-nap.fgb": ("", 4, "nl_nsgi_nlgeo2018.tif, not installed .projsync"),
+    }
+    for name, (given, code, text) in refused.items():
+        yield Row(name, "check", f"map check reports/{name} {given}", code, text)
+        yield Row(name, "doctor", f"doctor reports/{name}", 5, text)
+    yield Row("way-of-one-node.osm", "network", "map network reports/way-of-one-node.osm", 0, "2 tracks.*way/3")
+    route = "map route reports/easting-first-no-profile.xml --tracks A --heights reports/heights-by-chainage.csv"
+    yield Row("easting-first-no-profile.xml", "route", f"{route} {heights} --out {{out}}/e.csv", 0, r"890\.1 m")
+
+
+def _receiver_rows() -> Iterator[Row]:
+    log = "reports/three-epochs.rtcm3"
+    words = f"convert {log} --out {{out}}/q.rnx --nav-out {{out}}/q.nav --overwrite"
+    yield Row("three-epochs.rtcm3", "convert", words, 0, "4 epochs.*8 ephemerides")
+    contradicted = "its ephemerides are of 2024-08-18, the date given .--date. is 2024-06-01"
+    yield Row("three-epochs.rtcm3", "convert --date", f"{words} --date 2024-06-01", 5, contradicted)
+    located = f"locate --log {log} --out {{out}}/r.pos --overwrite"
+    yield Row("three-epochs.rtcm3", "locate", located, 7, "2 no valid and healthy navigation record")
+    yield Row("three-epochs.rtcm3", "doctor", f"doctor {log}", 5, "2024-08-18 21:14:25.*8 ephemerides inside")
+
+
+def list_rows() -> list[Row]:
+    """Return all rows."""
+    return [*_log_rows(), *_navigation_rows(), *_position_rows(), *_map_rows(), *_receiver_rows()]
+
+
+def write_line(path: Path) -> Path:
+    """Write a track map of 400 m through the station of base.rnx."""
+    latitude, longitude, height = (float(value) for value in geodetic_from_ecef(STATION_ECEF_M))
+    rows = [f"{latitude:.9f},{longitude + k * 1e-4:.9f},{height:.3f}" for k in range(-32, 33)]
+    path.write_text("# sigma_plan_m: 0.3\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def run_row(row: Row, cases: Path, out: Path) -> tuple[bool, int, str]:
+    """Run one row: whether it is as expected, the exit code, and what was printed, in one line."""
+    line = write_line(out / "line.csv")
+    words = []
+    for word in row.words.replace("{nav}", "reports/base.nav").split():
+        word = word.replace("{out}", str(out)).replace("{line}", str(line))
+        words.append(str(cases / word) if re.match("(reports|newcomer)/", word) else word)
+    result = CliRunner(env={"COLUMNS": "500"}).invoke(app, words)
+    text = " ".join(f"{result.stdout} {result.stderr}".split())
+    codes = (row.exit_code,) if isinstance(row.exit_code, int) else row.exit_code
+    broken = result.exception is not None and not isinstance(result.exception, SystemExit)
+    right = not broken and result.exit_code in codes and re.search(row.expected, text) is not None
+    return right, result.exit_code, f"{result.exception!r}" if broken else text
+
+
+def station_error_m(path: Path) -> float:
+    """Return the largest distance of positions in a file from the station of base.rnx [m]."""
+    from railfix.io.positions import read_positions
+
+    return float(np.linalg.norm(read_positions(path).ecef_m - STATION_ECEF_M, axis=1).max())
+
+
+def main() -> None:
+    cases = Path(__file__).resolve().parents[3] / "shared" / "data" / "cases"
+    wanted = sys.argv[1] if len(sys.argv) > 1 else ""
+    wrong = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for row in list_rows():
+            if wanted not in f"{row.file} {row.command}":
+                continue
+            right, code, text = run_row(row, cases, Path(folder))
+            wrong += not right
+            error = (
+                f"{station_error_m(Path(folder) / 'place.pos'):5.1f} m off"
+                if row.command == "locate" and not code
+                else ""
+            )
+            print(f"{'right' if right else 'WRONG'}  {row.file:32} {row.command:16} rc {code}  {error}")
+            if not right:
+                print(f"       expected {row.exit_code} {row.expected}\n       printed {text[:600]}")
+    print(f"{wrong} rows wrong")
+
+
+if __name__ == "__main__":
+    main()
