@@ -17,7 +17,7 @@ Where to begin
 >>> result, state = processor.process({"front": railfix.read_observations(files["front"])})
 >>> railfix.train_table(result)  # chainage, sigma, protection level, status of every epoch
 
-The median error of these positions is 0.32 m against the ground truth of the simulated run.
+The median error of these positions is 0.34 m against the ground truth of the simulated run.
 
 ============================ =========================================================================
 read                         `read_observations`, `read_navigation`, `read_track`, `read_vehicle`,

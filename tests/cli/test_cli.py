@@ -80,7 +80,7 @@ def test_version() -> None:
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (["run"], "--nav"),
+        (["run"], "--out"),
         (["run", "--front"], "--front"),
         (["ran"], "ran"),
         (["run", "--chunk", "many"], "--chunk"),

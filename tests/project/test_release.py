@@ -162,7 +162,8 @@ def test_recipe_and_citation_are_those_of_the_package() -> None:
     assert python == f"python {PROJECT['requires-python']}"
     renamed = {"matplotlib-base": "matplotlib"}  # the part without a window system
     found = [Requirement(" ".join([renamed.get(name, name), *more])) for name, *more in map(str.split, needed)]
-    assert found == [Requirement(text) for text in PROJECT["dependencies"]]
+    # conda installs what older Pythons need beside newer ones too
+    assert found == [Requirement(text.partition(";")[0]) for text in PROJECT["dependencies"]]
 
 
 def test_the_container_installs_the_wheel_and_runs_as_a_user() -> None:

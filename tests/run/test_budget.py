@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from broken_bench import Bench, bench_in
 from railfix.cli import app
 from railfix.core.reasons import Reason, Status
+from railfix.integrity.point_validation import PointStatus
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult
 from railfix.run import RunSummary, run_files
@@ -103,6 +104,7 @@ def result_of(reasons: list[list[int]], satellites: list[str], status: list[Stat
             status=np.array(status, dtype=np.int8),
             chainage_m=np.where([s == Status.OK for s in status], 1.0, np.nan),
             conventional_offset_m=np.full(epochs, np.nan),
+            conventional_status=np.full(epochs, PointStatus.VALID, dtype=np.int8),
             reason=np.array(reasons, dtype=np.int64),
             satellite=np.array(satellites),
             map_offset=SimpleNamespace(statistic=np.full(epochs, np.nan)),

@@ -14,7 +14,7 @@ import typer
 from railfix.cli.command import SIGNALLED, Command, command_group
 from railfix.cli.console import TableConsole, show_files, show_table
 from railfix.cli.options import check_outputs, from_models
-from railfix.core.errors import MismatchError, OutputError, SettingsError
+from railfix.core.errors import OutputError, SettingsError
 from railfix.core.settings import Settings, option
 from railfix.core.tables import plain_table, plural
 from railfix.ground.on_board import OnBoardLimits
@@ -22,7 +22,6 @@ from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
 
 if TYPE_CHECKING:
-    from railfix.ground.station_fixes import StationFixes
     from railfix.ground.triangle import Order
 
 app = command_group("ground")
@@ -88,6 +87,7 @@ def monitor(
 
     Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
     """
+    from railfix.ground.station_fixes import read_fixes
     from railfix.ground.triangle import TriangleVerdict, draw_triangle, monitor_log
 
     if len(logs) != 3:
@@ -105,7 +105,7 @@ def monitor(
     if choices.live:
         _monitor_live(logs, choices, files[0], limits=limits, times=times)
         return
-    fixes = _read_fixes(logs, choices)
+    fixes = read_fixes(logs, choices.nav, choices.point, computed=choices.fixes)
     result = monitor_log(fixes, limits=limits, times=times)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -123,30 +123,6 @@ def monitor(
     if not result.orders:
         console.print("no stop")
     show_files(console, files)
-
-
-def _read_fixes(logs: list[str], choices: MonitorChoices) -> StationFixes:
-    """Read the positions of the three receivers, or compute them from their observations."""
-    from railfix.ground.station_fixes import fixes_of_positions, station_fixes
-    from railfix.io import read_navigation, read_observations, read_positions
-    from railfix.run.processor import parse_position
-
-    points = np.array([parse_position(text, "--point") for text in choices.point])
-    if choices.fixes:
-        if choices.nav:
-            raise SettingsError("--nav has no use with --fixes: positions are not computed again")
-        if not len(points):
-            raise SettingsError("--point is missing: logs of positions name no known points; give it for each receiver")
-        return fixes_of_positions([read_positions(path) for path in logs], points)
-    if not choices.nav:
-        raise SettingsError("--nav is missing: logs need navigation files")
-    observations = [read_observations(path) for path in logs]
-    if not len(points):
-        points = np.stack([log.header.approximate_ecef_m for log in observations])
-        for log, known in zip(logs, points, strict=True):
-            if not np.isfinite(known).all():
-                raise MismatchError(f"{log}: the header has no position; give the known points with --point")
-    return station_fixes(observations, points, read_navigation(choices.nav))
 
 
 def _monitor_live(

@@ -7,16 +7,18 @@ from collections import Counter, deque
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks
-from railfix.core.errors import MismatchError
+from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
+from railfix.io import read_navigation, read_observations, read_positions
 from railfix.io.position_log import PositionLog
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import ReceivedData, arrivals, fresh_state, next_arrival
@@ -29,6 +31,7 @@ from railfix.positioning.range_arrays import Ranges, usable_ranges
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
+from railfix.run.processor import parse_position
 
 #: Median C/N0 over the satellites that is this far below that of the log counts as fallen [dB-Hz].
 FALLEN_DBHZ = 6.0
@@ -127,6 +130,30 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
         n_satellites=np.stack([item.n_used for item in ranges]).max(axis=0),
         cn0_fallen=cn0_fallen,
     )
+
+
+def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], *, computed: bool) -> StationFixes:
+    """Read the positions of three receivers (`computed`), or compute them from their observations.
+
+    `points` are the known points as texts, one per log, or none: those of the headers. SettingsError: navigation or
+    points are missing, or have no use. MismatchError: a header has no position, or the logs nothing in common.
+    """
+    known = np.array([parse_position(text, "--point") for text in points])
+    if computed:
+        if nav:
+            raise SettingsError("--nav has no use with --fixes: positions are not computed again")
+        if not len(known):
+            raise SettingsError("--point is missing: logs of positions name no known points; give it for each receiver")
+        return fixes_of_positions([read_positions(path) for path in logs], known)
+    if not nav:
+        raise SettingsError("--nav is missing: logs need navigation files")
+    observations = [read_observations(path) for path in logs]
+    if not len(known):
+        known = np.stack([log.header.approximate_ecef_m for log in observations])
+        for log, point in zip(logs, known, strict=True):
+            if not np.isfinite(point).all():
+                raise MismatchError(f"{log}: the header has no position; give the known points with --point")
+    return station_fixes(observations, known, read_navigation(nav))
 
 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:

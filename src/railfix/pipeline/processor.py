@@ -36,6 +36,7 @@ from railfix.pipeline.base_station import BaseStation, Stations, check_base
 from railfix.pipeline.channels import ChannelBook, missing_notes
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import SCREEN_NAMES, Config
+from railfix.pipeline.feature_fixes import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState
 from railfix.pipeline.interference_stage import Interference, PositionEpochs, judge_interference, with_statuses
 from railfix.pipeline.level_stage import compute_araim
@@ -44,7 +45,6 @@ from railfix.pipeline.range_stage import Models, collect_conditions, correct_ran
 from railfix.pipeline.received import correction_source, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.screen_stage import screen_antennas, screen_pairs
-from railfix.pipeline.sensed_motion import LineFeatures
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
 from railfix.pipeline.state import AntennaState, State
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations

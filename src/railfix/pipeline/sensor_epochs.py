@@ -26,20 +26,8 @@ from railfix.motion.samples import (
 from railfix.motion.slip import MotionState, SlipLimits
 from railfix.motion.tachometer import LEAST_SPEED_MPS, TachometerLimits, distance_m, faults_until, window_start
 from railfix.pipeline.balises import BaliseLimits, BaliseState, balise_epochs
-from railfix.pipeline.sensed_motion import (
-    CARRIED,
-    REACH,
-    FeatureFix,
-    FeatureState,
-    LineFeatures,
-    RateSeries,
-    SensedMotion,
-    SensedState,
-    ahead_m,
-    feature_fixes,
-    nothing_sensed,
-    sensed_motion,
-)
+from railfix.pipeline.feature_fixes import FeatureFix, FeatureState, LineFeatures, RateSeries, ahead_m, feature_fixes
+from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedState, nothing_sensed, sensed_motion
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import RangeEpochs, SensorEpochs
 

@@ -292,9 +292,7 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
     """Read a CSV track map as one segment of a route; its CRS is geographic."""
     check_height_datum(reading.height_datum)
     table = _with_map_names(read_named_columns(path), reading.height_datum)
-    notes = _check_columns(table)
-    if "note" in table.metadata:
-        notes += tuple(table.metadata["note"].split("; "))
+    notes = (*_check_columns(table), *filter(None, table.metadata.get("note", "").split("; ")))
     latitude, longitude = table.numbers("latitude_deg"), table.numbers("longitude_deg")
     check_degrees(table, latitude, longitude)
     datum = _datum(table, reading.height_datum)
@@ -311,17 +309,16 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
         )
     crs = choose_crs(path, reading.crs, table.metadata.get("crs"))
     place = _place(crs, latitude, longitude, path=table.path)
-    geoid, geoid_m = reading.geoid, None
+    geoid, geoid_m, above = reading.geoid, None, None
     if datum == "orthometric" and "geoid_m" in table:
         geoid_m = table.numbers("geoid_m")
     elif datum == "orthometric" and geoid is None:
         geoid = table.metadata.get("geoid")
+    if heights.any():  # heights that are all 0 are none, as in files of other formats
+        above = ellipsoidal_heights(heights, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path)
     return make_segment(
         place,
-        # heights that are all 0 are none, as in files of other formats
-        ellipsoidal_heights(heights, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path)
-        if heights.any()
-        else None,
+        above,
         source=table.path,
         file=table.path,
         crs=crs,

@@ -1,0 +1,260 @@
+"""Places by the features of a line that the body has passed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.timescale import seconds
+from railfix.motion.features import (
+    HALF_LENGTH_M,
+    Feature,
+    LineSeries,
+    LocatedFeature,
+    line_series,
+    locate,
+    map_features,
+)
+from railfix.track import Track
+from railfix.track.curves import curved_line
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line
+
+#: Slower than this the rates say nothing of the line [m/s].
+SLOWEST_MPS: Final = 1.0
+#: Rates over a length are the mean of so many metres: the body's swings are shorter.
+_LEAST_POINTS: Final = 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineFeatures:
+    """Gradient and curvature of a line, and its features in order; arc lengths are those of the line itself."""
+
+    series: LineSeries
+    features: tuple[Feature, ...]
+    #: Arc lengths of the antenna's trajectory, and of the body's middle on the line then: the body turns about it;
+    #: shape (V,).
+    antenna_m: Floats
+    body_m: Floats
+    line: Line  #: Shows whether it is closed.
+
+    @classmethod
+    def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
+        """Return the features of a track for the body that carries an antenna."""
+        line = curved_line(track)
+        series = line_series(line)
+        body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
+        inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])
+        return cls(
+            series=series, features=tuple(map_features(series)), antenna_m=np.asarray(trajectory.arc_m),
+            body_m=line.arc_at_chainage(inside) + body - inside, line=Line.of(line),
+        )  # fmt: skip
+
+    def body_at(self, antenna_m: Floats) -> Floats:
+        """Place of the body's middle where an antenna is at an arc length of its trajectory [m]."""
+        return np.interp(antenna_m, self.antenna_m, self.body_m)
+
+
+def ahead_m(trajectory: Trajectory) -> float:
+    """Return how far an antenna is ahead of the vehicle's middle in rising arc length [m]; 0 without a vehicle."""
+    if trajectory.body_chainage_m is None:
+        return 0.0
+    return float(np.median(trajectory.chainage_m - trajectory.body_chainage_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateSeries:
+    """Rates of the body at K ticks."""
+
+    #: Times at which they hold, and when they were known; shape (K,).
+    time: Datetimes
+    known: Datetimes
+    distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).
+    arc_m: Floats  #: Place of the antenna by the wheel; NaN where it is not known; shape (K,).
+    #: Change of heading (+ to the right) and of pitch (+ nose up) since the tick before, shape (K,).
+    turned_rad: Floats
+    climbed_rad: Floats
+    speed_mps: Floats  #: In rising arc length, shape (K,).
+    rolls: Masks  #: The wheel rolls, shape (K,).
+
+    def arc_at(self, time: Datetimes) -> Floats:
+        """Return places at times after the first tick, on from the tick before each [m]."""
+        last = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
+        since = seconds(time - self.time[last])
+        return np.asarray(self.arc_m[last] + np.nan_to_num(self.speed_mps[last]) * since)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureState:
+    """What one chunk leaves to the next."""
+
+    distance_m: float = 0.0  #: Distance at the last tick.
+    angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch there, from any beginning [rad].
+    #: Whole metres passed without a break, in the order of travel; shape (M,).
+    metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    #: At each, shape (M,).
+    heading_rad: Floats = field(default_factory=lambda: np.empty(0))
+    pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
+    #: Place of the last accepted feature, its standard deviation, and the distance there [m].
+    last: tuple[float, float, float] | None = None
+    done_m: float = float("nan")  #: Place up to which features have been compared; NaN before the first.
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureFix:
+    """Verdict on one feature."""
+
+    tick: int  #: After which of the ticks it was passed.
+    feature: Feature
+    located: LocatedFeature
+
+    @property
+    def correction_m(self) -> float:
+        """Place less that by the wheel [m]; NaN unless accepted."""
+        return self.located.arc_m - self.feature.arc_m
+
+
+class _Stretch(NamedTuple):
+    """Ticks without a break from `first` on, and the whole metres passed up to the last of them."""
+
+    first: int
+    sense: float  #: 1 toward rising arc length, else -1.
+    distance_m: Floats  #: At all ticks of the chunk, the one before the first of them at index 0.
+    body_m: Floats  #: Place of the body's middle at each tick of the stretch.
+    behind_m: Floats  #: And the place that a feature has to be passed by to be compared.
+    metre: Integers
+    heading_rad: Floats
+    pitch_rad: Floats
+
+    def shift_m(self, tick: int) -> float:
+        """Return what leads from distances to places of the body's middle at a tick."""
+        return float(self.body_m[tick - self.first] - self.distance_m[tick + 1])
+
+
+def _fix_feature(
+    feature: Feature,
+    stretch: _Stretch,
+    line: LineFeatures,
+    noise: tuple[float, tuple[float, float]],
+    facing: float,
+    last: tuple[float, float, float] | None,
+) -> FeatureFix | None:
+    """Compare the profile that was passed with a feature; `noise` is of the place by the wheel, and of the profile."""
+    tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
+    shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
+    # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
+    passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
+    place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
+    profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])
+    before = None
+    if last is not None:
+        covered = feature.arc_m - shift - last[2]
+        # on a closed line the last feature may lie before the join
+        nearest = line.line.nearest_m(np.array(last[0]), np.array(feature.arc_m - covered))
+        before = (float(nearest), last[1], covered)
+    located = _compare(profile, feature, line, noise[0], before, noise[1])
+    return None if located is None else FeatureFix(tick=tick, feature=feature, located=located)
+
+
+def feature_fixes(
+    rates: RateSeries,
+    line: LineFeatures,
+    facing: float,
+    sigma_m: float,
+    state: FeatureState,
+    *,
+    noise: tuple[float, float],
+) -> tuple[list[FeatureFix], FeatureState]:
+    """Return verdicts on the features that were passed, and the state to pass on.
+
+    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only distances without a slip and faster
+    than 1 m/s count: heading and pitch are integrals, and a break restarts them. `facing`: 1 where the front points to
+    rising arc length, else -1; `sigma_m`: of the place by the wheel; `noise`: standard deviations of gradient and
+    curvature in one metre.
+    """
+    distances = np.concatenate([[0.0], rates.distance_m]) + state.distance_m
+    heading, pitch = (
+        np.concatenate([[0.0], np.cumsum(turns)]) + begin
+        for turns, begin in zip((rates.turned_rad, rates.climbed_rad), state.angles, strict=True)
+    )
+    usable = rates.rolls & (np.abs(rates.speed_mps) > SLOWEST_MPS) & np.isfinite(heading[1:] + pitch[1:])
+    fixes: list[FeatureFix] = []
+    metre, headings, pitches = state.metre, state.heading_rad, state.pitch_rad
+    kept, last, done = int(2.5 * HALF_LENGTH_M), state.last, state.done_m
+    breaks = np.flatnonzero(~usable)
+    # stretches of usable ticks, each closed by one that is not
+    edges = np.concatenate([[-1], breaks, [len(usable)]])
+    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        if begin >= 0:
+            metre, headings, pitches = metre[:0], headings[:0], pitches[:0]
+        if end - begin < 2:
+            continue
+        rows = slice(begin + 1, end + 1)  # ticks begin + 1 .. end - 1, with the one before them at index begin + 1
+        distance = distances[rows]
+        whole = _whole_metres(distance)
+        if len(metre) and len(whole) and whole[0] != metre[-1] + np.sign(distance[-1] - distance[0]):
+            metre, headings, pitches = metre[:0], headings[:0], pitches[:0]
+        rising = distance if distance[-1] >= distance[0] else distance[::-1]
+        turned, climbed = (v[rows] if distance[-1] >= distance[0] else v[rows][::-1] for v in (heading, pitch))
+        metre = np.concatenate([metre, whole])
+        headings = np.concatenate([headings, np.interp(whole, rising, turned)])
+        pitches = np.concatenate([pitches, np.interp(whole, rising, climbed)])
+        body = line.body_at(rates.arc_m[begin + 1 : end])
+        if not np.isfinite(body[-1]) or len(metre) < _LEAST_POINTS:
+            continue
+        sense = 1.0 if metre[-1] > metre[0] else -1.0
+        behind = body - sense * HALF_LENGTH_M
+        passed = float(behind[-1])
+        stretch = _Stretch(begin + 1, sense, distances, body, behind, metre, headings, pitches)
+        known = done if done == done else float(behind[0])
+        for feature in line.features[:: int(sense)]:
+            if not 0.0 < sense * (feature.arc_m - known) <= sense * (passed - known):
+                continue
+            fix = _fix_feature(feature, stretch, line, (sigma_m, noise), facing, last)
+            if fix is None:
+                continue
+            fixes.append(fix)
+            if fix.located.verdict == "accepted":
+                last = (fix.located.arc_m, fix.located.sigma_m, feature.arc_m - stretch.shift_m(fix.tick))
+        # a place corrected backward passes nothing twice
+        done = passed if not sense * (passed - done) < 0.0 or abs(passed - done) > HALF_LENGTH_M else done
+    metre, headings, pitches = metre[-kept:], headings[-kept:], pitches[-kept:]
+    angles = (float(np.nan_to_num(heading[-1])), float(np.nan_to_num(pitch[-1])))
+    return fixes, replace(
+        state, distance_m=float(distances[-1]), angles=angles, metre=metre, heading_rad=headings, pitch_rad=pitches,
+        last=last, done_m=done,
+    )  # fmt: skip
+
+
+def _whole_metres(distance_m: Floats) -> Integers:
+    """Return the whole metres between the first value and the last, in the order of travel."""
+    first, last = float(distance_m[0]), float(distance_m[-1])
+    if last >= first:
+        return np.arange(np.floor(first) + 1, np.floor(last) + 1).astype(np.int64)
+    return np.arange(np.ceil(first) - 1, np.ceil(last) - 1, -1).astype(np.int64)
+
+
+def _compare(
+    profile: tuple[Floats, Floats, Floats],
+    feature: Feature,
+    line: LineFeatures,
+    sigma_m: float,
+    last: tuple[float, float, float] | None,
+    noise: tuple[float, float],
+) -> LocatedFeature | None:
+    """Verdict on one feature by arc lengths, headings and pitches; None where it was not passed without a break."""
+    arc_m, heading_rad, pitch_rad = profile
+    about = arc_m - feature.arc_m
+    near = np.flatnonzero(np.abs(about) <= HALF_LENGTH_M)
+    if len(near) < 1.8 * HALF_LENGTH_M or len(near) < 3:
+        return None
+    heading, pitch = heading_rad[near], pitch_rad[near]
+    measured = LineSeries(
+        arc_m=np.asarray(about[near][1:-1], dtype=np.float64),
+        gradient=np.tan(pitch[1:-1]),
+        curvature_1pm=0.5 * (heading[2:] - heading[:-2]),
+    )
+    return locate(measured, line.series, feature.arc_m, sigma_m, quantity=feature.quantity, noise=noise, last=last)
