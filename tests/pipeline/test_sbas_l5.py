@@ -95,6 +95,7 @@ def errors_m(folder: Path, name: str, table: str) -> tuple[np.ndarray, np.ndarra
     return np.abs((found["chainage_m"] - truth["chainage_m"]).to_numpy()), found["protection_level_m"].to_numpy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("table", "share"), [("positions", 0.9), ("train", 0.6)])
 def test_errors_become_less_and_stay_within_levels(folder: Path, table: str, share: float) -> None:
     error, level = errors_m(folder, "l5", table)

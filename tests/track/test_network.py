@@ -270,6 +270,7 @@ def test_page_has_the_network_its_faults_and_the_run(tmp_path: Path) -> None:
                 assert high - low < 1000.0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(browser() is None, reason="no chromium is installed")
 def test_names_of_tracks_do_not_lie_over_one_another_and_come_with_the_zoom(tmp_path: Path) -> None:
     net = made_network(10.0)
