@@ -311,6 +311,6 @@ def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 
 
-def _latest(samples: Samples, first: int) -> Samples:
+def _latest(samples: Samples, first: int | np.integer[Any]) -> Samples:
     """Return samples from an index on."""
     return samples.take(slice(max(int(first), 0), None))
