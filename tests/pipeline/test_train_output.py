@@ -55,6 +55,7 @@ def test_one_row_an_epoch_and_antenna_with_all_columns(tracked: RunSummary) -> N
     assert (apart_s.drop_nulls().to_numpy()[2:] == 1.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("E5")
 def test_smoothed_columns_stand_beside_those_of_the_filter(tracked: RunSummary, tmp_path: Path) -> None:
     tables = {}

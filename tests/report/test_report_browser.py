@@ -179,7 +179,7 @@ def test_tables_can_be_downloaded(page: Path, tmp_path: Path) -> None:
     assert rows["max"].cast(pl.Float64).min() > 0.0
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [390, 1400])
 def test_nothing_is_wider_than_the_window(page: Path, width: int) -> None:
     wide = """width => [...document.querySelectorAll("body *")].filter(e => !e.closest(".scroll, svg, .modebar") &&
@@ -191,7 +191,7 @@ def test_nothing_is_wider_than_the_window(page: Path, width: int) -> None:
         assert shown.evaluate(wide, width) == ""
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "paper"), [("light", "rgb(255, 255, 255)"), ("dark", "rgb(20, 24, 28)")])
 def test_charts_follow_the_readers_preference(page: Path, scheme: str, paper: str) -> None:
     with visited(page, color_scheme=scheme) as shown:

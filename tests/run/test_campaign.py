@@ -108,6 +108,7 @@ def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path,
     assert record.stat().st_mtime_ns != before
 
 
+@pytest.mark.slow
 def test_lenience_of_the_command_reaches_every_run(folder: Path, tmp_path: Path) -> None:
     text = (folder / "logs/A/2024-03-05/front.obs").read_text().splitlines(keepends=True)
     starts = [k for k, line in enumerate(text) if line.startswith(">")]
