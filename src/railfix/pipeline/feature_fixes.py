@@ -89,7 +89,7 @@ class RateSeries:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureState:
-    """What one chunk leaves to the next."""
+    """State of the feature search after a chunk."""
 
     distance_m: float = 0.0  #: Distance at the last tick.
     angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch there, from any beginning [rad].
