@@ -35,7 +35,7 @@ from railfix.simulate.scenario_file import Recipe, list_scenarios, load_recipe
 
 
 class SimulateOptions(Settings):
-    """Where the runs go, and what overrides the scenario."""
+    """Folder of the runs, and settings that override the scenario."""
 
     out: Path | None = option(
         "Folder for the files; each run of a recipe in its own below it.", None, metavar="DIR", panel="Options"
@@ -92,7 +92,7 @@ def simulate(
 
     Example: `railfix simulate demo --out simulated`
 
-    Exit codes as `railfix --help` says; 5 where the navigation file does not serve the scenario's time.
+    Exit codes are those of `railfix --help`; 5 where the navigation file does not cover the scenario's time.
     """
     if list_shipped:
         for name in list_scenarios():
@@ -249,7 +249,7 @@ def show_levels(evaluation: Evaluation, console: Console) -> None:
 
 
 def median_level(evaluation: Evaluation, kind: str, antenna: str) -> float | None:
-    """Return the median of the finite levels of the positions of status ok [m]; None where there is none."""
+    """Return the median of the finite levels of the positions of status ok [m]; None where no level is finite."""
     if evaluation.levels is None:
         return None
     wanted = {"antenna": antenna, "position": "constrained_ok", "level": f"{kind}_protection_level_m"}
