@@ -238,7 +238,7 @@ def doctor(
         raise typer.Exit(5 if problems else 0)
     console = TableConsole()
     verdict = f"{plural(problems, 'problem')} to fix" if problems else "the files fit together"
-    console.print(f"{len(diagnosis.findings)} files: {verdict}")
+    console.print(f"{plural(diagnosis.findings, 'file')}: {verdict}")
     for problem in problems:
         console.print(f"- {problem}")
     if diagnosis.command:

@@ -180,7 +180,7 @@ def unpacked_file(path: FilePath) -> Iterator[Path]:
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)
-    if not head.startswith((ZIP, COMPRESS, *STREAMS)) or (head.startswith(ZIP) and _is_document(path)):
+    if not head.startswith((ZIP, COMPRESS, *STREAMS)):
         yield Path(path)
         return
     with tempfile.TemporaryDirectory(prefix="railfix-") as folder:
@@ -195,11 +195,6 @@ def unpacked_file(path: FilePath) -> Iterator[Path]:
         with open_stream(path, content="bytes") as stream, target.open("wb") as file:
             shutil.copyfileobj(stream, file, _COPY_BYTES)
         yield target
-
-
-def _is_document(path: FilePath) -> bool:
-    """Return whether a zip archive is a document of its own (a spreadsheet), by its name."""
-    return Path(path).suffix.lower() in (".xlsx", ".ods")
 
 
 def read_bytes(path: FilePath) -> bytes:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Integers, Strings
+from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, text_lines
 
@@ -53,6 +53,10 @@ class NamedColumns:
 
     def __contains__(self, name: str) -> bool:
         return name in self.cells
+
+    def take(self, rows: Indices) -> NamedColumns:
+        """Return some rows in a given order."""
+        return replace(self, line=self.line[rows], cells={name: cell[rows] for name, cell in self.cells.items()})
 
     def error(self, row: int, message: str) -> InputFileError:
         """Return an error that names the line of a row."""

@@ -23,6 +23,8 @@ CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
     "z_m", "quality", "ratio", *SIGMA_COLUMNS,
 )  # fmt: skip
+#: Further columns of a table of positions, which `PositionLog.table` keeps.
+OTHER_COLUMNS: Final = ("antenna", "chainage_m", "speed_mps", "sigma_m", "source", "environment")
 #: Largest Unix time that is taken for seconds, in 2100.
 _LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
@@ -46,6 +48,7 @@ class PositionLog:
     #: Latitude and longitude of all rows, where some have no height; shape (n, 2).
     plan_deg: Floats | None = None
     antennas: tuple[str, ...] = ()  #: Names of antennas in a table that has them.
+    table: NamedColumns | None = None  #: All columns, where the log is a table with named columns.
 
     @property
     def geodetic(self) -> tuple[Floats, Floats, Floats]:
@@ -97,17 +100,10 @@ def skip_broken(
 
 
 def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> PositionLog:
-    """Parse the positions in a table with named columns; see `railfix.io.positions.read_positions`."""
-    table = rename_columns(parse_named_columns(lines, path), columns, known=CSV_COLUMNS)
-    antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
-    return replace(positions_of_table(table), antennas=tuple(antennas))
-
-
-def positions_of_table(table: NamedColumns) -> PositionLog:
-    """Convert a table that has been read to a position log; columns of heights and sigmas may be absent."""
+    """Parse the positions in a table with named columns; columns of heights and sigmas may be absent."""
+    table = rename_columns(parse_named_columns(lines, path), columns, known=(*CSV_COLUMNS, *OTHER_COLUMNS))
     cartesian = all(name in table for name in _CARTESIAN)
     table = table if cartesian else with_usual_names(table, _GEODETIC)
-    path = table.path
     close = misspelt(table.cells, CSV_COLUMNS)
     absent = {right: wrong for wrong, right in close.items() if right not in table}
     geodetic = all(name in table for name in _GEODETIC[:2])
@@ -141,6 +137,8 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
         notes=notes,
         ratio=numbers_or_nan(table, "ratio") if "ratio" in table else None,
         plan_deg=values[:, :2] if flat else None,
+        antennas=tuple(table.cells["antenna"].unique().sort().to_list()) if "antenna" in table else (),
+        table=table,
     )
 
 
