@@ -224,19 +224,6 @@ def read_text(path: FilePath) -> str:
         raise InputFileError(path, "is not UTF-8 text; save the file as UTF-8", line=line) from None
 
 
-def text_lines(path: FilePath) -> Iterator[str]:
-    """Yield the lines of a decompressed UTF-8 file, without a byte order mark and without their ends."""
-    number = 0
-    with open_stream(path) as stream, io.TextIOWrapper(stream, encoding="utf-8") as text:  # type: ignore[type-var]
-        try:
-            for line in text:
-                number += 1
-                yield from line.splitlines()
-        except UnicodeDecodeError:
-            message = "is not UTF-8 text; save the file as UTF-8"
-            raise InputFileError(path, message, line=number + 1) from None
-
-
 def ending(path: FilePath) -> str:
     """Return the ending of a file name in lower case, ignoring those of packed files; of a zip archive its file's.
 

@@ -6,25 +6,28 @@ import codecs
 import re
 from typing import Final, Literal
 
+from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, ending
 from railfix.io.mate import mate_table
 from railfix.io.receiver.framing import is_receiver_log, read_head
 
 FileKind = Literal[
     "observations", "navigation", "rinex", "sp3", "sbas", "receiver", "nmea", "novatel", "rtklib", "gpx", "table",
-    "mate", "geojson", "kml", "osm", "xml", "rdf", "ifc", "dxf", "gml", "gpkg", "shp", "fgb", "pbf", "toml", "unknown",
+    "mate", "geojson", "kml", "osm", "xml", "rdf", "ifc", "dxf", "gml", "gpkg", "shp", "fgb", "pbf", "toml", "android",
+    "unknown",
 ]  # fmt: skip
 #: Kinds of logs of positions, and of track maps; a table may be either, and a GPX file, too.
 POSITIONS: Final[tuple[FileKind, ...]] = ("table", "rtklib", "nmea", "novatel", "gpx", "receiver")
 #: Maps that GDAL reads, by their kind.
 GDAL: Final[tuple[FileKind, ...]] = ("gpkg", "shp", "fgb", "gml", "dxf", "pbf")
 MAPS: Final[tuple[FileKind, ...]] = ("table", "mate", "geojson", "kml", "gpx", "osm", "xml", "rdf", "ifc", *GDAL)
-#: Each kind in words, for messages.
+#: Each kind in words, for messages, with the option that takes it.
 KIND_WORDS: Final[dict[FileKind, str]] = {
-    "observations": "a RINEX observation file", "navigation": "a RINEX navigation file",
-    "rinex": "a RINEX file of another type", "sp3": "a file of precise orbits (SP3)", "sbas": "a log of SBAS messages",
-    "receiver": "a receiver's log", "nmea": "an NMEA log", "novatel": "a NovAtel log",
-    "rtklib": "a solution of RTKLIB (.pos)", "gpx": "a GPX file", "table": "a table", "mate": "a table of EGNSS MATE",
+    "observations": "a RINEX observation file (--front, --rear)", "navigation": "a RINEX navigation file (--nav)",
+    "rinex": "a RINEX file of clocks or meteorology", "sp3": "a file of precise orbits, SP3 (--sp3)",
+    "sbas": "a log of SBAS messages (--sbas)", "receiver": "a receiver's log", "nmea": "an NMEA log",
+    "novatel": "a NovAtel log", "rtklib": "a solution of RTKLIB (.pos)", "gpx": "a GPX file", "table": "a table",
+    "android": "a log of Android's GnssLogger, which writes a RINEX file beside it", "mate": "a table of EGNSS MATE",
     "geojson": "a JSON file", "kml": "a KML file", "osm": "a file of OpenStreetMap", "xml": "an XML file",
     "rdf": "an RDF file", "ifc": "an IFC file", "dxf": "a DXF file", "gml": "a GML file", "gpkg": "a GeoPackage",
     "shp": "a Shapefile", "fgb": "a FlatGeobuf file", "pbf": "a file of OpenStreetMap (.pbf)", "toml": "a TOML file",
@@ -43,6 +46,7 @@ _TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
     ),
     "geojson": re.compile(rb"\A\s*\{"),
     "dxf": re.compile(rb"\A\s*(?:999\s*\n.*\n\s*)*0\s*\n\s*SECTION"),
+    "android": re.compile(rb"\A# ?\r?\n|\A# Header Description|\ARaw,"),
     "nmea": re.compile(rb"\$(?:[A-Z]{2}(?:GGA|RMC|ZDA|GSA|GSV|GLL|VTG|GNS|GST|TXT)|P[A-Z]{3})"),
     "novatel": re.compile(rb"^[#%](?:BEST(?:GNSS)?POSA|INSPVA[SX]?A|[A-Z0-9]+A),", re.MULTILINE),
     "rtklib": re.compile(rb"^%.*(?:latitude|ecef|baseline|program|GPST|UTC|JST)", re.MULTILINE),
@@ -92,6 +96,11 @@ def find_kind(path: FilePath) -> FileKind:
     if any(mark in header for mark in ",;\t|") and any(letter.isalpha() for letter in header):
         return "mate" if {"TRACK_EDGE_ID", "TRACK_SEGMENT_TYPE"} <= {*re.split("[,;\t]", header.upper())} else "table"
     return _ENDINGS.get(ending(path), "unknown")
+
+
+def wrong_kind(path: FilePath, expected: str) -> InputFileError:
+    """Return the error of a file of another kind than is expected."""
+    return InputFileError(path, f"is {KIND_WORDS[find_kind(path)]}; {expected} was expected")
 
 
 def has_times(path: FilePath) -> bool:

@@ -12,7 +12,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, text_lines
+from railfix.core.files import FilePath, read_text
 
 _BLOCK: Final = 4096  #: Rows that are read before they become compact.
 _SEPARATORS: Final = (";", "\t", "|")  #: Separators of columns other than the comma.
@@ -130,7 +130,7 @@ def read_named_columns(path: FilePath) -> NamedColumns:
 
     InputFileError: it is none.
     """
-    return parse_named_columns(text_lines(path), path)
+    return parse_named_columns(read_text(path).splitlines(), path)
 
 
 def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:

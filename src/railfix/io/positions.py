@@ -15,7 +15,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.tables import plural
 from railfix.core.timescale import from_week, utc_to_gpst
 from railfix.gnss.observations import first_problems
-from railfix.io.file_kind import FileKind, find_kind
+from railfix.io.file_kind import FileKind, find_kind, wrong_kind
 from railfix.io.nmea import read_nmea
 from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtklib_positions, skip_broken
 from railfix.io.receiver.log import read_receiver_positions
@@ -154,10 +154,8 @@ def read_positions(
     elif kind == "gpx":
         log = _read_gpx(path)
     else:
-        raise InputFileError(
-            path,
-            "is no log of positions: RTKLIB's solution (.pos), NMEA, GPX, NovAtel ASCII, UBX, SBF, or a table (CSV) "
-            "whose first line names its columns was expected",
+        raise wrong_kind(
+            path, "a log of positions: RTKLIB's solution (.pos), NMEA, GPX, NovAtel ASCII, UBX, SBF, or a table (CSV)"
         )
     if antennas == "one" and len(log.antennas) > 1:
         raise InputFileError(path, f"has positions of {' and '.join(log.antennas)}; give those of one antenna")

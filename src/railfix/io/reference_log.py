@@ -230,17 +230,17 @@ class Acceleration:
 def read_pulses(path: FilePath) -> Pulses:
     """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
 
-    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the distance
-    run; with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. InputFileError: no such
-    table, times that do not rise, a direction other than 1 and -1.
+    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``pulse`` the number of a
+    pulse, as `railfix run` takes it, ``distance_m`` the distance run; with none of them each row is one pulse. A column
+    ``direction`` of 1 and -1 gives the sign. InputFileError: no such table, times that do not rise, a direction other
+    than 1 and -1.
     """
     table = _sensor_table(path)
     time = _rising_times(table)
-    kind = "count" if "count" in table else "distance" if "distance_m" in table else "pulse"
-    if kind == "pulse":
-        count = np.arange(len(table), dtype=np.float64)
-    else:
-        count = table.numbers("count" if kind == "count" else "distance_m")
+    names = {"count": "count", "pulse": "pulse", "distance_m": "distance"}
+    name = next((name for name in names if name in table), "")
+    kind = names.get(name, "pulse")
+    count = table.numbers(name) if name else np.arange(len(table), dtype=np.float64)
     if "direction" in table:
         direction = table.numbers("direction")
         wrong = ~np.isin(direction, (-1.0, 1.0))

@@ -18,7 +18,7 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io.file_kind import KIND_WORDS, POSITIONS, find_kind
+from railfix.io.file_kind import POSITIONS, find_kind, wrong_kind
 from railfix.io.logs import read_navigation
 from railfix.io.positions import read_positions
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
@@ -239,8 +239,7 @@ def survey_files(
                 runs.append(run_of_log(log, limits))
                 continue
             if kind not in ("observations", "receiver", "mate"):
-                what = f"is {KIND_WORDS[kind]}; positions or a log of observations were expected"
-                raise InputFileError(path, what)
+                raise wrong_kind(path, "a log of positions or observations")
             own = not nav and kind == "receiver"
             if not nav and not own:
                 message = "is a log of observations, which needs navigation files: give --nav"

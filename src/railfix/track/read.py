@@ -12,7 +12,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending
-from railfix.io.file_kind import GDAL, KIND_WORDS, find_kind
+from railfix.io.file_kind import GDAL, find_kind, wrong_kind
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum
 from railfix.track.point_files import read_csv_segment, read_geojson_segments
@@ -193,8 +193,8 @@ def _read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
         from railfix.track.xml_files import read_xml_segments
 
         return read_xml_segments(file, reading)
-    raise InputFileError(
+    raise wrong_kind(
         file,
-        f"is {KIND_WORDS[kind]}; a track map was expected: a table (CSV), GeoJSON, KML, GPX, OpenStreetMap, LandXML, "
-        "railML, IFC, RDF of RINF, GeoPackage, Shapefile, FlatGeobuf, GML or DXF",
+        "a track map (a table, GeoJSON, KML, GPX, OpenStreetMap, LandXML, railML, IFC, RDF of RINF, GeoPackage, "
+        "Shapefile, FlatGeobuf, GML or DXF)",
     )

@@ -16,7 +16,7 @@ from railfix.core.arrays import Bytes, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
-from railfix.io.file_kind import find_kind
+from railfix.io.file_kind import find_kind, wrong_kind
 from railfix.io.receiver.framing import SbasFrames
 from railfix.io.receiver.log import scan_pieces
 from railfix.ranges.sbas.messages import (
@@ -59,9 +59,7 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
         if text[60:80].startswith("RINEX VERSION / TYPE"):
             if text[20:21] == "B":
                 return "rinex"
-            raise InputFileError(
-                path, f"is RINEX of type {text[20:21]!r}, type B (broadcast data) was expected", line=1
-            )
+            raise wrong_kind(path, "a log of SBAS messages, or RINEX of type B,")
         if _RTKLIB.fullmatch(line):
             return "rtklib"
         if _EMS.fullmatch(line):
