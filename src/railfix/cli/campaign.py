@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
-from railfix.cli.command import SIGNALLED, raise_exit
+from railfix.cli.command import raise_exit
 from railfix.cli.console import (
     TableConsole,
     prepare_kernels,
@@ -122,7 +121,7 @@ def _prepare_worker() -> None:
     for each in _ENDING:
         signal.signal(each, _end)
     if signal.sigpending() & {*_ENDING}:
-        os._exit(SIGNALLED + signal.SIGINT)
+        signal.raise_signal(signal.SIGKILL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
 
 

@@ -27,7 +27,7 @@ class XmlLine:
 
 def read_root(path: FilePath) -> Element:
     """Return the root of an XML file; InputFileError where it is none."""
-    content = read_bytes(path)
+    content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros
     try:
         text: str | bytes = content.decode("utf-8")
     except UnicodeDecodeError:  # in the encoding that the file declares

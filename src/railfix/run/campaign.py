@@ -6,8 +6,8 @@ together are one hive-partitioned data set: ``pl.scan_parquet(out / "runs/**/pos
 
 from __future__ import annotations
 
-import os
 import re
+import signal
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
@@ -201,10 +201,11 @@ def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
     """Position one run; a worker process that is interrupted meanwhile ends, once the run has removed its folder."""
     try:
         return position_run(run)
-    except SystemExit as end:
+    except SystemExit:
         if parent_process() is None:
             raise
-        os._exit(int(end.code or 0))
+        signal.raise_signal(signal.SIGKILL)
+        raise
 
 
 def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:
