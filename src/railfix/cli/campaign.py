@@ -9,11 +9,12 @@ from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
 
+from railfix.cli.command import raise_exit
 from railfix.cli.console import (
     TableConsole,
     prepare_kernels,
@@ -108,6 +109,29 @@ def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: floa
     sys.stderr.flush()
 
 
+#: Signals that end a worker process: Ctrl-C, and that of the pool whose other worker has ended.
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM)
+
+
+def _prepare_worker() -> None:
+    """Let the signals that were blocked while a worker process began end it.
+
+    polars, once imported, takes the place of the default handlers, and ignores Ctrl-C.
+    """
+    for each in _ENDING:
+        signal.signal(each, _end)
+    if signal.sigpending() & {*_ENDING}:
+        signal.raise_signal(signal.SIGKILL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
+
+
+def _end(number_of_signal: int, frame: object) -> None:
+    """End by way of an exception, which a second signal does not disturb."""
+    for each in _ENDING:
+        signal.signal(each, signal.SIG_IGN)
+    raise_exit(number_of_signal, frame)
+
+
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
     """Yield the executor, and the errors by which it reports that a worker process is gone.
@@ -115,9 +139,12 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
     SettingsError: the scheduler does not exist, or `distributed` is not installed.
     """
     if scheduler is None:
-        context, default = get_context("spawn"), (signal.SIGINT, signal.SIG_DFL)
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=signal.signal, initargs=default) as pool:
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
             try:
+                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # of the worker processes, until they are prepared
+                for _ in range(workers):
+                    pool.submit(int)
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
                 yield pool, (BrokenExecutor,)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)

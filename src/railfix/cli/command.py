@@ -166,8 +166,8 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program: ending signals clean up first, and a closed standard output is no error."""
-    for name, handler in (("SIGTERM", _raise_exit), ("SIGHUP", _raise_exit), ("SIGPIPE", _end_at_closed_pipe)):
+    """Run the program: signals that end it clean up first, and a reader that stops reading is no error."""
+    for name, handler in (("SIGTERM", raise_exit), ("SIGHUP", raise_exit), ("SIGPIPE", _end_at_closed_pipe)):
         if number := getattr(signal, name, None):
             signal.signal(number, handler)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -187,7 +187,7 @@ def run_program(app: typer.Typer) -> NoReturn:
     sys.exit(code)
 
 
-def _raise_exit(number: int, _frame: object) -> None:
+def raise_exit(number: int, _frame: object) -> None:
     """End by way of an exception, so that staging folders are removed."""
     raise SystemExit(SIGNALLED + number)
 

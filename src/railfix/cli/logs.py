@@ -26,7 +26,6 @@ from railfix.evaluate.inputs import TABLES, list_position_tables, read_run
 from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.tables import round_floats
 from railfix.run.convert import write_mcap
-from railfix.run.doctor import examine_files
 from railfix.run.inputs import LogReading, input_path
 from railfix.run.locate import LocateInputs, locate_files
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files, write_last_place
@@ -231,6 +230,8 @@ def doctor(
 
     Exit codes: 0 everything fits; 3 a file is missing; 5 something does not fit, is missing or of no known kind.
     """
+    from railfix.run.doctor import examine_files
+
     diagnosis = examine_files(files)
     problems = diagnosis.problems
     if as_json:
@@ -238,7 +239,7 @@ def doctor(
         raise typer.Exit(5 if problems else 0)
     console = TableConsole()
     verdict = f"{plural(problems, 'problem')} to fix" if problems else "the files fit together"
-    console.print(f"{len(diagnosis.findings)} files: {verdict}")
+    console.print(f"{plural(diagnosis.findings, 'file')}: {verdict}")
     for problem in problems:
         console.print(f"- {problem}")
     if diagnosis.command:

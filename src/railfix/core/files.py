@@ -181,7 +181,7 @@ def unpacked_file(path: FilePath) -> Iterator[Path]:
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)
-    if not head.startswith((ZIP, COMPRESS, *STREAMS)) or (head.startswith(ZIP) and _is_document(path)):
+    if not head.startswith((ZIP, COMPRESS, *STREAMS)):
         yield Path(path)
         return
     with tempfile.TemporaryDirectory(prefix="railfix-") as folder:
@@ -196,11 +196,6 @@ def unpacked_file(path: FilePath) -> Iterator[Path]:
         with open_stream(path, content="bytes") as stream, target.open("wb") as file:
             shutil.copyfileobj(stream, file, _COPY_BYTES)
         yield target
-
-
-def _is_document(path: FilePath) -> bool:
-    """Return whether a zip archive is a document of its own (a spreadsheet), by its name."""
-    return Path(path).suffix.lower() in (".xlsx", ".ods")
 
 
 def read_bytes(path: FilePath) -> bytes:
@@ -228,19 +223,6 @@ def read_text(path: FilePath) -> str:
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise InputFileError(path, "is not UTF-8 text; save the file as UTF-8", line=line) from None
-
-
-def text_lines(path: FilePath) -> Iterator[str]:
-    """Yield the lines of a decompressed UTF-8 file, without a byte order mark and without their ends."""
-    number = 0
-    with open_stream(path) as stream, io.TextIOWrapper(stream, encoding="utf-8") as text:  # type: ignore[type-var]
-        try:
-            for line in text:
-                number += 1
-                yield from line.splitlines()
-        except UnicodeDecodeError:
-            message = "is not UTF-8 text; save the file as UTF-8"
-            raise InputFileError(path, message, line=number + 1) from None
 
 
 def ending(path: FilePath) -> str:

@@ -47,6 +47,8 @@ def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
     maps = [name for name in names if name.lower().endswith((".kml", ".shp"))]
     if len(names) == 1 or len(maps) == 1:
         return maps[0] if maps else names[0]
+    if {"[Content_Types].xml", "mimetype"} & {*names}:
+        raise InputFileError(path, "is a spreadsheet or another document; save it as CSV, and give that")
     shown = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
     raise InputFileError(path, f"is a zip archive of {len(names)} files ({shown}); unpack it, and name the files")
 

@@ -30,9 +30,9 @@ from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, has_position
 from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, list_position_tables, read_run
 from railfix.evaluate.integrity import STANFORD_COLUMNS
 from railfix.evaluate.place import TrackFiles, find_trajectory
+from railfix.io.file_kind import find_kind
 from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
-from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
 from railfix.run.campaign import CampaignProgress, CampaignRun, position_runs
 from railfix.run.inputs import Antenna, RunInputs
@@ -122,7 +122,7 @@ def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> s
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:
         return f"no row of RTKLIB: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
-    if any(is_receiver_log(read_head(path)) for path in inputs.front):
+    if any(find_kind(path) == "receiver" for path in inputs.front):
         return "no row of RTKLIB: the log is not RINEX (railfix convert makes it so)"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
