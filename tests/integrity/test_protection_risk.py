@@ -8,12 +8,12 @@ from math import comb, prod
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 import raim_oracle as oracle
 from protection_oracle import Event, hypotheses, kind_of, products
 from railfix.core.errors import SettingsError
-from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
+from railfix.integrity.protection import MOST_EXCLUDED, RiskBudget, k_factor
 from railfix.integrity.protection.risk import FEW, allocate, set_sums
 
 pytestmark = pytest.mark.requirement("C2")
@@ -29,13 +29,11 @@ def test_k_of_a_risk_on_both_sides_of_a_line():
             k_factor(risk)
 
 
-def test_constants_of_do_229():
-    """V: 1e-7 in one dimension; H, PA: 2e-9 in one; H, NPA: 5e-9 in two, that is 1e-7 an hour, half, 10 samples."""
-    assert round(k_factor(1e-7), 2) == K_V
-    assert round(k_factor(2e-9), 1) == K_H_PA
-    assert round(float(np.sqrt(chi2.isf(0.5e-7 / 10.0, 2))), 2) == K_H_NPA
-    # Along a line it would be less.
-    assert k_factor(0.5e-7 / 10.0) < K_H_NPA - 0.3
+def test_k_along_a_line_is_that_of_do_229_in_one_dimension():
+    """Appendix J: 5.33 vertical (1e-7), 6.0 horizontal, precision approach (2e-9); 6.18 is of two dimensions."""
+    assert round(k_factor(1e-7), 2) == 5.33
+    assert round(k_factor(2e-9), 1) == 6.0
+    assert k_factor(0.5e-7 / 10.0) < 6.18 - 0.3
 
 
 def test_risk_of_an_hour_is_divided_among_its_samples():
