@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-import raim_oracle as oracle
+import raim_cases
 from protection_oracle import Event, hypotheses, kind_of, products
 from railfix.core.errors import SettingsError
 from railfix.integrity.protection import MOST_EXCLUDED, RiskBudget, k_factor
@@ -114,10 +114,10 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(
 ) -> None:
     """Faults that no hypothesis covers are taken off; the rest is shared; false alarms among all separations."""
     systems = "GGGEEECC"
-    ranges = oracle.made(np.array([700.0]), systems, seed=3)
+    ranges = raim_cases.made(np.array([700.0]), systems, seed=3)
     weight = ranges.weight.copy()
     weight[0, 1] = 0.0
-    _, model = oracle.solved(replace(ranges, weight=weight), np.array([700.0]))
+    _, model = raim_cases.solved(replace(ranges, weight=weight), np.array([700.0]))
     risk = RiskBudget(
         risk_per_hour=1e-4,
         samples_per_hour=100.0,
@@ -177,7 +177,7 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(
 def test_more_hypotheses_are_asked_for_only_where_the_rest_is_too_likely() -> None:
     """The usual priors: satellites, pairs, sides with one, both sides, a wrong map with one or a side, and no more."""
     systems = "G" * 9 + "E" * 9
-    _, model = oracle.solved(oracle.made(np.array([700.0]), systems, seed=3), np.array([700.0]))
+    _, model = raim_cases.solved(raim_cases.made(np.array([700.0]), systems, seed=3), np.array([700.0]))
     sides = np.zeros((1, 2, 18), dtype=bool)
     sides[0, 0, :5], sides[0, 1, 9:14] = True, True
 
@@ -201,10 +201,10 @@ def test_the_risk_of_an_epoch_is_divided_alike_alone_and_among_others(length: in
     systems, count = "GGGGEEEEC", 24
     random = np.random.default_rng(4)
     arc = np.full(count, 700.0)
-    ranges = oracle.made(arc, systems, seed=3)
+    ranges = raim_cases.made(arc, systems, seed=3)
     weight = ranges.weight.copy()
     weight[random.random(count) < 0.3, 1] = 0.0
-    _, model = oracle.solved(replace(ranges, weight=weight), arc)
+    _, model = raim_cases.solved(replace(ranges, weight=weight), arc)
     out = random.integers(0, 3, count)
     sides = np.zeros((count, 2, len(systems)), dtype=bool)
     sides[:, 0, [0, 2]] = True

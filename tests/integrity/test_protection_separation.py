@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import protection_oracle
+import raim_cases
 import raim_oracle as oracle
 from railfix import kernels
 from railfix.integrity.protection import RiskBudget, protection_level
@@ -46,7 +47,7 @@ def recorded(ranges: Ranges, systems: str, arc_m: Array, **options: Any) -> tupl
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels.hypotheses, "tails_of_hypotheses", record)
-        protection_level(linear_model(ranges, oracle.LINE, arc_m), list(systems), **options)
+        protection_level(linear_model(ranges, raim_cases.LINE, arc_m), list(systems), **options)
     (call,) = calls
     return call
 
@@ -55,7 +56,7 @@ def solved_with_and_without_map(
     ranges: Ranges, arc_m: float, errors: Errors
 ) -> tuple[protection_oracle.Resolved, protection_oracle.Resolved]:
     """Return an epoch as it is, and with what was seen of the antenna's place instead of the map, or nothing."""
-    case, scale = oracle.problem_on_line(ranges, 0, arc_m), float(errors.scale[0])
+    case, scale = oracle.problem_on_line(ranges, 0, arc_m, raim_cases.LINE), float(errors.scale[0])
     n = len(case.channels)
     least = errors.least_sigma_m[0] if errors.least_sigma_m.shape[1] else None
     design, observed = case.design / scale, case.observed / scale
@@ -131,7 +132,7 @@ def compare_hypotheses(ranges: Ranges, systems: str, arc_m: Array, **options: An
 def test_every_hypothesis_equals_solving_without_its_satellites(systems: str, by_range: bool, seed: int) -> None:
     """Satellites, constellations, sides of the track, a wrong map, these together; noise scales, biases, overbounds."""
     rng, n, epochs = np.random.default_rng(seed), len(systems), len(ARC)
-    ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=SYSTEMS[systems], faults_m={1: 9.0, n - 1: 2.0})
+    ranges = raim_cases.made(ARC, systems, seed=seed, tie_sigma_m=SYSTEMS[systems], faults_m={1: 9.0, n - 1: 2.0})
     missing = (rng.random(ranges.weight.shape) < 0.1) & (n > 6)
     ranges = replace(ranges, weight=np.where(missing, 0.0, ranges.weight))
     known = np.tile(np.array([[0.25, 0.02], [0.02, 0.04]]), (epochs, 1, 1)) * np.array([1.0, 1.0, 0.0])[:, None, None]
@@ -151,11 +152,11 @@ def test_every_hypothesis_equals_solving_without_its_satellites(systems: str, by
         }
 
     compared: Counter[str] = Counter()
-    whole = protection_level(linear_model(ranges, oracle.LINE, ARC), list(systems), **options([0, 1, 2]))
+    whole = protection_level(linear_model(ranges, raim_cases.LINE, ARC), list(systems), **options([0, 1, 2]))
     for t in range(epochs):
         one = ranges.take(np.array([t]))
         compared += compare_hypotheses(one, systems, ARC[[t]], **options([t]))
-        alone = protection_level(linear_model(one, oracle.LINE, ARC[[t]]), list(systems), **options([t]))
+        alone = protection_level(linear_model(one, raim_cases.LINE, ARC[[t]]), list(systems), **options([t]))
         assert whole.level_m[t] == pytest.approx(alone.level_m[0], rel=1e-9, nan_ok=True)
     assert {"0", "1", "2"} <= set(compared)
     if n > 6:
@@ -172,8 +173,8 @@ def test_two_clocks_without_one_of_a_pair_leave_a_direction_free(scale: float) -
     10 km across and up gives 10 km times 0.0016, some 16 m, which no observation supports.
     """
     arc = ARC[:1]
-    ranges = oracle.made(arc, "GGGEEC", seed=193, faults_m={1: 12.0})
-    whitened = oracle.problem_on_line(ranges, 0, arc[0])
+    ranges = raim_cases.made(arc, "GGGEEC", seed=193, faults_m={1: 12.0})
+    whitened = oracle.problem_on_line(ranges, 0, arc[0], raim_cases.LINE)
     rows = whitened.design[:6, :3] / whitened.scale_of[:3] * whitened.sigma_m[:, None]
     free = np.cross(rows[1] - rows[0], rows[2] - rows[0])
     free /= np.linalg.norm(free)
@@ -194,7 +195,7 @@ def test_two_clocks_without_one_of_a_pair_leave_a_direction_free(scale: float) -
 
 def test_pair_of_a_clock_of_its_own_is_left_out_whole() -> None:
     """Each of the two is useless without the other: both gone is the same as one gone."""
-    ranges = oracle.made(ARC[:1], "GGGGGGEE", seed=6, faults_m={7: 25.0})
+    ranges = raim_cases.made(ARC[:1], "GGGGGGEE", seed=6, faults_m={7: 25.0})
     _, asked, (_, offset, sigma, _, _) = recorded(
         ranges, "GGGGGGEE", ARC[:1], risk=RiskBudget(risk_per_hour=1e-3, local_prior=4e-3)
     )
@@ -205,7 +206,7 @@ def test_pair_of_a_clock_of_its_own_is_left_out_whole() -> None:
 
 
 def test_excluded_satellites_count_among_those_that_may_be_faulty() -> None:
-    model = linear_model(oracle.made(ARC[:1], "GGGGGEEEE", seed=5), oracle.LINE, ARC[:1])
+    model = linear_model(raim_cases.made(ARC[:1], "GGGGGEEEE", seed=5), raim_cases.LINE, ARC[:1])
     risk = RiskBudget()
     spent = [protection_level(model, list("GGGGGEEEE"), risk=risk, n_excluded=e).unchecked_risk[0] for e in (0, 1, 2)]
     prior = risk.prior(list("GGGGGEEEE"))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import raim_oracle
+import raim_cases
 from plain_kernels import plain
 from railfix import kernels
 from railfix.core.arrays import read_only
@@ -175,7 +175,7 @@ def test_velocities_are_those_of_reweighted_least_squares() -> None:
 
 def test_arrays_of_any_caller_are_of_one_type_for_kernels() -> None:
     """Writable, read-only and strided arrays: nothing is compiled for them beyond what the first call compiles."""
-    frozen, line = raim_oracle.made(np.full(4, 731.0), "GGGGGEEE", seed=1), raim_oracle.LINE
+    frozen, line = raim_cases.made(np.full(4, 731.0), "GGGGGEEE", seed=1), raim_cases.LINE
     vertex = np.full(4, int(np.argmin(np.abs(line.arc_m - 731.0))))
     place = line.ecef_m[vertex]
     places = [read_only(place), place, np.asfortranarray(place)]
