@@ -32,9 +32,9 @@ def east_north_up(ecef_m: np.ndarray) -> np.ndarray:
 def range_on_turning_earth(sat_ecef_m: np.ndarray, place_ecef_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return distances in the frame of reception, to first order of the rotation, and the unit vectors of sight."""
     apart = sat_ecef_m - place_ecef_m
-    distance = np.linalg.norm(apart, axis=1)
-    turned = sat_ecef_m[:, 0] * place_ecef_m[1] - sat_ecef_m[:, 1] * place_ecef_m[0]
-    return distance + ROTATION_RADPS / LIGHT_MPS * turned, apart / distance[:, None]
+    distance = np.linalg.norm(apart, axis=-1)
+    turned = sat_ecef_m[..., 0] * place_ecef_m[..., 1] - sat_ecef_m[..., 1] * place_ecef_m[..., 0]
+    return distance + ROTATION_RADPS / LIGHT_MPS * turned, apart / distance[..., None]
 
 
 @dataclass(frozen=True)
