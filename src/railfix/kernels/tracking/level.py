@@ -25,9 +25,11 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking.layout import (
     ALL_IN_VIEW,
     ARC,
+    CLOCK_COUNT,
     CODES_AHEAD,
     CODES_BEHIND,
     MAP_RIGHT,
+    SLOW_CODE,
     SPEED,
     WRONG_MAP,
     Given,
@@ -68,16 +70,33 @@ def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
 
 
 @inner
-def _find_subfilters(state: State) -> Alternatives:
-    """Return the running sub-filters."""
-    first, size = len(state.hypothesis), 0
-    most = find_others(state) + ALL_IN_VIEW
-    away, sigma, probability = np.empty(most), np.empty(most), np.empty(most)
+def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple[float, float]:
+    """Return place and variance of a Gaussian with another prior sigma of the slow code error n.
+
+    The information at n changes by ``-d``, ``d = 1 / slow^2 - 1 / tilt^2``, so that the place is
+    ``s + P_sn d n / (1 - d P_nn)`` and its variance ``P_ss + P_sn^2 d / (1 - d P_nn)``.
+    """
+    less = 1.0 / slow_m**2 - 1.0 / tilt_m**2
+    gain = P[ARC, SLOW_CODE] * less / (1.0 - less * P[SLOW_CODE, SLOW_CODE])
+    return x[ARC] + gain * x[SLOW_CODE], P[ARC, ARC] + gain * P[ARC, SLOW_CODE]
+
+
+@inner
+def _find_subfilters(given: Given, state: State) -> Alternatives:
+    """Return the running sub-filters, and the filter where the ionosphere may be tilted."""
+    first, size, most = len(state.hypothesis), 0, find_others(state) + ALL_IN_VIEW
+    away, sigma, probability = np.empty(most + 1), np.empty(most + 1), np.empty(most + 1)
     for b in range(most):
         if state.source[b].running:
             away[size] = abs(state.x[first + b, ARC] - state.x[0, ARC])
             sigma[size], probability[size] = math.sqrt(state.P[first + b, ARC, ARC]), state.source[b].prior
             size += 1
+    slow_m, tilt_m = given.parameters[0].slow_code_m, given.line[0].tilt_m
+    if tilt_m > slow_m:
+        place, variance = widen_slow_code(slow_m, tilt_m, state.x[0], state.P[0])
+        away[size], sigma[size] = abs(place - state.x[0, ARC]), math.sqrt(variance)
+        probability[size] = given.parameters[0].level_tilt_prior
+        size += 1
     return Alternatives(away[:size], away[:size], sigma[:size], probability[:size])
 
 
@@ -125,6 +144,19 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
 
 
 @inner
+def find_unchecked(state: State) -> float:
+    """Return the probability of a fault common to a constellation in view without a sub-filter: the only one."""
+    source, satellites, total = state.source, len(state.code_bias), 0.0
+    for g in range(CLOCK_COUNT):
+        in_view = False
+        for k in range(satellites):
+            in_view = in_view or (source[k].running and source[k].clock == g)
+        if in_view and not source[satellites + g].running:
+            total += source[satellites + g].prior
+    return total
+
+
+@inner
 def write_level(given: Given, state: State, branches: Alternatives, far: float, result: Record) -> None:
     """Write the level of the first hypothesis and its parts.
 
@@ -146,6 +178,7 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
                 apart = away if math.isnan(apart) else max(apart, away)
             start = max(start, away + source[b].k * math.sqrt(state.P[first + b, ARC, ARC]))
     result.level_noise_m, result.separation_m = noise, apart
+    result.unchecked_prior = find_unchecked(state)
     result.level_m = result.ground_level_m = math.inf
     if math.isnan(apart) or contradicted:
         return
@@ -153,7 +186,7 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
     risk = parameters.level_risk - spent
     if risk <= 0.0:
         return
-    alternatives = join(join(_find_subfilters(state), branches), pairs)
+    alternatives = join(join(_find_subfilters(given, state), branches), pairs)
     result.ground_level_m = solve_level(sigma, alternatives.straight_m, alternatives, risk, start)
     if len(branches.sigma_m) == 0:
         result.level_m = result.ground_level_m
@@ -168,13 +201,10 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
 @inner
 def join(one: Alternatives, other: Alternatives) -> Alternatives:
     """Return the alternatives of both."""
-    first, size = len(one.sigma_m), len(one.sigma_m) + len(other.sigma_m)
-    both = Alternatives(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
-    for part, start in ((one, 0), (other, first)):
-        for a in range(len(part.sigma_m)):
-            both.along_m[start + a], both.straight_m[start + a] = part.along_m[a], part.straight_m[a]
-            both.sigma_m[start + a], both.probability[start + a] = part.sigma_m[a], part.probability[a]
-    return both
+    return Alternatives(
+        np.concatenate((one.along_m, other.along_m)), np.concatenate((one.straight_m, other.straight_m)),
+        np.concatenate((one.sigma_m, other.sigma_m)), np.concatenate((one.probability, other.probability)),
+    )  # fmt: skip
 
 
 @inner
