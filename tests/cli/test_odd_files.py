@@ -23,7 +23,7 @@ from odd_files import OddFile, write_odd_file
 from railfix.cli import app
 from railfix.core.geodesy import geodetic_from_ecef
 
-pytestmark = pytest.mark.requirement("A6")
+pytestmark = pytest.mark.requirement("G5")
 
 #: Epochs and rows of the good files.
 EPOCHS = 20

@@ -1,7 +1,7 @@
 """Protection levels along a line over Japan for an hour of MSAS messages: geometry alone, no receiver.
 
 ``python tests/studies/sbas_hour.py [FOLDER]`` with the recordings beside the checkout prints the tables of
-``docs/integrity-recordings.md``, and writes a picture of each line to the folder. The lines are great circles with a
+``docs/level-results.md``, and writes a picture of each line to the folder. The lines are great circles with a
 point a kilometre; every ten seconds each satellite of the navigation file that MSAS corrects (issues of data
 matched) gives a range of its own sigma, and the level is that of a train at the point.
 """

@@ -59,7 +59,6 @@ class _Program(LazyCommands):
         "error-model": "evaluate",
         "live": "run",
         "cn0-curve": "evaluate",
-        "demo": "simulate",
     }
 
 

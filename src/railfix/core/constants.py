@@ -60,5 +60,5 @@ CLEAR_M: Final = 200.0
 ON_TANGENT_M: Final = 1e-3
 
 #: Prior of one reflection off a side of the track that the largest data set supports: 2 of 30 943 blocks of 30 s of 70
-#: simulated hours in a city, 95 % (docs/integrity-campaign.md); recordings, which are shorter, support 1e-2.
+#: simulated hours in a city, 95 % (docs/level-results.md); recordings, which are shorter, support 1e-2.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5
