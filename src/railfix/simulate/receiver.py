@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Masks
+from railfix.core.arrays import Bytes, Floats, Masks
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.gnss.navigation import KeplerRecords
 from railfix.gnss.observations import ObservationHeader
-from railfix.simulate.constellation import newest_record
 from railfix.simulate.errors import ClockWalk, CommonErrors, satellite_key
 from railfix.simulate.scenario import ANTENNAS, ReceiverSettings, Scenario
 from railfix.simulate.settings import InterSystemSettings, NoiseSettings, TrackingSettings
@@ -215,26 +213,6 @@ class Receiver:
     def white(self, epochs: int) -> Floats:
         """Return the white noise of code, phase, Doppler and C/N0 for the next epochs, shape (T, M, 4)."""
         return self._rng.standard_normal((epochs, len(self.names), 4))
-
-
-def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Datetimes) -> Floats:
-    """Group delay of a signal's code against the broadcast clock, shape (T,) [s].
-
-    GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2), TGD on L5, whose ISC LNAV lacks.
-    Galileo I/NAV: BGD E5b/E1 likewise, on E5a that of both BGDs (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I,
-    which the clock refers to; TGD_B1Cp on B1C, TGD_B2ap on B2a.
-    """
-    row = newest_record(records, satellite, time)
-    letter = satellite[0]
-    frequency = CARRIER_FREQUENCY[letter]
-    if letter == "C":
-        of_band = {"1": records.group_delay_1_s, "2": records.group_delay_1_s, "5": records.group_delay_2_s}
-        return of_band[signal[0]][row] if signal[0] in of_band else np.zeros(len(row))
-    delay = records.group_delay_2_s if letter == "E" else records.group_delay_1_s
-    if signal[0] == "5":
-        scale = (frequency["1"] / frequency["5"]) ** 2
-        return np.asarray(delay[row] - (records.group_delay_1_s[row] * (1.0 - scale) if letter == "E" else 0.0))
-    return np.asarray(delay[row] * (frequency["1"] / frequency[signal[0]]) ** 2)
 
 
 _WALK = 5  #: Stream of random numbers of the walks.

@@ -15,14 +15,15 @@ from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
+from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.simulate.alignment import Alignment, build_alignment
-from railfix.simulate.constellation import SatelliteTable, links, simulate_navigation
+from railfix.simulate.constellation import SatelliteTable, links, newest_record, simulate_navigation
 from railfix.simulate.environment import Environment
 from railfix.simulate.environment.settings import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.errors import CommonErrors, fault_m
 from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
-from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, list_signals
+from railfix.simulate.receiver import Receiver, ReceiverClocks, list_signals
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 CN0_STEP_DBHZ: Final = 0.25  #: Receivers report C/N0 in steps [dB-Hz].
@@ -260,8 +261,9 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     extra = fault + receiver.offset_m + receiver.offset_drift_mps * tags[:, None]
     extra_rate = fault_rate + receiver.offset_drift_mps
     path = now.path_m[:, column] + clock[:, None] + extra
+    kepler = simulation.navigation.kepler
     delay = SPEED_OF_LIGHT * np.stack(
-        [group_delay_s(simulation.navigation.kepler, n, g, time) for n, g in simulation.channels], axis=1
+        [group_delay_s(kepler, g)[newest_record(kepler, n, time)] for n, g in simulation.channels], axis=1
     )
     code = path + ionosphere + delay + receiver.group_delay_error_m
     error = now.path_error_m[:, column] + scale * now.ionosphere_error_m[:, column]
