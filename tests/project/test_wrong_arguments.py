@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 import railfix
 from railfix.cli.ground import app
+from railfix.simulate import Scenario
 
 pytestmark = pytest.mark.requirement("G4")
 FILES = railfix.demo_files()
