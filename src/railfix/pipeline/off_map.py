@@ -29,9 +29,9 @@ def off_map_epochs(
 ) -> tuple[Masks, OffMapState]:
     """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
 
-    It leaves the map once all positions of the last `least_s` are off it, and returns once all of that time are on it:
-    a single position can be off the map by reflected signals, or on it by chance. The first position of a log decides
-    alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict, shape (T,).
+    The train leaves the map once all positions of the last `least_s` are off it, and returns once all of that time are
+    on it: a single position can be off the map by reflected signals, or on it by chance. The first position of a log
+    decides alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict, shape (T,).
     """
     off, known, since = state.off, state.known, state.since
     result = np.full(len(time), off)
