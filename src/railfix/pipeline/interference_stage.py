@@ -49,7 +49,7 @@ _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Statuses of positions that spoofing outranks, and those that jamming does.
 _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
-    Status.MAP_OFFSET,
+    Status.MAP_OFFSET, Status.MAP_END,
 ])  # fmt: skip
 #: Statuses of positions that failed a check by their ranges.
 _FAILED: Final = np.isin(np.arange(len(Status)), [

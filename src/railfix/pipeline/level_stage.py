@@ -206,16 +206,17 @@ def apply_verdicts(
 ) -> ProtectionResult:
     """Return the levels with the verdicts on the positions applied.
 
-    A level is valid at the position where the ranges were linearised. Where another position fits them equally well, it
-    is unavailable. Where a check has failed, or ranges and map contradict each other: alarm. Epochs that lose their
-    coordinates (`has`) lose the level; where it reaches a stretch of `Config.no_level_m` it is infinite.
+    A level is valid at the position where the ranges were linearised. Where another position fits them equally well, or
+    they put it beyond an end of the map, the level is unavailable. Where a check has failed, or ranges and map
+    contradict each other: alarm. Epochs that lose their coordinates (`has`) lose the level; where it reaches a stretch
+    of `Config.no_level_m` it is infinite.
     """
     level, verdict = protection.level, protection.status
     if config.no_level_m or not has.all():
         level = _where_it_holds(level, has, chainage_m, config)
         verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     verdict = np.where(_ALARMING[status], int(LevelStatus.ALARM), verdict)
-    doubtful = status == int(Status.AMBIGUOUS)
+    doubtful = np.isin(status, (Status.AMBIGUOUS, Status.MAP_END))
     verdict = np.where(doubtful & (verdict == int(LevelStatus.AVAILABLE)), int(LevelStatus.UNAVAILABLE), verdict)
     return copy_with(protection, level=level, status=verdict.astype(np.int8))
 

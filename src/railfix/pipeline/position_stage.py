@@ -405,6 +405,7 @@ def _status(
             (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,
             Status.AMBIGUOUS,
         ),
+        (constrained.overshoot_m > 0.0, Status.MAP_END),
     ]
     status = np.full(len(ranges), Status.OK, dtype=np.int8)
     for condition, value in reversed(conditions):

@@ -203,6 +203,11 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("protection_noise_m", "its part by noise without a fault", "tracked.level_noise_m"),
         Column("protection_separation_m", "largest distance of a sub-filter of the level", "tracked.separation_m"),
         Column(
+            "protection_unchecked",
+            "probability of faults that the level does not bound: one of the only constellation in view",
+            "tracked.unchecked_prior",
+        ),
+        Column(
             "over_reading_m",
             "how far the train may be behind: the level, at least 2 % of the distance since codes were used "
             "(`L_DOUBTOVER` less `Q_LOCACC`)",

@@ -31,7 +31,8 @@ from railfix.track import Trajectory, read_track
 SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
     "ambiguous": "another position on the line fits the ranges equally well",
-    "off_map": "at an end of the map, or too far from the position without the map",
+    "off_map": "beyond an end of the map, or too far from the position without the map",
+    "map_end": "at an end of the map: the ranges put it a little beyond",
     "too_few_satellites": "no position: too few usable satellites",
     "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",

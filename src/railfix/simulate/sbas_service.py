@@ -10,13 +10,13 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import FREQUENCY_L1
-from railfix.core.timescale import seconds, timedelta
+from railfix.core.timescale import timedelta
+from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.ranges.sbas.ionosphere import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
 from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
 from railfix.simulate.constellation import newest_record
 from railfix.simulate.errors import fault_m
-from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.settings import SbasSettings
 
 if TYPE_CHECKING:
@@ -216,13 +216,10 @@ class Service:
         at = self._instant(second)
         latitude, longitude = (np.array([point[k] for point in points]) for k in (1, 2))
         time = self._start + timedelta(at)
-        day_s = float(seconds(time - time.astype("datetime64[D]"))[0])
-        zenith = np.full(len(points), 90.0)
-        model = ionosphere_m(
-            self._simulation.navigation.klobuchar["G"], np.full(len(points), day_s), latitude, longitude, zenith,
-            np.zeros(len(points)), frequency_hz=FREQUENCY_L1,
-        )  # fmt: skip
-        places = latitude[:, None], longitude[:, None], zenith[:, None], np.zeros((len(points), 1))
+        zenith, north = np.full((len(points), 1), 90.0), np.zeros((len(points), 1))
+        coefficients, l1 = self._simulation.navigation.klobuchar["G"], np.array(FREQUENCY_L1)
+        model = klobuchar_delay_m(time, latitude, longitude, zenith, north, coefficients, l1)[:, 0]
+        places = latitude[:, None], longitude[:, None], zenith, north
         error = self._errors.ionosphere_m(np.repeat(at, len(points)), *places)[:, 0]
         total = self._simulation.scenario.sky.ionosphere_scale * model + error
         total = total + self._settings.delay_sigma_m * self._rng[_DELAY].standard_normal(len(points))

@@ -13,10 +13,12 @@ from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
 from railfix.core.files import FilePath, write_whole
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
+from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, SLOT_OF
 from railfix.ranges.sbas.messages import PREAMBLES, message_type
-from railfix.simulate.receiver import group_delay_s, list_signals
+from railfix.simulate.constellation import newest_record
+from railfix.simulate.receiver import list_signals
 from railfix.simulate.sbas_service import CLOCK, FAST_PERIOD_S, Field, Service, pack_message
 from railfix.simulate.settings import SbasSettings
 
@@ -114,7 +116,7 @@ class SimulatedDfmc(Service):
         for signals, added in zip((first, other), delay_m, strict=True):
             for k, (name, signal) in enumerate(zip(names, signals, strict=True)):
                 if name[0] == "G":
-                    added[k] += SPEED_OF_LIGHT * group_delay_s(kepler, name, signal, time)[0]
+                    added[k] += SPEED_OF_LIGHT * group_delay_s(kepler, signal)[newest_record(kepler, name, time)[0]]
         clock = self._errors.clock_error_m(at)[0] - (ratio * delay_m[0] - delay_m[1]) / (ratio - 1.0)
         clock = clock + self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(names))
         return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
