@@ -185,6 +185,49 @@ def test_height_tells_a_viaduct_from_the_line_below() -> None:
     assert np.abs(blind.probability - 0.5).max() < 0.01
 
 
+@pytest.mark.parametrize(
+    ("missing_m", "unmapped"), [(0.0, (0.0, 0.01)), (3.6, (0.01, 1.0)), (7.2, (0.99, 1.0)), (15.0, (0.99, 1.0))]
+)
+def test_a_track_that_the_map_lacks_is_possible(missing_m: float, unmapped: tuple[float, float]) -> None:
+    """The train runs beside the only track, for ten minutes, with an error of 0.8 m toward it."""
+    x = np.linspace(0.0, 8000.0, 161)
+    net = Network(tracks=(segment("M", *to_degrees(x, 0.0 * x)),), links=())
+    latitude, longitude = to_degrees(np.arange(1000.0, 7000.0, 10.0), np.full(600, max(missing_m - 0.8, 0.0)))
+    log = PlanLog(
+        path="made",
+        time=np.datetime64("2024-01-01", "ns") + np.arange(600) * np.timedelta64(1, "s"),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.full(600, 1.5),
+    )
+    for reverse in (False, True):
+        turned = replace(net, tracks=(net.tracks[0].reverse(),)) if reverse else net
+        matched = match(turned, log)
+        share = 1.0 - matched.probabilities.sum(axis=1)
+        assert (share >= unmapped[0]).all()
+        assert (share <= unmapped[1]).all()
+        assert (matched.track == (0 if missing_m < 5.0 else -1)).all()
+
+
+def test_a_track_that_the_map_lacks_stays_where_the_nearest_track_changes() -> None:
+    """7.2 m right of T0 and 6.8 m left of T1, which is nearer now and then and is drawn in the other direction."""
+    x = np.linspace(0.0, 8000.0, 161)
+    tracks = (segment("T0", *to_degrees(x, 0.0 * x)), segment("T1", *to_degrees(x[::-1], np.full(161, -14.0))))
+    net = Network(tracks=tracks, links=())
+    north = -7.2 + np.random.default_rng(2).normal(0.0, 1.0, 600)
+    latitude, longitude = to_degrees(np.arange(1000.0, 7000.0, 10.0), north)
+    log = PlanLog(
+        path="made",
+        time=np.datetime64("2024-01-01", "ns") + np.arange(600) * np.timedelta64(1, "s"),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.full(600, 1.5),
+    )
+    matched = match(net, log)
+    assert set(matched.candidates.track[:, 0].tolist()) == {0, 1}
+    assert (1.0 - matched.probabilities.sum(axis=1)).min() > 0.99
+
+
 def test_a_few_positions_far_off_move_no_train_to_the_track_beside() -> None:
     net = made_network(10.0)
     log, on = made_run(net, [0, 1, 3], rng=np.random.default_rng(5), sigma_m=0.3)

@@ -36,6 +36,10 @@ _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
 _LEAVE_BESIDE_COST: Final = 10.0
 _ENTER_BESIDE_COST: Final = 7.0
+#: And the same of a position that lies farther than this beyond an end of a track at which the map ends [m].
+_OPEN_COST: Final = 2.0
+_BEYOND_M: Final = 10.0
+_ROUNDED_M: Final = 1e-6
 #: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
@@ -95,6 +99,10 @@ class Transitions:
         #: Whether an end of the track is within reach, before and after each passage, shapes (n - 1, m).
         self._leaves = to_end[:-1] <= self._reach[:, None]
         self._enters = to_end[1:] <= self._reach[:, None]
+        ends = np.array([[(t, e) not in network.passages for e in (0, 1)] for t in range(len(network.tracks))])
+        at_end = ends[self._track] & (np.stack([self._place, self._rest], axis=-1) <= _ROUNDED_M)
+        #: Whether a position lies beyond an open end, shape (n, m).
+        self._opens = at_end.any(axis=2) & (np.abs(residuals.beyond_m) > _BEYOND_M)
 
     @property
     def changes(self) -> Masks:
@@ -108,8 +116,10 @@ class Transitions:
         m, free = len(before), self._clear[k + 1] * _shares_of_shifts()
         same = (before[:, None] == after) & (before[:, None] >= 0)
         share = np.full((m + len(SHIFTS_M) + 1, m + len(SHIFTS_M) + 1), np.exp(-_LEAVE_COST))
-        share[-1, :m], share[-1, -1] = np.exp(-_ENTER_COST), 1.0
-        share[:m, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
+        share[:m, -1] = np.where(self._opens[k], np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
+        share[-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
+        share[-1, -1] = 1.0
+        share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
         share[m:-1, :m] = np.exp(-_ENTER_BESIDE_COST)
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))

@@ -46,6 +46,8 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
         return _of_nodes(tracks)
     network, cuts = _divide(Network(tracks=tuple(tracks), links=()), tolerance_m)
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
+    if packed := [path for path in paths if ending(path) == ".pbf"]:
+        note += f"; {packed[0]} is read without the ids of its nodes, which 'osmium cat FILE.osm.pbf -o FILE.osm' keeps"
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
 
 

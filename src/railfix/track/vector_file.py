@@ -41,7 +41,7 @@ _OTHERS: Final = (
 #: Columns of the id of a feature; those that only exporters of OpenStreetMap write come first.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
-_ID: Final = re.compile(r"\W*(way|relation|[wr])?\W*(\d+)\)?")
+_ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
@@ -159,8 +159,8 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection."""
-    return tags.get("railway") == "railway_crossing"
+    """Return whether a node is a crossing of tracks without a connection: a slip has one."""
+    return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
 def read_overpass(path: str, elements: Any) -> list[Way]:
@@ -234,6 +234,7 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
         raise InputFileError(path, f"reading {ending(path)} maps needs pyogrio and shapely; {INSTALL}") from None
     _check_text(path)
     layers = []
+    pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # ids of nodes in .osm.pbf may be negative
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are no heights and not read
