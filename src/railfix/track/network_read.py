@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, read_text
+from railfix.core.files import FilePath, ending, read_text
 from railfix.io.file_kind import find_kind
 from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
