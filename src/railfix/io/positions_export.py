@@ -43,6 +43,7 @@ STATUS_COLOURS: Final[Mapping[str, str]] = {
     "lost": "#d55e00",
     "off_map": "#a3487e",
     "map_offset": "#a3487e",
+    "map_end": "#e69f00",
     "jamming_suspected": "#e69f00",
     "spoofing_suspected": "#d55e00",
     "other": "#767676",

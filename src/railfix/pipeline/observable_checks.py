@@ -1,8 +1,8 @@
 """Signs and units of Dopplers and carrier phases, by the range rates of the satellites.
 
 A satellite's own motion changes its range by up to 800 m/s, much more than a train's or a receiver clock's. The factor
-by which a constellation's Dopplers, or changes of its phases, follow it is 1; it is -1 with the wrong sign, and the
-wavelength where metres stand for cycles.
+between a constellation's Dopplers, or changes of its phases, and its range rates is 1; it is -1 with the wrong sign,
+and the wavelength if metres are given for cycles.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Least range rate of a satellite, against the median one of its constellation, that a factor is taken from [m/s].
+#: Least range rate of a satellite, relative to the median of its constellation, for a factor [m/s].
 _LEAST_RATE_MPS: Final = 100.0
 #: Satellites that give a factor, and how far their factors are from the median one: all, or all but one of at least
-#: `_MANY`. Of four satellites one with a cycle slip moves the median rate, and with it the factors of the others.
+#: `_MANY`. With four satellites, one cycle slip moves the median rate, and with it the factors of the others.
 _LEAST_SATELLITES: Final = 3
 _MANY: Final = 6
 _SPREAD: Final = 0.3
-#: Factors up to so far from 1 are right: a train's own speed is in them.
+#: Factors within this distance from 1 are correct: they include the train's own speed.
 _RIGHT: Final = 0.5
 #: Phases of epochs farther apart are not compared [s].
 _LONGEST_S: Final = 35.0
@@ -39,7 +39,7 @@ _NAMES: Final = {"G": "GPS", "J": "QZSS", "E": "Galileo", "C": "BeiDou", "R": "G
 class ObservableState:
     """State of the checks of one antenna after a chunk."""
 
-    #: Last factors of Dopplers and of phases, NaN for none so far, shape (2, L), by letter of the constellation, ""
+    #: Last factors of Dopplers and of phases, NaN before the first, shape (2, L), by letter of the constellation, ""
     #: for all together, shape (L,).
     factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
     letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
@@ -59,9 +59,10 @@ class CheckedObservables(NamedTuple):
 
 
 def check_observables(corrected: CorrectedRanges, state: ObservableState) -> CheckedObservables:
-    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, a sentence on each.
+    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, with one sentence for
+    each.
 
-    A factor counts until the next one of its constellation; before the first one, that of all constellations does.
+    A factor is valid until the next one of its constellation; before the first one, that of all constellations is used.
     """
     sight = corrected.satellites.position_ecef_m - corrected.near_ecef_m[:, None, :]
     sight = sight / np.linalg.norm(sight, axis=2, keepdims=True)
@@ -95,9 +96,9 @@ def check_observables(corrected: CorrectedRanges, state: ObservableState) -> Che
 
 
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
-    """Return the factor by which observed rates follow those of the satellites, shape (T,); NaN where it is unclear.
+    """Return the factor between observed rates and those of the satellites, shape (T,); NaN where it is unclear.
 
-    The median over satellites of one constellation, shape (T, K), each against their median.
+    The median over satellites of one constellation, shape (T, K), each relative to their median.
     """
     known = np.isfinite(observed_mps) & np.isfinite(expected_mps)
     few = known.sum(axis=1) <= _LEAST_SATELLITES
@@ -114,7 +115,7 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
 
 
 def _held(factor: Floats, before: float) -> Floats:
-    """Return the factors with each gap filled by the one before it."""
+    """Return the factors with each gap filled by the preceding factor."""
     values = np.concatenate([[before], factor])
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     return np.asarray(values[last][1:])
@@ -152,7 +153,7 @@ def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]
 
 
 def _sentence(kind: int, letter: str, factor: float, wavelength_m: float) -> str:
-    """Return what is wrong with the Dopplers or phases of a constellation."""
+    """Return the fault of the Dopplers or phases of a constellation."""
     if abs(factor + 1.0) <= _RIGHT:
         wrong = "have the wrong sign"
     elif abs(abs(factor) - wavelength_m) < 0.1:

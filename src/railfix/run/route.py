@@ -1,4 +1,4 @@
-"""Route of a log through a network of tracks, found from the log itself, and the tracks beside it as hypotheses.
+"""Route of a log through a network of tracks, found from the log itself, with neighbouring tracks as hypotheses.
 
 Conventional positions once a second are matched to the network (`railfix.track.network_match`); the most probable
 sequence of tracks is the route on which positions are computed, and every other track keeps its probability.
@@ -34,10 +34,11 @@ from railfix.track.network_route import find_route
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
-#: Tracks of the route this near count for a place on it [m], and how far lengths in plan and of the line differ.
+#: Tracks of the route within this distance are candidates for a position on it [m]; difference between lengths in plan
+#: and along the line.
 _REACH_M: Final = 50.0
 _LENGTHS_DIFFER: Final = 1e-3
-#: Least probability of a track beside the route that is written and named.
+#: Least probability of another track than the route's at which it is written and named.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
 #: Alternatives named in the notes; all are in ``run.json``.
@@ -49,11 +50,11 @@ _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
 #: Name of a track that the map does not have.
 NONE: Final = "none"
 
-#: Columns that positions on a network have besides.
+#: Additional columns of positions on a network.
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
-    "track": "track of the network on which the position lies, of the route found from the log",
+    "track": "track of the network on which the position lies, part of the route found from the log",
     "track_chainage_m": "distance in plan along that track from its first point, of the antenna",
-    "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the tracks beside it",
+    "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the alternatives",
     "unmapped_probability": "probability of a track that the map lacks, given the whole log",
     "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from that "
     "track; positive right of it",
@@ -75,7 +76,7 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Alternative:
-    """A stretch of the log on which a track beside the route is possible."""
+    """A stretch of the log on which another track is possible."""
 
     track: str
     instead_of: str
@@ -108,12 +109,12 @@ class RouteOfLog:
     """Route of a log through a network, with the probability of every track near it."""
 
     network: Network
-    tracks: tuple[int, ...]  #: Of the route, in order.
+    tracks: tuple[int, ...]  #: Tracks of the route, in order.
     #: Tracks of the most probable sequence that no route joins to those: the train turned back over them.
     left_out: tuple[int, ...]
     log: PlanLog  #: Positions that were matched, in the frame of the network.
     matched: Matched
-    time: np.datetime64  #: Of the frame's epoch.
+    time: np.datetime64  #: Coordinates at the frame's epoch.
     reading: TrackReading
 
     @cached_property
@@ -125,9 +126,9 @@ class RouteOfLog:
         """Return whether the train is, with more than a risk, on another track than where it was placed on the route.
 
         A track that the map lacks counts beyond `_UNMAPPED_LIMIT`: up to there it is in the levels (`with_unmapped`).
-        By the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside another has
-        its own probability. At the positions matched before and after each time: the track between two that are known
-        may be another.
+        Computed from the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside
+        another has its own probability. At the positions matched before and after each time: the track between two that
+        are known may be another.
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
@@ -172,7 +173,7 @@ class RouteOfLog:
 
     @cached_property
     def alternatives(self) -> tuple[Alternative, ...]:
-        """Stretches on which a track beside the route has a probability of at least 1 %, the most probable first."""
+        """Stretches on which another track has a probability of at least 1 %, the most probable first."""
         names = (*self.network.names, NONE)
         beside = np.where(self._on_route > 0.0, -1, self.matched.candidates.track)
         found = []
@@ -208,7 +209,7 @@ class RouteOfLog:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The route and what may be instead of it, one sentence each."""
+        """Notes on the route and its alternatives, one sentence each."""
         low = float(self.probability.min())
         first = (
             f"route found from the log: {', '.join(self.names)}; chainage rises in this order; its probability is "
@@ -236,7 +237,7 @@ class RouteOfLog:
     def on_tracks(self, table: pl.DataFrame, line: Track) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Return a table of positions with `ON_TRACK_COLUMNS`, and every track near each position (`TRACK_COLUMNS`).
 
-        `line` is the route, whose sections are its tracks. There are no rows of tracks where there is no position.
+        `line` is the route, whose sections are its tracks. Epochs without a position have no rows of tracks.
         """
         chainage = table["chainage_m"].to_numpy()
         ecef = table.select("x_m", "y_m", "z_m").to_numpy()
@@ -308,7 +309,7 @@ class LogPositions:
     parts: Callable[[], Iterable[Observations]]  #: The pieces of the log in order of time.
     navigation: Navigation
     config: Config
-    time: np.datetime64 | None  #: Of the epoch of frames; None without a navigation record.
+    time: np.datetime64 | None  #: Epoch of frames; None without a navigation record.
     reading: TrackReading
     antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
 
@@ -331,7 +332,7 @@ class LogPositions:
         )  # fmt: skip
 
     def route(self, network: Network) -> RouteOfLog:
-        """Find the route of the log through a network; MismatchError where there is none, or no position."""
+        """Find the route of the log through a network; MismatchError where there is no route, or no position."""
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         own = self.positions
