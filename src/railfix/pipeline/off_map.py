@@ -38,7 +38,7 @@ def off_map_epochs(
 ) -> tuple[Masks, OffMapState]:
     """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
 
-    The train leaves the map once all positions of the last `least_s` are off it: a single position can be off the map by
+    The train leaves the map once all positions of the last `least_s` are off it: a single position can be off it by
     reflected signals. It returns once all of that time are on it, and their mean offset is within a metre or half of
     what it was before: beside the line, on a track that the map lacks, positions are on it by chance. The first
     position of a log decides alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict;

@@ -43,10 +43,10 @@ _ROUNDED_M: Final = 1e-6
 #: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
-#: Difference of way and distance at which a joint is half as probably passed as where they agree [m].
+#: Difference of path length and distance at which a joint is half as probable as where they agree [m].
 _PASSING_M: Final = 5.0
-#: What a change of track has to gain, in positions on the right track; less over a joint, known by its probability: on
-#: a short track of a switch there are one or two positions.
+#: Least gain of a change of track, in positions on the right track; less at a joint, which is known by its probability:
+#: on a short track of a switch there are one or two positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
@@ -59,7 +59,7 @@ _BLOCK: Final = 1024  #: Positions whose probabilities are in memory at a time, 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """Positions beside their candidates, n rows with up to m candidates each.
+    """Positions with their candidates, n rows with up to m candidates each.
 
     `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
     without a candidate; `beyond_m` how far the position lies beyond an end; `above_m` its height above the track, NaN
@@ -85,14 +85,14 @@ class Residuals:
 
 
 class Transitions:
-    """Probability of each passage from the candidates of an epoch to those of the next."""
+    """Probability of each transition from the candidates of an epoch to those of the next."""
 
     def __init__(self, network: Network, candidates: Candidates, step_m: Floats, residuals: Residuals) -> None:
         self._network, self._step = network, step_m
         self._track, self._place = candidates.track, candidates.chainage_m
         self._clear, self._moved, self._turned = residuals.clear, residuals.moved_m, residuals.turned
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: Ways from an end of a track to the ends of others, and how far they were looked for.
+        #: Path lengths from an end of a track to the ends of others, and the search limit.
         self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
         self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
         to_end = np.fmin(self._place, self._rest)
@@ -130,8 +130,8 @@ class Transitions:
         return np.asarray(share / share.sum(axis=1, keepdims=True))
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Way between two places over ends of tracks [m], infinite beyond reach: about the distance of the positions
-        where a train passes the joint between them.
+        """Path length between two positions over ends of tracks [m], infinite beyond the limit: about the distance of
+        the positions where a train passes the joint between them.
         """
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
@@ -172,7 +172,9 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the shares of the states of an urn in equilibrium, and its passages after a time, from row to column."""
+    """Return the equilibrium probabilities of the states of an urn, and its transition matrix after a time, from row to
+    column.
+    """
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -188,7 +190,7 @@ def _binomial(count: int, share: float) -> Floats:
 
 
 class _CommonError:
-    """Lattice of the common error: C places in plan by U heights, and its `first` probabilities (C, U)."""
+    """Lattice of the common error: C positions in plan by U heights, and its `first` probabilities (C, U)."""
 
     def __init__(self, residuals: Residuals) -> None:
         self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
@@ -203,7 +205,7 @@ class _CommonError:
         return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
-        """Return what is expected, a time before, of values of shape (..., C, U)."""
+        """Return the expectation, a time before, of values of shape (..., C, U)."""
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
@@ -232,7 +234,7 @@ def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
     off_track = offset[known, None] - across @ lattice.plan_m.T
     square = off_track**2
     if beyond.any():
-        # the common error may lie along the track, too: what is left of the way beyond the end counts
+        # the common error may lie along the track, too: the remaining distance beyond the end counts
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
         square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
     cost = np.full((m + len(SHIFTS_M) + 1, *lattice.first.shape), np.inf)
@@ -255,7 +257,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     n, m = residuals.offset_m.shape
     lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
     length = _BLOCK // len(lattice.up_m)
-    # of a long log the first positions of the blocks are kept, and each block is passed again on the way back
+    # of a long log the first positions of the blocks are stored, and each block is computed again on the backward pass
     firsts: dict[int, Floats | None] = {0: None}
     if n > length:
         firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}
@@ -318,7 +320,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """The sequence of the largest gains: neighbouring pairs expected to be right, less what changes have to gain."""
+    """The sequence of the largest gains: neighbouring pairs expected to be right, less the required gain of changes."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])
