@@ -2,8 +2,8 @@
 
 A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, or
 none of the map, and the common error of the positions: a first-order Gauss-Markov process east, north and up, on a
-lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). What is left of each position has heavy tails (Student's t)
-and lasts for `correlation_s`, of which each position has its share.
+lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The residual of each position has heavy tails (Student's t)
+and is constant over `correlation_s`, so each position counts by its fraction of that time.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
 from railfix.track.network import Candidates, Network
 
-#: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0:
-#: that of a position 5 standard deviations from its track.
+#: Negative logarithm of the likelihood of a position on a missing track, relative to one at distance 0: that of a
+#: position 5 standard deviations from its track.
 _UNMAPPED_COST: Final = 5.0
 _FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of positions.
 #: Negative logarithms of the probability, from a position to the next, of passing to another track without connection,
-#: of leaving the map and of entering it: to a track beside by way of none is as improbable as the jump.
+#: of leaving the map and of entering it: passing to a parallel track off the map is as improbable as the jump.
 _JUMP_COST: Final = 17.0
 _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
-#: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
+#: Length by which a connection may exceed the straight distance of two positions [m], and its fraction of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
-#: Difference of way and distance at which a joint is half as probably passed as where they agree [m].
+#: Difference of path length and distance at which a joint is half as probable as where they agree [m].
 _PASSING_M: Final = 5.0
-#: What a change of track has to gain, in positions on the right track; less over a joint, known by its probability: on
-#: a short track of a switch there are one or two positions.
+#: Least gain of a change of track, in positions on the right track; less at a joint, which is known by its probability:
+#: on a short track of a switch there are one or two positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
@@ -46,12 +46,13 @@ _BLOCK: Final = 1024  #: Positions whose probabilities are in memory at a time, 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """Positions beside their candidates, n rows with up to m candidates each.
+    """Positions with their candidates, n rows with up to m candidates each.
 
     `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
-    without a candidate; `beyond_m` how far the position lies beyond an end; `above_m` its height above the track, NaN
-    without (n, m). `weight` is the share of the correlation time that a position covers, `seconds` since the one
-    before; `sigma_m` and `common_m` are of one horizontal axis, `common_up_m` is 0 where heights do not count.
+    without a candidate; `beyond_m` is the distance of the position beyond an end; `above_m` its height above the track,
+    NaN without (n, m). `weight` is the fraction of the correlation time that a position covers, `seconds` the time
+    since the previous one; `sigma_m` and `common_m` are of one horizontal axis; `common_up_m` is 0 where heights are
+    not used.
     """
 
     across: Floats
@@ -67,13 +68,13 @@ class Residuals:
 
 
 class Transitions:
-    """Probability of each passage from the candidates of an epoch to those of the next."""
+    """Probability of each transition from the candidates of an epoch to those of the next."""
 
     def __init__(self, network: Network, candidates: Candidates, step_m: Floats) -> None:
         self._network, self._step = network, step_m
         self._track, self._place = candidates.track, candidates.chainage_m
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: Ways from an end of a track to the ends of others, and how far they were looked for.
+        #: Path lengths from an end of a track to the ends of others, and the search limit.
         self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
         self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
         to_end = np.fmin(self._place, self._rest)
@@ -102,8 +103,8 @@ class Transitions:
         return np.asarray(share / share.sum(axis=1, keepdims=True))
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Way between two places over ends of tracks [m], infinite beyond reach: about the distance of the positions
-        where a train passes the joint between them.
+        """Path length between two positions over ends of tracks [m], infinite beyond the limit: about the distance of
+        the positions where a train passes the joint between them.
         """
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
@@ -128,7 +129,9 @@ class Transitions:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the shares of the states of an urn in equilibrium, and its passages after a time, from row to column."""
+    """Return the equilibrium probabilities of the states of an urn, and its transition matrix after a time, from row to
+    column.
+    """
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -144,7 +147,7 @@ def _binomial(count: int, share: float) -> Floats:
 
 
 class _CommonError:
-    """Lattice of the common error: C places in plan by U heights, and its `first` probabilities (C, U)."""
+    """Lattice of the common error: C positions in plan by U heights, and its `first` probabilities (C, U)."""
 
     def __init__(self, residuals: Residuals) -> None:
         self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
@@ -159,7 +162,7 @@ class _CommonError:
         return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
-        """Return what is expected, a time before, of values of shape (..., C, U)."""
+        """Return the expectation, a time before, of values of shape (..., C, U)."""
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
@@ -181,12 +184,12 @@ def _student(square: Floats) -> Floats:
 
 
 def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
-    """Of a position given each state, shape (m + 1, C, U), up to a factor."""
+    """Likelihood of a position given each state, shape (m + 1, C, U), up to a factor."""
     known = np.flatnonzero(np.isfinite(residuals.offset_m[k]))
     across, beyond = residuals.across[k, known], residuals.beyond_m[k, known, None]
     square = (residuals.offset_m[k, known, None] - across @ lattice.plan_m.T) ** 2
     if beyond.any():
-        # the common error may lie along the track, too: what is left of the way beyond the end counts
+        # the common error may lie along the track, too: the remaining distance beyond the end counts
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
         square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
     cost = np.full((residuals.offset_m.shape[1] + 1, *lattice.first.shape), np.inf)
@@ -203,7 +206,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     n, m = residuals.offset_m.shape
     lattice = _CommonError(residuals)
     length = _BLOCK // len(lattice.up_m)
-    # of a long log the first positions of the blocks are kept, and each block is passed again on the way back
+    # of a long log the first positions of the blocks are stored, and each block is computed again on the backward pass
     firsts: dict[int, Floats | None] = {0: None}
     if n > length:
         firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}
@@ -231,8 +234,8 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
 
 @dataclass(frozen=True)
 class _At:
-    """One position going forward: probabilities of all states given the positions so far and its likelihood, shapes
-    (m + 1, C, U), and the passages to it, shape (m + 1, m + 1).
+    """Forward pass at one position: probabilities of all states given the positions so far and their likelihood, shapes
+    (m + 1, C, U), and the transitions to it, shape (m + 1, m + 1).
     """
 
     share: Floats
@@ -243,7 +246,7 @@ class _At:
 def _forward(
     residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
 ) -> Iterator[tuple[int, _At]]:
-    """Yield positions from one, where all states have given probabilities, to before another."""
+    """Yield positions from one, at which all states have given probabilities, to before another."""
     states = residuals.offset_m.shape[1] + 1
     share, move = first, np.eye(states)
     for k in range(start, stop):
@@ -260,7 +263,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """The sequence of the largest gains: neighbouring pairs expected to be right, less what changes have to gain."""
+    """The sequence of the largest gains: neighbouring pairs expected to be right, less the required gain of changes."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

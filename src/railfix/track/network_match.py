@@ -25,14 +25,14 @@ from railfix.track.track import ANOTHER_PLACE_M
 SIGMA_M: Final = 4.0
 _LEAST_SIGMA_M: Final = 1.0
 _ALONE_M: Final = 15.0  #: Distance of the next track from a position by which sigmas are estimated [m].
-#: Positions farther from the track than this, and than their noise so many times, are beside it for another reason [m].
+#: Positions farther from the track than this, and than this multiple of their noise, are off it for another reason [m].
 _LARGEST_LEVEL_M: Final = 5.0
 _BESIDE: Final = 3.0
 _ENOUGH: Final = 30  #: Positions that an estimate needs.
 #: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map, antenna height.
 _COMMON_M: Final = 2.0
 _COMMON_UP_M: Final = 4.0
-_COMMON_SHARE: Final = 0.7  #: Share of the stated standard deviation that the common error has where it is smaller.
+_COMMON_SHARE: Final = 0.7  #: Fraction of the stated standard deviation that the common error has where it is smaller.
 _BEST: Final = 0.1  #: Quantile of the stated standard deviations that the common error has where it is smaller.
 #: Least distance to which tracks are looked for [m], and farther ones in standard deviations and metres.
 _WITHIN_M: Final = 30.0
@@ -41,10 +41,10 @@ _FARTHEST_M: Final = 100.0
 #: Positions farther from all tracks than this many times that distance, for less than a time [s], are wrong.
 _FAR: Final = 6.0
 _WRONG_S: Final = 60.0
-#: Tracks that are looked at from such positions, and what stands where there is none.
+#: Number of tracks near such positions that are examined, and the placeholder for none.
 _MOST_FAR: Final = 8
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
-#: What stands where a position was not matched.
+#: Placeholder of a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
 _STEP_S: Final = 0.4  #: Time between positions that state none, or one before the last [s].
@@ -54,7 +54,9 @@ _APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLog(RowArrays):
-    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None or NaN without any."""
+    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None or NaN
+    where missing.
+    """
 
     path: str
     time: Datetimes
@@ -66,7 +68,7 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions, in the frame of the satellites, in that of the network; else MismatchError."""
+        """Return the positions, given in the frame of the satellites, in that of the network; else MismatchError."""
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -85,7 +87,7 @@ class PlanLog(RowArrays):
 
 
 def _check_region(network: Network, log: PlanLog) -> None:
-    """Raise MismatchError where every position lies further than `ANOTHER_PLACE_M` from the network."""
+    """Raise MismatchError where every position is farther than `ANOTHER_PLACE_M` from the network."""
     known = np.isfinite(log.latitude_deg) & np.isfinite(log.longitude_deg)
     if not known.any():
         return
@@ -107,7 +109,7 @@ def _check_region(network: Network, log: PlanLog) -> None:
 class Matched:
     """Positions on a network, n rows; `track` is the most probable sequence (-1: none), `offset_m` in plan, positive to
     the right; `probability` is given the whole log, NaN without or with a wrong position; `probabilities`, shape (n,
-    m), of each candidate, the rest to 1 of no mapped track; `notes` say what was assumed of the log.
+    m), of each candidate, the rest to 1 of no mapped track; `notes` state assumptions on the log.
     """
 
     track: Indices
@@ -217,7 +219,7 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
     """Return the standard deviation of distances by their median where one track alone is near, and how it was found.
 
-    Where tracks lie beside each other, errors of the positions cannot be told from another track.
+    With parallel tracks, errors of the positions cannot be distinguished from another track.
     """
     latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
     near = network.near(latitude, longitude, within_m=_FARTHEST_M, most=2)
@@ -242,7 +244,7 @@ def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
-    """Find tracks near each position, and farther ones where it lies far from all."""
+    """Find tracks near each position, and farther ones where it is far from all."""
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
     far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
@@ -291,7 +293,7 @@ def _residuals(
     sigma_m: Floats,
     correlation_s: float,
 ) -> Residuals:
-    """Return the positions of some rows of a log beside their candidates."""
+    """Return the positions of some rows of a log with their candidates."""
     known = candidates.track >= 0
     row = np.nonzero(known)[0]
     track, chainage = candidates.track[known], candidates.chainage_m[known]
@@ -329,14 +331,14 @@ def _residuals(
         sigma_up_m=sigma_up,
         weight=weight,
         seconds=seconds,
-        # that of the transformation of the map is one of all positions, too
+        # the error of the map's transformation is common to all positions, too
         common_m=float(np.hypot(min(_COMMON_SHARE * np.quantile(sigma_m, _BEST), _COMMON_M), network.datum_plan_m)),
         common_up_m=max(_COMMON_SHARE * float(np.quantile(sigma_up, _BEST)), _COMMON_UP_M) if counts else 0.0,
     )
 
 
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
-    """Return the matched positions put on their rows of a log, the others without."""
+    """Return the matched positions on their rows of a log, and the other rows without one."""
 
     def over(values: Any, empty: float) -> Any:
         full = np.full((count, *values.shape[1:]), empty, dtype=values.dtype)
