@@ -91,6 +91,7 @@ def run_files(
     ):
         entries, packages = inputs.entries(hashing, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
+        config = config if line.route is None else line.route.with_unmapped(config)
         sensors, units = read_samples_and_units(inputs)
         balises = load_balises(inputs.balises, inputs.balise_list, inputs.virtual_balises, line.track, config)
         base = base_log(inputs.base, options)
@@ -162,7 +163,7 @@ def open_inputs(
     offset = None if inputs.vehicle is None else read_vehicle(inputs.vehicle).antennas.get(antenna)
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
-        reading=options.track, antenna_up_m=0.0 if offset is None else offset.up_m,
+        reading=options.track, antenna_up_m=None if offset is None else offset.up_m,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,

@@ -7,7 +7,7 @@ sequence of tracks is the route on which positions are computed, and every other
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -28,7 +28,7 @@ from railfix.pipeline.received import known_from_start
 from railfix.run.inputs import TrackReading
 from railfix.track import Track
 from railfix.track.frames import in_map_frame
-from railfix.track.network import Network
+from railfix.track.network import UNMAPPED_PRIOR, Network
 from railfix.track.network_match import Matched, PlanLog, match, plan_log
 from railfix.track.network_route import find_route
 
@@ -45,6 +45,8 @@ _LEAST_NAMED: Final = 0.01
 _NAMED: Final = 8
 #: Epochs of an alternative nearer than this belong together [s].
 _TOGETHER_S: Final = 60.0
+#: Probability of a track that the map lacks beyond which the log speaks for one: twice what it has before the log.
+_UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
 #: Name of a track that the map does not have.
 NONE: Final = "none"
 
@@ -53,6 +55,10 @@ ON_TRACK_COLUMNS: Final[dict[str, str]] = {
     "track": "track of the network on which the position lies, part of the route found from the log",
     "track_chainage_m": "distance in plan along that track from its first point, of the antenna",
     "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the alternatives",
+    "unmapped_probability": "probability of a track that the map lacks, given the whole log",
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from that "
+    "track; positive right of it",
+    "unconstrained_up_m": "height of that position above the track, less the antenna's where the vehicle is known",
 }
 #: Columns of the table of tracks near each position.
 TRACK_COLUMNS: Final[dict[str, str]] = {
@@ -63,7 +69,8 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
     "probability": "of this track given the whole log; the rows of an epoch and antenna add up to 1",
     "chainage_m": "distance in plan along the track from its first point, of the nearest point to the position",
     "kilometrage_m": "the line's own marking there, where the map has one",
-    "offset_m": "distance in plan from the position to the track",
+    "offset_m": "distance in plan from the position, which lies on the route, to the track",
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map from the track; positive right of it",
 }
 
 
@@ -118,14 +125,18 @@ class RouteOfLog:
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
         """Return whether the train is, with more than a risk, on another track than where it was placed on the route.
 
+        A track that the map lacks counts beyond `_UNMAPPED_LIMIT`: up to there it is in the levels (`with_unmapped`).
         Computed from the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside
         another has its own probability. At the positions matched before and after each time: the track between two that
         are known may be another.
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
-        shares = (self._share_at(np.clip(k, 0, last), chainage_m) for k in (np.maximum(after - 1, 0), after))
-        return np.asarray(np.fmin(*shares) < 1.0 - risk)
+        known = (
+            self._share_at(k, chainage_m) + np.minimum(self.unmapped[k], _UNMAPPED_LIMIT)
+            for k in (np.clip(after - 1, 0, last), np.clip(after, 0, last))
+        )
+        return np.asarray(np.fmin(*known) < 1.0 - risk)
 
     def _share_at(self, epoch: Indices, chainage_m: Floats) -> Floats:
         """Probability of the tracks of the route near chainages, at matched positions; of all without a chainage."""
@@ -142,6 +153,19 @@ class RouteOfLog:
     def unmapped(self) -> Floats:
         """Probability of a track that the map does not have, shape (n,)."""
         return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
+
+    def with_unmapped(self, config: Config) -> Config:
+        """Return the settings with the probability of a track that the map lacks as the prior of a wrong map.
+
+        It is the largest of the log, at most `_UNMAPPED_LIMIT`: where it is more there is no level.
+        """
+        share = float(np.clip(self.unmapped.max(), 0.0, _UNMAPPED_LIMIT))
+        limits, risk, araim = config.tracking, config.risk, config.araim
+        return config.replaced(
+            tracking=limits.replaced(level_map_prior=max(limits.level_map_prior, share)),
+            risk=risk.replaced(map_prior=max(risk.map_prior, share)),
+            araim=araim.replaced(map_prior=max(araim.map_prior, share)),
+        )
 
     @cached_property
     def _on_route(self) -> Floats:
@@ -232,6 +256,8 @@ class RouteOfLog:
             pl.Series("track", names[number].tolist(), dtype=pl.String),
             pl.Series("track_chainage_m", along, nan_to_null=True),
             pl.Series("track_probability", share, nan_to_null=True),
+            pl.Series("unmapped_probability", np.where(known, self.unmapped[epoch], np.nan), nan_to_null=True),
+            *self._unconstrained(epoch, number),
         )
         candidates, probability = self.matched.candidates.track[epoch], self.matched.probabilities[epoch]
         beside = np.where(self._on_route[epoch] > 0.0, -1, candidates)
@@ -252,10 +278,27 @@ class RouteOfLog:
                 pl.Series("chainage_m", at, nan_to_null=True),
                 pl.Series("kilometrage_m", self.network.kilometrage_on(track, at), nan_to_null=True),
                 pl.Series("offset_m", offset, nan_to_null=True),
+                self._unconstrained(epoch[row], track)[0],
             )
         )
         order = np.lexsort((-long["probability"].to_numpy(), row))
         return positions, long[order]
+
+    def _unconstrained(self, epoch: Indices, track: Indices) -> tuple[pl.Series, pl.Series]:
+        """Return offset and height of matched positions from tracks near them, shape (n,); null without one."""
+        near = self.matched.candidates
+        same = (near.track[epoch] == track[:, None]) & (track >= 0)[:, None]
+        column = same.argmax(axis=1)
+        offset, up = (np.full(len(track), np.nan) for _ in range(2))
+        rows = np.flatnonzero(same.any(axis=1))
+        offset[rows] = near.offset_m[epoch[rows], column[rows]]
+        _, _, height = self.network.course_on(track[rows], near.chainage_m[epoch[rows], column[rows]])
+        if self.log.height_m is not None:
+            up[rows] = self.log.height_m[epoch[rows]] - height - (self.log.antenna_up_m or 0.0)
+        return (
+            pl.Series("unconstrained_offset_m", offset, nan_to_null=True),
+            pl.Series("unconstrained_up_m", up, nan_to_null=True),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +311,7 @@ class LogPositions:
     config: Config
     time: np.datetime64 | None  #: Epoch of frames; None without a navigation record.
     reading: TrackReading
-    antenna_up_m: float = 0.0  #: Height of the antenna above the rails, where the vehicle is known [m].
+    antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
 
     @cached_property
     def positions(self) -> PositionLog:
@@ -293,18 +336,14 @@ class LogPositions:
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         own = self.positions
-        of_antenna = plan_log(self.path, own.time, own.ecef_m, own.sigma_m)
-        on_rails = replace(of_antenna, height_m=np.asarray(of_antenna.height_m) - self.antenna_up_m)
-        positions, _ = on_rails.transform_to(network, **self.reading.motion)
+        of_antenna = plan_log(self.path, own.time, own.ecef_m, own.sigma_m, antenna_up_m=self.antenna_up_m)
+        positions, _ = of_antenna.transform_to(network, **self.reading.motion)
         matched = match(network, positions)
         used = np.flatnonzero(np.isfinite(matched.probability))
         positions, matched = positions.take(used), matched.take(used)
         tracks, left_out = find_route(network, matched)
         if not tracks:
-            raise MismatchError(
-                f"{self.path}: no position lies near a track of the network; is it the map of this region, and its CRS "
-                "right?"
-            )
+            raise MismatchError(f"{self.path}: no position lies on a track of the network{_beside(network, matched)}")
         return RouteOfLog(
             network=network,
             tracks=tuple(tracks),
@@ -314,3 +353,15 @@ class LogPositions:
             time=self.time,
             reading=self.reading,
         )
+
+
+def _beside(network: Network, matched: Matched) -> str:
+    """Return how the positions lie to the tracks that they are near but not on, the end of a sentence."""
+    track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
+    near = track >= 0
+    if not near.any():
+        return "; is it the map of this region, and its CRS right?"
+    most = int(np.bincount(track[near]).argmax())
+    away = float(np.median(offset[track == most]))
+    side = "right" if away > 0.0 else "left"
+    return f": they lie {abs(away):.1f} m {side} of {network.names[most]}; the map lacks their track, or is displaced"

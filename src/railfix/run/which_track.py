@@ -127,7 +127,7 @@ _MOST_TRACKS: Final = 64
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
     """Tracks of a network near a position in its frame, east and north of it; MismatchError without one within 60 m."""
-    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
+    latitude, longitude, height = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
     near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=_MOST_TRACKS)
     numbers = sorted(int(t) for t in near.track[0] if t >= 0)
     if not numbers:
@@ -136,7 +136,9 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
     ground = ecef_from_geodetic(latitude, longitude, 0.0)
     radius = float(np.linalg.norm(origin_ecef_m)) / float(np.linalg.norm(ground))
     tracks = []
+    at = {int(t): near.chainage_m[0, [j]] for j, t in enumerate(near.track[0]) if t >= 0}
     for k in numbers:
+        _, _, above = network.course_on(np.array([k]), at[k])
         rows = slice(network.first_point[k], network.first_point[k + 1])
         points = (network.points_m[rows] - ground) @ axes.T * radius
         close = np.flatnonzero(np.hypot(*points.T) < _POINTS_M)
@@ -144,7 +146,8 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
         part = points[max(first - 1, 0) : last + 2]
         part = part[np.concatenate([[True], np.linalg.norm(np.diff(part, axis=0), axis=1) > 1e-3])]
         if len(part) > 1:
-            tracks.append(YardTrack(name=network.names[k], points_m=part))
+            up = float(above[0]) - height
+            tracks.append(YardTrack(name=network.names[k], points_m=part, up_m=up, sigma_up_m=network.sigma_height_m))
     return tracks
 
 

@@ -19,12 +19,18 @@ from railfix.core.arrays import Floats, Indices, Integers, RowArrays, join_rows,
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files
-from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
+from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 from railfix.track.trajectory import NearestOnPolyline, project_on_segments
 
 if TYPE_CHECKING:
     import networkx as nx
 
+#: Prior probability that the train is on a track that the map lacks, and the least distance of two tracks [m].
+UNMAPPED_PRIOR: Final = 0.05
+CLEARANCE_M: Final = 3.0
+#: Height of an antenna above the rails that is not known, and its standard deviation [m]: from bogies to roofs.
+ANTENNA_UP_M: Final = 2.5
+ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Way over which the direction of an end is taken [m].
 _NEAR_WAY_M: Final = 5_000.0  #: Ways searched before the whole network is [m].
 _SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
@@ -177,6 +183,11 @@ class Network:
     def sigma_plan_m(self) -> float:
         """Standard deviation of the tracks in plan: the worst that the files state, or that of a surveyed map."""
         return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
+
+    @cached_property
+    def sigma_height_m(self) -> float:
+        """Standard deviation of the tracks' heights, likewise."""
+        return sigma_of_files(self.tracks, "sigma_height_m", SIGMA_HEIGHT_M)
 
     @cached_property
     def datum_plan_m(self) -> float:

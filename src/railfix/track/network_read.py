@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, read_text
+from railfix.core.files import FilePath, ending, read_text
 from railfix.io.file_kind import find_kind
 from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
@@ -47,6 +47,8 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
         return _of_nodes(tracks)
     network, cuts = _divide(Network(tracks=tuple(tracks), links=()), tolerance_m)
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
+    if packed := [path for path in paths if ending(path) == ".pbf"]:
+        note += f"; {packed[0]} is read without the ids of its nodes, which 'osmium cat FILE.osm.pbf -o FILE.osm' keeps"
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
 
 

@@ -43,7 +43,7 @@ _OTHERS: Final = (
 #: Columns of the id of a feature; those that only exporters of OpenStreetMap write come first.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
-_ID: Final = re.compile(r"\W*(way|relation|[wr])?\W*(\d+)\)?")
+_ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
@@ -161,8 +161,8 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection."""
-    return tags.get("railway") == "railway_crossing"
+    """Return whether a node is a crossing of tracks without a connection: a slip has one."""
+    return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
 def read_overpass(path: str, elements: Any) -> list[Way]:
@@ -233,6 +233,7 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
         what = KIND_WORDS[find_kind(path)]
         raise InputFileError(path, f"is {what}, which pyogrio and shapely read; {INSTALL}") from None
     layers = []
+    pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # ids of nodes in .osm.pbf may be negative
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are not heights and are not read
