@@ -49,6 +49,7 @@ class ChangedLine(AttackedLine):
         if self.rng.random() < 0.01 * self.calm:
             self.restart_older()
         super().step()
+        self.check_apart()
 
     def check_held(self) -> None:
         """As before, of trains that have been heard since the start: an older copy does not know what others hold."""
@@ -56,6 +57,27 @@ class ChangedLine(AttackedLine):
         self.trains = {n: train for n, train in kept.items() if n not in self.centre.awaited}
         super().check_held()
         self.trains = kept
+
+    def sent(self) -> list[Authority]:
+        """As before, with the orders to brake."""
+        messages = [*self.centre.watch(self.now_s), *self.centre.work(self.now_s)]
+        self.centre.command_points(self.centre.state)
+        return messages
+
+    def is_clear(self, train: AttackedTrain, back_m: float) -> bool:
+        """Return whether a train can go back so far: over points that lie as it has passed them, and into no other."""
+        path = LINE.pieces(train.rear_m, train.rear_m - train.direction * back_m, train.tracks)
+        under = [point for point in LINE.points() if overlap([(0, *LINE.zone_m(point))], path)]
+        lie = all(self.points[p] == train.tracks.get(p[0]) and p not in self.moving for p in under)
+        return lie and not any(overlap(path, self.pieces(n)) for n in self.trains if n != train.number)
+
+    def check_apart(self) -> None:
+        """No train has run into another one, where all have moved by what was granted alone."""
+        for number, train in self.trains.items():
+            for other in self.trains:
+                astray = train.astray or self.trains[other].astray
+                if number < other and not astray and overlap(self.pieces(number), self.pieces(other)):
+                    self.violations["trains overlap"] += 1
 
     def any_train(self) -> AttackedTrain:
         return self.rng.choice(list(self.trains.values()))
@@ -240,6 +262,8 @@ class ChangedLine(AttackedLine):
         for point in LINE.points():
             zone = sorted(train.direction * end for end in LINE.zone_m(point))
             if train.direction * before < zone[0] <= train.direction * train.front_m:
+                if point[1] == train.direction and self.points[point] != train.tracks.get(point[0]):
+                    self.violations["points run through from the wrong track"] += 1
                 state = self.centre.state.points[point]
                 locked = train.number in state.locked and state.wanted == self.points[point]
                 if not locked and not self.centre.awaited:
