@@ -13,6 +13,7 @@ from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import PreciseEphemeris
 from railfix.gnss.orbits.ephemerides import POINTS
 from railfix.gnss.plausible_records import plausible_radius
+from railfix.io.file_kind import wrong_kind
 
 #: Time systems that are GPS time up to nanoseconds; SP3-a files name none and are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
@@ -53,7 +54,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     grid[row[::-1], column[::-1]] = np.array(numbers)[::-1]
     position, clock = grid[..., :3], grid[..., 3]
     known = (position != 0.0).any(axis=-1) & np.isfinite(position).all(axis=-1)
-    wrong = ~plausible_radius(satellites, position * 1e3)  # zeros, where there is none, among them
+    wrong = ~plausible_radius(satellites, position * 1e3)  # zeros, for missing ones, among them
     if known.any() and wrong[known].all():
         radius = float(np.median(np.linalg.norm(position[known], axis=-1)))
         what = f"its satellites are {radius:,.0f} km from the Earth's centre; are the positions in metres? SP3 has km"
@@ -76,7 +77,7 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
     """Read epochs [ns of GPS time], satellites, positions [km] and clocks [us] of a file."""
     lines = read_text_lines(path)
     if not lines or lines[0][:2] not in ("#a", "#b", "#c", "#d"):
-        raise InputFileError(path, "is not an SP3 file: its first line must begin with #a, #b, #c or #d", line=1)
+        raise wrong_kind(path, "a file of precise orbits, SP3 (its first line begins with #a, #b, #c or #d)")
     system = _time_system(path, lines)
     epoch: int | None = None
     states: list[tuple[int, str, list[float]]] = []

@@ -50,8 +50,14 @@ class AntennaVerdict:
 
     @property
     def leading(self) -> PositionFigures:
-        """Return the figures that stand first: those of the filter, or of single epochs without it."""
+        """Return the leading figures: those of the filter, or of single epochs without it."""
         return self.filter or self.single_epochs
+
+    @property
+    def is_usable(self) -> bool:
+        """Return whether any position lies on the map."""
+        off_map = 0 if self.filter is not None else self.leading.statuses.get(Status.OFF_MAP.text, 0)
+        return self.leading.positions > off_map
 
     def figures(self) -> Iterator[tuple[str, str, str]]:
         """Yield the name of each figure, its leading value, and that of single epochs where the filter leads."""
@@ -140,7 +146,7 @@ def _describe(antenna: AntennaVerdict) -> str:
 
 
 def _describe_checks(figures: Sequence[PositionFigures]) -> str:
-    """Return how many single epochs passed every check, and what most of the others are."""
+    """Return how many single epochs passed every check, and the most frequent status of the others."""
     passed, epochs = sum(of.passed for of in figures), sum(of.epochs for of in figures)
     failed = _count_statuses(figures)
     del failed[Status.OK.text]

@@ -14,6 +14,7 @@ from railfix.core.arrays import Floats, places_in_groups
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.io.file_kind import find_kind
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
@@ -42,7 +43,7 @@ _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
 def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
-    """Raise SettingsError with all options that a raster needs besides; InputFileError where it is none."""
+    """Raise SettingsError with all further options that a raster needs; InputFileError where it is none."""
     with _open_raster(path) as (_, crs):
         own = crs.is_compound
     asked = []
@@ -72,7 +73,7 @@ def with_heights(
         return _from_positions(track, source, sigma_m, reach_m=np.inf)
     if ending(source) in RASTERS:
         return _from_raster(track, source, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
-    if ending(source) == ".csv":
+    if find_kind(source) == "table":
         table = read_named_columns(source)
         by_place = {"chainage_m", "kilometrage_m"} & set(table.cells)
         if by_place and not {"latitude_deg", "x_m"} & set(table.cells):
@@ -104,7 +105,7 @@ def _dense(track: Track) -> Track:
 
 @contextmanager
 def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
-    """Yield a raster and its CRS; InputFileError where there is none."""
+    """Yield a raster and its CRS; InputFileError where it names none."""
     try:
         import rasterio
     except ImportError:
@@ -207,7 +208,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
     place, height, sigma = place[order], height[near][order], sigma[near][order]
     target = track.chainage_m
     fitted = _smooth(target, place, height, sigma, reach_m=reach_m)
-    # errors of neighbouring positions are common to them: the standard deviation is that of one position
+    # neighbouring positions have common errors: the standard deviation is that of one position
     spread = float(np.median(sigma)) if sigma_m is None else sigma_m
     if np.isnan(fitted).any():
         first = float(target[np.isnan(fitted)][0])
@@ -244,7 +245,7 @@ def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, rea
 
 
 def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, kernel_m: float) -> Floats:
-    """Return the heights of weighted straight lines about each target; NaN beside all positions."""
+    """Return the heights of weighted straight lines about each target; NaN where no position is near."""
     fitted = np.full(len(target), np.nan)
     bounds = np.searchsorted(place, [target - 3.0 * kernel_m, target + 3.0 * kernel_m]).T
     for k, (low, high) in enumerate(bounds.tolist()):

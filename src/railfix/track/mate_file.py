@@ -1,9 +1,8 @@
 """Track tables of EGNSS MATE: edges of lines, circles and clothoids, with gradients and cant.
 
 https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the arc from its north pole, a
-clothoid by its point without curvature, the azimuth there and the arc from it. The tables do not say which side is
-positive, nor what the constant of a clothoid is: the form is taken in which a segment meets those before and after it
-on its edge.
+clothoid by its point of zero curvature, the azimuth there and the arc from it. The tables state neither which side is
+positive, nor the constant of a clothoid: the form in which a segment meets its neighbours on its edge is used.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import polars as pl
 
 from railfix.core.arrays import cheapest_path
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, text_lines
+from railfix.core.files import FilePath
 from railfix.io.mate import mate_table, read_mate
 from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import choose_crs
@@ -35,16 +34,16 @@ _POINT: Final = ("TRACK_EDGE_ID", "POSITION", *_NUMBERS[:3])
 
 
 def read_edges(path: Path, reading: MapReading) -> list[Segment]:
-    """Read the edges of S_DM_TRACKPOINT, or S_DM_TRACK_SEGMENT_POSITION in Parquet, by default in ETRS89."""
+    """Read the edges of S_DM_TRACKPOINT, by default in ETRS89, or those of S_DM_TRACK_SEGMENT_POSITION."""
     if mate_table(path) != "S_DM_TRACKPOINT":
-        return read_mate_segments(path, reading)
+        return _read_segments(path, reading)
     table = read_mate(path, _POINT).sort("TRACK_EDGE_ID", "POSITION", maintain_order=True)
     edges = table.group_by("TRACK_EDGE_ID", maintain_order=True)
     return [_segment_of_points(path, str(key[0]), rows, reading) for key, rows in edges]
 
 
 def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
-    """Return the points of one track edge; cant in millimetres, a radius of 0 or none is straight."""
+    """Return the points of one track edge; cant in millimetres; without a radius, or with 0, it is straight."""
     values = {name: rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy() for name in _NUMBERS}
     for name in _NUMBERS[:3]:
         if not np.isfinite(values[name]).all():
@@ -75,13 +74,7 @@ _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
 
-def is_mate(path: FilePath) -> bool:
-    """Return whether a CSV is a table of positions of track segments, by its header."""
-    head = next(iter(text_lines(path)), "").upper()
-    return "TRACK_EDGE_ID" in head and "TRACK_SEGMENT_TYPE" in head
-
-
-def read_mate_segments(path: FilePath, reading: MapReading) -> list[Segment]:
+def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the edges of the tables as segments, in the order of the file; InputFileError where they do not meet."""
     gradients, cants = (_rows(path, name) for name in (_GRADIENT, _CANT))
     found = []
@@ -97,7 +90,7 @@ def read_mate_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
-    """Return rows of each edge by their distance from its start; of another table beside the file where it is there."""
+    """Return rows of each edge by their distance from its start; also of another table in the same folder."""
     file = Path(path)
     if table is not None:
         names = {entry.name.upper(): entry for entry in file.parent.iterdir()}
@@ -145,7 +138,7 @@ def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
     plan = [options[k] for options, k in zip(forms, chosen, strict=True)]
     for number, (first, second) in enumerate(pairwise(plan), start=2):
         if (gap := _gap(first, second)) > _MEETS_M:
-            raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the one before it")
+            raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the previous one")
     return plan
 
 
@@ -201,7 +194,7 @@ def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float
     """Return the part of a clothoid from an arc from its point without curvature on."""
     if arc == 0.0:
         return _element(east, north, azimuth, 0.0, rate * length, length)
-    # back from the origin a clothoid has the same curvature to the other side, and runs the other way
+    # backward from the origin a clothoid has the same curvature to the other side, and the opposite direction
     way = _element(east, north, azimuth if arc > 0.0 else azimuth + np.pi, 0.0, rate * abs(arc), abs(arc))
     (x, y), _ = _end(way)
     return _element(x, y, azimuth + rate * arc**2 / 2.0, rate * arc, rate * (arc + length), length)

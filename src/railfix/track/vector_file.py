@@ -1,8 +1,8 @@
 """Lines of map files of geographic information systems, read through GDAL by `pyogrio`, OpenStreetMap among them.
 
-OpenStreetMap's ways are known by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters write
-the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class (`fclass`
-of Geofabrik's shapefiles), and the id in a dozen forms.
+OpenStreetMap's ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters
+write the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class
+(`fclass` of Geofabrik's shapefiles), and the id in a dozen forms.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending, open_stream, unpacked_file
+from railfix.core.files import FilePath, open_stream, unpacked_file
+from railfix.io.file_kind import KIND_WORDS, find_kind
+from railfix.io.xml_lines import read_gpx_lines, read_kml_lines
 from railfix.track.crs import choose_crs, unit_of_heights
 from railfix.track.georeference import georeference
 from railfix.track.heights import check_height_datum, heights_of_file
@@ -32,7 +34,7 @@ SIGMA_M: Final = 2.0
 ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Origin of a segment, in its metadata.
 #: Values of the tag railway that are tracks on which trains run.
 _RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "monorail", "rack")
-#: Values of that tag that are no such tracks, by which a feature of OpenStreetMap is known.
+#: Values of that tag for other features than tracks, which identify a feature of OpenStreetMap.
 _OTHERS: Final = (
     "abandoned", "construction", "disused", "dismantled", "demolished", "funicular", "historic", "loading_ramp",
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
@@ -41,12 +43,12 @@ _OTHERS: Final = (
 #: Columns of the id of a feature; those that only exporters of OpenStreetMap write come first.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
-_ID: Final = re.compile(r"\W*(way|relation|[wr])?\W*(\d+)\)?")
+_ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
 CROSSING: Final = "x"  #: Begins the id of a node at which tracks cross without a connection.
-_LEFT_OUT: Final = "@left out"  #: Why a way is left out, beside its tags.
+_LEFT_OUT: Final = "@left out"  #: Reason for leaving out a way, besides its tags.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +91,7 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
-    """Return why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
+    """Return why a feature is not a track: for OpenStreetMap those not tagged as active railways; empty for tracks."""
     if row.get(_LEFT_OUT):
         return str(row[_LEFT_OUT])
     railway = get_tags(row).get("railway")
@@ -123,7 +125,7 @@ def find_level(tags: Mapping[str, Any]) -> int:
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
-    """Segments of a file, the first with a note on its lines that are no tracks; InputFileError where none is left."""
+    """Segments of a file, the first with a note on its lines that are not tracks; InputFileError where none is left."""
     left_out = ", ".join(f"{n} {why}" for why, n in reasons.items())
     note = f"{path}: lines left out that are no tracks: {left_out}"
     if not segments:
@@ -159,8 +161,8 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection."""
-    return tags.get("railway") == "railway_crossing"
+    """Return whether a node is a crossing of tracks without a connection: a slip has one."""
+    return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
 def read_overpass(path: str, elements: Any) -> list[Way]:
@@ -196,9 +198,9 @@ def _ways(
     nodes: Mapping[str, tuple[float, float]],
     crossings: Set[str],
 ) -> list[Way]:
-    """Ways with their points, in parts where some lie outside the extract; those without two points are left out.
+    """Ways with their points, in parts where some points are outside the extract; ways without two points are left out.
 
-    InputFileError: no way has two.
+    InputFileError: no way has two points.
     """
     found, short = [], []
     for row, refs in ways:
@@ -214,14 +216,11 @@ def _ways(
     if not found and short:
         raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; ask Overpass for them, too (out geom;)")
     if not found:
-        raise InputFileError(path, "there is no way with a tag railway in this file")
+        raise InputFileError(path, "no way in this file has a tag railway")
     return [*found, *short]
 
 
-#: Endings of files that are read here.
-ENDINGS: Final = (".gpkg", ".shp", ".fgb", ".gml", ".gpx", ".kml", ".dxf", ".osm", ".pbf")
 INSTALL: Final = "install it with: pip install 'railfix[maps]'"
-_LOOKED_AT: Final = 1 << 20  #: Bytes of a text file that are looked at before GDAL reads it.
 _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns that name a line, in this order.
 
 
@@ -231,12 +230,13 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
         import pyogrio
         import shapely
     except ImportError:
-        raise InputFileError(path, f"reading {ending(path)} maps needs pyogrio and shapely; {INSTALL}") from None
-    _check_text(path)
+        what = KIND_WORDS[find_kind(path)]
+        raise InputFileError(path, f"is {what}, which pyogrio and shapely read; {INSTALL}") from None
     layers = []
+    pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # ids of nodes in .osm.pbf may be negative
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are no heights and not read
+            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are not heights and are not read
             with unpacked_file(path) as file:
                 found = [
                     pyogrio.raw.read(file, layer=layer, read_geometry=geometry != "none")
@@ -256,21 +256,6 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
     except (pyogrio.errors.DataSourceError, pyogrio.errors.FeatureError) as error:
         raise InputFileError(path, f"GDAL cannot read this file ({str(error).splitlines()[0]})") from None
     return layers
-
-
-def _check_text(path: FilePath) -> None:
-    """Reject coordinates that GDAL reads as others: decimal commas, heights above the ground."""
-    kind = ending(path)
-    if kind not in (".gpx", ".kml"):
-        return
-    with open_stream(path, content="bytes") as stream:
-        text = stream.read(_LOOKED_AT)
-    if comma := re.search(rb"""\bl(?:at|on)\s*=\s*["'][-+\d]+,\d*""", text):
-        raise InputFileError(path, f"{comma[0].decode()}: has a comma in a number; a point was expected")
-    if mode := re.search(rb"<altitudeMode>\s*(relativeTo\w+|clampTo\w+)\s*<", text):
-        raise InputFileError(
-            path, f"its altitudeMode is {mode[1].decode()}, no height of the track; write absolute heights or none"
-        )
 
 
 def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
@@ -297,10 +282,14 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 def _features(
     path: FilePath,
 ) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]], list[tuple[str, ...]]]]:
-    """Yield CRS, columns, lines and ids of nodes of the features of each layer; of OSM XML without GDAL, which needs
-    sorted nodes.
-    """
-    if ending(path) == ".osm":
+    """Yield CRS, columns, lines and ids of nodes of the features of each layer; KML, GPX, OSM XML without GDAL."""
+    kind = find_kind(path)
+    if kind in ("kml", "gpx"):
+        found = read_kml_lines(path) if kind == "kml" else read_gpx_lines(path)
+        points = [line.points if np.isfinite(line.points[:, 2]).any() else line.points[:, :2] for line in found]
+        yield "EPSG:4326", [line.fields for line in found], [[own] for own in points], [()] * len(points)
+        return
+    if kind == "osm":
         ways = read_osm_xml(path)
         yield "EPSG:4326", [way.row for way in ways], [[way.points_deg] for way in ways], [way.nodes for way in ways]
         return

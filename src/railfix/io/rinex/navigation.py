@@ -15,7 +15,8 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, BrokenLines, FilePath, Paths, path_names, read_text_lines
 from railfix.gnss.navigation import Navigation
-from railfix.io.rinex.header import read_version
+from railfix.io.file_kind import wrong_kind
+from railfix.io.rinex.header import VERSION, read_version
 from railfix.io.rinex.navigation_records import (
     RawRecord,
     first_fault,
@@ -94,16 +95,10 @@ def read_header(path: FilePath, lines: list[str], content: NavigationContent) ->
 
 
 def _version(path: FilePath, first: str) -> tuple[float, str]:
-    if first[60:80].strip() != "RINEX VERSION / TYPE":
-        raise InputFileError(path, "is not a RINEX file: its first line lacks 'RINEX VERSION / TYPE'", line=1)
-    version, kind = read_version(path, first), first[20:21].upper()
-    if kind == "O":
-        raise InputFileError(
-            path, "is a RINEX observation file; give it with --front or --rear (a navigation file was expected)", line=1
-        )
-    if kind not in _FILE_SYSTEMS:
-        raise InputFileError(path, f"is RINEX of type {kind!r}, a navigation file (N) was expected", line=1)
-    return version, kind
+    kind = first[20:21].upper()
+    if first[60:80].strip() != VERSION or kind not in _FILE_SYSTEMS:
+        raise wrong_kind(path, "a RINEX navigation file")
+    return read_version(path, first), kind
 
 
 def _header_line(line: str, label: str, content: NavigationContent) -> None:
@@ -122,7 +117,7 @@ def _header_line(line: str, label: str, content: NavigationContent) -> None:
 #: Fewest and most lines of a record, the epoch line included, by constellation (RINEX 2.11, tables A4 and
 #: A11; 3.05, tables A6 to A16: GLONASS has a fifth line since 3.05, whose flags are not needed).
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
-#: The same of the messages that came with RINEX 4 (4.02, tables A10, A11, A18 to A20).
+#: Messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
 _LINES_4: Final = {"CNAV": (9, 9), "CNV1": (10, 10), "CNV2": (10, 10), "CNV3": (9, 9)}
 #: Messages by constellation as RINEX 4 names them.
 _MESSAGES: Final = {
@@ -141,7 +136,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     """Read all records of one or several navigation files: plain, gzip, compress.
 
     A broken record stops the reading, or is counted in `skipped` and described in `notes`. InputFileError: a file is
-    missing, is no navigation file, or (with "stop") a record is broken; or no file has a usable record.
+    missing, is not a navigation file, or (with "stop") has a broken record; or no file has a usable record.
     """
     files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
@@ -288,7 +283,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
     names = list_fields(satellite[0], block.message)
     numbers: list[float] = []
     for k, name in enumerate(names):
-        # Three numbers stand on the first line, after satellite and time; four on each of the others.
+        # The first line has three numbers, after satellite and time; the others have four.
         row, place = divmod(k + 1, 4)
         text = block.text[row]
         column = shift - 15 + _WIDTH * place

@@ -11,16 +11,16 @@ from railfix.core.arrays import Floats, Indices
 from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.draw import draw_figure, save_figure
 from railfix.report.plots.line import LocalFrame
-from railfix.run.locate import Surveyed
-from railfix.track import TrackQuality
 from railfix.track.network import Network, end_points
-from railfix.track.network_match import Matched, PlanLog
-from railfix.track.network_read import NetworkQuality
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from railfix.run.locate import Surveyed
     from railfix.run.which_track import TrackDecision
+    from railfix.track import TrackQuality
+    from railfix.track.network_match import Matched, PlanLog
+    from railfix.track.network_read import NetworkQuality
 
 #: Points of tracks that are drawn at most; of larger networks every n-th one and the ends.
 _DRAWN: Final = 200_000
@@ -110,7 +110,7 @@ def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[f
 def _names_beside(
     network: Network, frame: LocalFrame, matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
 ) -> Marks:
-    """Names of the tracks that a run has passed, beside the middle of its positions there, on alternating sides."""
+    """Names of the tracks that a run has passed, next to the middle of its positions there, on alternating sides."""
     passed = dict.fromkeys(matched.track[matched.track >= 0].tolist())
     places = [np.flatnonzero(matched.track == track) for track in passed][:_NAMED]
     rows = np.array([own[len(own) // 2] for own in places], dtype=np.intp)
@@ -156,7 +156,7 @@ def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]
 
 _COLOURS: Final = {"error": "#c1272d", "warning": "#e08e0b"}
 _LINE: Final = "#1f4e79"
-#: Panel along the line in which each kind of finding is marked; those not named stand in the plan only.
+#: Panel along the line in which each kind of finding is marked; other kinds are marked in the plan only.
 _PANELS: Final = {
     "mid-chord": "mid-chord",
     "duplicate": "spacing",
