@@ -43,7 +43,7 @@ class ObservableState:
     #: for all together, shape (L,).
     factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
     letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
-    #: Phases of the last epoch and range rates of the satellites, shape (K,).
+    #: Phases of the last epoch that gave factors and range rates of the satellites, shape (K,).
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U6"))
     phase_m: Floats = field(default_factory=lambda: np.zeros(0))
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
@@ -64,26 +64,29 @@ def check_observables(corrected: CorrectedRanges, state: ObservableState) -> Che
 
     A factor is valid until the next one of its constellation; before the first one, that of all constellations is used.
     """
-    sight = corrected.satellites.position_ecef_m - corrected.near_ecef_m[:, None, :]
+    second = corrected.time.astype("datetime64[s]")
+    chosen = np.diff(second, prepend=np.array([state.time], dtype=second.dtype)) != np.timedelta64(0, "s")
+    sight = corrected.satellites.position_ecef_m[chosen] - corrected.near_ecef_m[chosen, None, :]
     sight = sight / np.linalg.norm(sight, axis=2, keepdims=True)
-    rate = (sight * corrected.satellites.velocity_ecef_mps).sum(axis=2)
+    rate = (sight * corrected.satellites.velocity_ecef_mps[chosen]).sum(axis=2)
     wavelength = SPEED_OF_LIGHT / corrected.frequency_hz
     phase = wavelength * corrected.observations.phase_cycles[:, corrected.columns]
-    changes, after = _phase_rates(corrected.time, corrected.channels.names, phase, rate, state)
+    names, time = corrected.channels.names, corrected.time[chosen]
+    changes, after = _phase_rates(time, names, phase[chosen], rate, state)
     letters = corrected.satellite.astype("<U1")
     bad: dict[int, Masks] = {}
     notes: list[str] = []
     before = dict(zip(state.letter.tolist(), state.factor.T.tolist(), strict=True))
     factors = {letter: before.get(letter, [np.nan, np.nan]) for letter in {**before, **dict.fromkeys(["", *letters])}}
-    for kind, (observed, expected) in enumerate(((-wavelength * corrected.doppler_hz, rate), changes)):
-        wrong, found = np.zeros(observed.shape, dtype=np.bool_), {}
+    doppler = -wavelength * corrected.doppler_hz
+    for kind, (all_of_kind, observed, expected) in enumerate(((doppler, doppler[chosen], rate), (phase, *changes))):
+        wrong, found = np.zeros(all_of_kind.shape, dtype=np.bool_), {}
         for letter in ["", *np.unique(letters).tolist()]:
             own = (letters == letter) | (letter == "")
-            found[letter] = _held(rate_factor(observed[:, own], expected[:, own]), factors[letter][kind])
-            factors[letter][kind] = float(found[letter][-1]) if len(rate) else factors[letter][kind]
+            found[letter] = _held(rate_factor(observed[:, own], expected[:, own]), factors[letter][kind], chosen)
+            factors[letter][kind] = float(found[letter][-1]) if len(chosen) else factors[letter][kind]
             factor = np.where(np.isnan(found[letter]), found[""], found[letter])
-            seen = np.isfinite(observed[:, own] - expected[:, own]).any(axis=1)
-            off = (np.abs(factor - 1.0) > _RIGHT) & seen
+            off = (np.abs(factor - 1.0) > _RIGHT) & np.isfinite(all_of_kind[:, own]).any(axis=1)
             if letter and off.any():
                 wrong[:, own] = off[:, None]
                 notes.append(_sentence(kind, letter, float(np.median(factor[off])), float(np.median(wavelength[own]))))
@@ -114,11 +117,11 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
     return np.where(unclear, np.nan, factor)
 
 
-def _held(factor: Floats, before: float) -> Floats:
-    """Return the factors with each gap filled by the preceding factor."""
+def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
+    """Return the factor of each epoch, shape (T,): the last known one of the `chosen` epochs; at first `before`."""
     values = np.concatenate([[before], factor])
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
-    return np.asarray(values[last][1:])
+    return np.asarray(values[last][np.cumsum(chosen)])
 
 
 def _phase_rates(

@@ -34,7 +34,14 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions, Slips
 from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
-from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
+from railfix.positioning.map_offset import (
+    LinePositions,
+    MapOffset,
+    OffsetErrors,
+    beyond_threshold,
+    map_offset,
+    offset_from_line,
+)
 from railfix.positioning.normal_equations import SinglePoint, misfit, point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
 from railfix.positioning.receiver_noise import (
@@ -113,12 +120,16 @@ def position_stage(
     unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
     off_map = checked.off_map & ~unresolved
 
-    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
-        return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
-
-    away, off_map_states = antennas.each_with_state(own_absence, states)
     excluded = checked.lasting | checked.raim.excluded
     agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
+    right_m = offset_from_line(free.ecef_m, constrained.arc_m, antennas)[:, 0]
+
+    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
+        return off_map_epochs(
+            time[rows], on_map[rows], off_map[rows], right_m[rows], state.off_map, least_s=OFF_MAP_S
+        )  # fmt: skip
+
+    away, off_map_states = antennas.each_with_state(own_absence, states)
     offset, map_states = map_offset(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,

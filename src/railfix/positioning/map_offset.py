@@ -171,6 +171,15 @@ def map_offset(
     return result, after
 
 
+def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
+    """Return how far 3-D positions (T, 3) lie right of places on the line and above them, shape (T, 2); NaN without."""
+    known = np.isfinite(arc_m)
+    arc = np.where(known, arc_m, 0.0)
+    axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]
+    offset = np.einsum("tij,tj->ti", axes, ecef_m - antennas.at_arc(arc))
+    return np.asarray(np.where(known[:, None], offset, np.nan))
+
+
 def terms_of_epochs(
     ranges: RangeArrays,
     ecef_m: Floats,

@@ -44,7 +44,7 @@ class Interpolated:
         self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return the four nodes about each time, shape (T, C), and the share of the cell, shape (T, 1)."""
+        """Return the four nodes about each time, shape (T, C), and the fraction of the cell, shape (T, 1)."""
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
@@ -162,7 +162,7 @@ _CLOCK, _AXIS, _DELAY, _IONOSPHERE, _TROPOSPHERE = 10, 11, 14, 15, 16
 
 
 class CommonErrors:
-    """Errors of satellites and the atmosphere as functions of time since `start` and place."""
+    """Errors of satellites and the atmosphere as functions of time since `start` and position."""
 
     def __init__(
         self,

@@ -39,7 +39,7 @@ class CarriedNoise:
         return np.asarray(np.sqrt(1.0 - share) * white + np.sqrt(share) * self._code.next(len(white)))
 
     def cn0_db(self, epochs: int) -> Floats | float:
-        """Return the variation of C/N0 [dB] over the next epochs, shape (T, M); 0 where there is none."""
+        """Return the variation of C/N0 [dB] over the next epochs, shape (T, M); 0 without any."""
         sigma = self._settings.cn0_wander_sigma_db
         return 0.0 if sigma == 0.0 else sigma * self._cn0.next(epochs)
 
@@ -60,7 +60,7 @@ class _FirstOrder:
 
 class CodeSmoothing:
     """Filter of first order on code errors, restarted after loss of lock: ``y[k] = y[k-1] + (1 - exp(-interval / time))
-    (x[k] - y[k-1])``; a time of 0 is no filter.
+    (x[k] - y[k-1])``; a time of 0 means no filter.
     """
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:

@@ -125,7 +125,7 @@ def grid_mask(second: int, band: int, bits: Collection[int], iodi: int = 0, band
 def grid_delay(
     second: int, band: int, block: int, delay: Sequence[float], givei: Sequence[int], iodi: int = 0
 ) -> Bytes:
-    """Type 26; delays in metres, 63.875 says do not use; points left over are not monitored."""
+    """Type 26; delays in metres, 63.875 means do not use; remaining points are not monitored."""
     raw = [round(v / STEP_M) for v in delay] + [0] * (15 - len(delay))
     grades = list(givei) + [NO_DELAY] * (15 - len(givei))
     pairs = [field for v, g in zip(raw, grades, strict=True) for field in ((v, 9), (g, 4))]
@@ -134,7 +134,7 @@ def grid_delay(
 
 #: Slots of one message of types 2 to 5; satellites of one of type 25; points of one of type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-_MIXED: Final = 6  #: Slots of type 24, which takes the place of the last fast message where no more are left.
+_MIXED: Final = 6  #: Slots of type 24, which replaces the last fast message where no more remain.
 #: Largest correction, orbit correction and delay that the fields hold [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
 FAST_PERIOD_S: Final = 6  #: Seconds from one fast correction of a satellite to the next.
@@ -148,7 +148,8 @@ class Service:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
         names = {str(name) for name in simulation.navigation.kepler.satellite}
-        # All of the mask, not only what the train sees; each satellite's errors are its own, so they are the same.
+        # All satellites of the mask, not only those in view of the train; each satellite's errors are its own, so they
+        # are the same.
         self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
         self._errors, self._start = simulation.compute_errors(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))

@@ -92,7 +92,7 @@ def parameters(
 
 #: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
-_LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field holds [m].
+_LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field can represent [m].
 _GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next ones [m/s].
 
 
@@ -156,16 +156,16 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
     """Return messages from `lead_s` before the run to its end, one a second.
 
     Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
-    long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` puts
-    into clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
-    On L5: integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
+    long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` adds
+    to clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected. On L5:
+    integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
     """
     service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario
     fast, slow = service.fast_messages(), service.slow_messages()
     first = -int(np.ceil(settings.lead_s))
     sent, bits, turn = [], [], 0
-    # The preamble goes by the second of the day, the frame of six seconds too.
+    # The preamble depends on the second of the day, like the frame of six seconds.
     day = int(seconds(scenario.start - scenario.start.astype("datetime64[D]")))
     for second in range(first, int(np.ceil(scenario.duration_s))):
         place = (day + second) % FAST_PERIOD_S

@@ -30,7 +30,7 @@ CN0_STEP_DBHZ: Final = 0.25  #: Receivers report C/N0 in steps [dB-Hz].
 CHUNK_EPOCHS: Final = 2000  #: Epochs of one chunk.
 _LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are searched [s].
 _RATE_S: Final = 0.005  #: Half the interval of the difference that gives range rates [s].
-#: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise no longer falls [dB-Hz].
+#: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise is constant [dB-Hz].
 _SIGMA_AT_DBHZ: Final = 45.0
 _BEST_DBHZ: Final = 50.0
 
@@ -87,7 +87,7 @@ class Simulation:
         return self.compute_errors(self.satellites)
 
     def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
-        """Return the errors of satellites and atmosphere; those of a satellite do not depend on the others."""
+        """Return the errors of satellites and atmosphere; errors of a satellite are independent of the others."""
         scenario = self.scenario
         return CommonErrors(
             scenario.errors,
@@ -112,7 +112,7 @@ class Simulation:
         return self.body_truth(getattr(self.scenario.vehicle, antenna), seconds_s)
 
     def _station_truth(self, name: str, count: int) -> AntennaTruth:
-        """Position of a reference station, the same at all of so many instants."""
+        """Position of a reference station, repeated for a number of instants."""
         station = next(item for item in self.scenario.stations if item.name == name)
         at = np.full(count, station.chainage_m)
         place = self.line.point_beside(at, station.lateral_m, station.height_m)
@@ -140,7 +140,7 @@ class Simulation:
         return tuple((name, signal) for name in names for signal in list_signals(name[0], scenario.receiver))
 
     def header(self, antenna: str) -> ObservationHeader:
-        """Header of a receiver's log; the approximate position is rounded to 100 m, that of the station is exact."""
+        """Header of a receiver's log; the approximate position is rounded to 100 m, a station's is exact."""
         place = self.truth(antenna, np.zeros(1))[0].ecef_m[0]
         return ObservationHeader(
             version=3.04,
@@ -154,7 +154,7 @@ class Simulation:
         )
 
     def pieces(self, antenna: str, *, chunk_epochs: int = CHUNK_EPOCHS) -> Iterator[Piece]:
-        """Yield the truth and observations of one antenna, piece by piece; any cutting gives the same numbers."""
+        """Yield the truth and observations of one antenna, piece by piece; results do not depend on the pieces."""
         receiver = Receiver(
             self.scenario,
             antenna,
