@@ -11,7 +11,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.positioning.search_index import SearchIndex
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-_RIDGE: Final = 1e-9  #: Weight of the unknowns by themselves, for what a satellite is missing for.
+_RIDGE: Final = 1e-9  #: Weight of the unknowns themselves, for those that too few satellites determine.
 
 
 class MotionInputs(NamedTuple):
