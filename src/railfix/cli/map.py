@@ -123,9 +123,9 @@ def features(
 ) -> None:
     """List the features of a line: the positions where its gradient or curvature changes.
 
-    A train that measures the same change knows where it is (`railfix.motion.features`). Changes are taken over 15 m,
-    about the distance of two bogies. With `--run` the features are those that several runs measured consistently: their
-    positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
+    A train that measures the same change knows its position (`railfix.motion.features`). Changes are computed over 15
+    m, about the distance of two bogies. With `--run` the features are those that several runs measured consistently:
+    their positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
 
     Example:
 

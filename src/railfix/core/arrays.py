@@ -116,7 +116,7 @@ def patch_rows(result: Rows, rows: Indices, part: Rows) -> Rows:
 
 
 class RowArrays:
-    """Base of dataclasses whose arrays have one row for each of the same things."""
+    """Base of dataclasses whose arrays have one row per item of a common axis."""
 
     def take(self, rows: NDArray[Any] | slice) -> Self:
         """Return selected rows, by mask, index or slice, with the other fields unchanged."""

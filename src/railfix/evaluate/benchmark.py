@@ -207,8 +207,9 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, and judge them and other programs; return `BENCHMARK_COLUMNS`
-    and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out cases.
+    """Run the cases of a folder with one configuration, and evaluate them with other programs; return
+    `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out
+    cases.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)

@@ -26,7 +26,8 @@ class InterlockingLimits(Settings):
     overlap_m: float = Field(default=0.0, ge=0)
     #: Points are released this long after the safe rear end has passed them.
     release_s: float = Field(default=3.0, ge=0)
-    #: The field answers the question for the detection of points within this time; else the trains on them are stopped.
+    #: The field answers a request for the detection of points within this time; otherwise the trains on them are
+    #: stopped.
     answer_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration, between two reports with speeds.

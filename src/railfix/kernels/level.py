@@ -1,4 +1,4 @@
-"""The level at which Gaussian tails of many hypotheses together keep within a risk."""
+"""The level at which Gaussian tails of many hypotheses sum to a risk."""
 
 from __future__ import annotations
 

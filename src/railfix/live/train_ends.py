@@ -40,7 +40,7 @@ class TrainFrame:
 
     trajectories: Mapping[str, Trajectory]
     facing: int  #: Direction of the vehicle's front along the line, 0 where unknown.
-    running: int  #: Direction in which the end that runs ahead looks at the start, 0 where unknown.
+    running: int  #: Direction of the leading end at the start, 0 where unknown.
     #: Front end of the train ahead of the reference point, its rear end behind it, and its length [m]; NaN where
     #: unknown.
     front_m: float

@@ -1,6 +1,6 @@
 """Compilation of all kernels at the first command on a machine: later ones load them from disk.
 
-During a live session it would delay epochs by seconds, in a run nobody would know why nothing happens.
+During a live session it would delay epochs by seconds, and a run would pause without a message.
 """
 
 from __future__ import annotations

@@ -195,7 +195,7 @@ class _Automaton:
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
 
     def copy(self, limits: SlipLimits) -> _Automaton:
-        """Return the same with numbers of its own: states handed on stay as they are."""
+        """Return a copy: states that were returned stay unchanged."""
         other = copy.copy(self)
         other.limits, other._past = limits, self._past.copy()
         return other
@@ -287,7 +287,7 @@ class _Automaton:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
-        """The wheel turns: it is believed unless the pitch contradicts."""
+        """The wheel turns: its distance is used unless the pitch contradicts."""
         limits = self.limits
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")

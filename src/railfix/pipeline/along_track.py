@@ -32,7 +32,7 @@ from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, 
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
+#: Reasons with which a code is still used: the filter weighs multipath and faults itself, over more than one epoch.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK

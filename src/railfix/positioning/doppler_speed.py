@@ -7,7 +7,7 @@ speed v along the unit tangent e of its path measures
     ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
 
 with the drifts of both clocks in m/s and the change of the tropospheric delay. Unknown are v and d_r, whatever the
-number of constellations. The ionosphere's change (millimetres a second) is left in.
+number of constellations. The ionosphere's change (millimetres per second) is neglected.
 """
 
 from __future__ import annotations

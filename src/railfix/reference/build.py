@@ -133,7 +133,7 @@ class _ReferenceBuilder:
         self.trajectory = data.trajectories[name]
 
     def built(self, fixes: Fixes) -> Built:
-        """From judged fixes to the reference."""
+        """From checked fixes to the reference."""
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])

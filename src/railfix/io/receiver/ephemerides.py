@@ -189,7 +189,7 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append records of GLONASS strings whose next epoch came within their frame, up to a time or all known."""
+        """Append records of GLONASS strings whose next epoch arrived within their frame, up to a time or all known."""
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):
                 del self.waiting[satellite]

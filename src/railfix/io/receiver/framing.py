@@ -199,7 +199,7 @@ _CRC24: Final = _crc24_table()
 
 
 def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
-    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all together."""
+    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all stretches."""
     crc = np.zeros(len(start), dtype=np.int64)
     order = np.argsort(start - end, kind="stable")  # longest first: the ones still running are a prefix
     first, length = start[order], (end - start)[order]

@@ -49,7 +49,7 @@ class Phases:
     weight: Floats
     #: Equal within an unbroken stretch of one channel's phase, and different elsewhere; shape (T, M).
     arc_id: Integers
-    integers: IntegerChannels | None = None  #: None leaves all ambiguities real numbers.
+    integers: IntegerChannels | None = None  #: None: all ambiguities are real numbers.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
         """Return the phases of some epochs."""
@@ -164,7 +164,7 @@ def _ties(ties: InterSystemBiases) -> tuple[Floats, Floats]:
 
 
 def own_clock(lin: Linearised) -> bool:
-    """Return whether the phases have a clock of their own."""
+    """Return whether the phases have a separate clock."""
     return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
 
 
