@@ -79,7 +79,7 @@ class Diagnosis:
         }
 
 
-def examine_files(paths: Sequence[Path]) -> Diagnosis:
+def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
     """Read each file as every kind until one fits, and compare them with each other; InputFileError where one is
     missing.
     """
@@ -90,18 +90,18 @@ def examine_files(paths: Sequence[Path]) -> Diagnosis:
             raise InputFileError(path, "there is no such file; check the name")
         if sum(path.samefile(other) for other in paths if other.exists()) > 1:
             raise InputFileError(path, "is given twice; name each file once")
-    findings = tuple(_examine(path) for path in paths)
+    findings = tuple(_examine(path, date) for path in paths)
     problems = tuple(_problems(findings))
-    return Diagnosis(findings=findings, problems=problems, command=_command(findings))
+    return Diagnosis(findings=findings, problems=problems, command=_command(findings, date))
 
 
-def _examine(path: Path) -> FileFinding:
+def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
     """Return what a file is: its content decides the kind, and the reader of that kind says what is wrong with it."""
     errors: list[str] = []
     kinds = _find_kinds(path)
     for kind in kinds:
         try:
-            return _READERS[kind](path)
+            return _DATED[kind](path, date) if kind in _DATED else _READERS[kind](path)
         except RailfixError as error:
             errors.append(str(error))
             if "--date" in str(error):  # the kind is known, the date is not
@@ -124,7 +124,7 @@ def _unknown(path: Path) -> FileFinding:
     raise InputFileError(path, f"not recognised: it is {KIND_WORDS[find_kind(path)]}, and no command reads it")
 
 
-def _observations(path: Path) -> FileFinding:
+def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
     """Read a log piece by piece: the facts of the whole, in the memory of a piece."""
     first: Observations | None = None
     epochs, longest_s, steps = 0, 0.0, []
@@ -132,7 +132,7 @@ def _observations(path: Path) -> FileFinding:
     signals: set[str] = set()
     end = np.datetime64("NaT", "ns")
     broken, notes = Counter[str](), list[str]()
-    for piece in scan_observations(path, broken_lines="count"):
+    for piece in scan_observations(path, broken_lines="count", date=date):
         broken.update({what: n for what, n in piece.skipped.items() if what.startswith(("broken", "epochs out of"))})
         notes += piece.problems
         if not len(piece):
@@ -159,7 +159,7 @@ def _observations(path: Path) -> FileFinding:
     facts += [f"receiver and antenna: {', '.join(words)}"] if words else []
     facts += [f"note: {note.removeprefix(f'{path}, ')}" for note in notes[:_MOST_NOTES]]
     place = header.approximate_ecef_m
-    own = _own_ephemerides(path)
+    own = _own_ephemerides(path, date)
     if own is not None:
         facts.append(f"{own[0]:,} ephemerides inside")
     return FileFinding(
@@ -169,34 +169,34 @@ def _observations(path: Path) -> FileFinding:
         span=(first.time[0], end),
         place_ecef_m=place if np.isfinite(place).all() else None,
         ephemerides=None if own is None else own[1],
-        options=("--lenient",) if broken and _needs_lenient(path) else (),
+        options=("--lenient",) if broken and _needs_lenient(path, date) else (),
     )
 
 
-def _needs_lenient(path: Path) -> bool:
+def _needs_lenient(path: Path, date: np.datetime64 | None) -> bool:
     """Return whether a reader of the default policy stops at a line of the file."""
     try:
-        for _ in scan_observations(path):
+        for _ in scan_observations(path, date=date):
             pass
     except InputFileError:
         return True
     return False
 
 
-def _own_ephemerides(path: Path) -> tuple[int, Span] | None:
+def _own_ephemerides(path: Path, date: np.datetime64 | None) -> tuple[int, Span] | None:
     """Return the number and the reference times of the ephemerides in a receiver's log; None without any."""
     if find_kind(path) != "receiver":
         return None
     try:
-        navigation = read_navigation([path])
+        navigation = read_navigation([path], date=date)
     except InputFileError:  # it has none: observations alone are no fault of a log
         return None
     span = navigation_span(navigation)
     return None if span is None else (len(navigation.kepler) + len(navigation.glonass), span)
 
 
-def _navigation(path: Path) -> FileFinding:
-    navigation = read_navigation([path], broken_lines="count")
+def _navigation(path: Path, date: np.datetime64 | None) -> FileFinding:
+    navigation = read_navigation([path], broken_lines="count", date=date)
     span = navigation_span(navigation)
     if span is None:
         raise InputFileError(path, "has no ephemeris")
@@ -257,14 +257,14 @@ def _track(path: Path) -> FileFinding:
     )  # fmt: skip
 
 
-def _positions(path: Path) -> FileFinding:
+def _positions(path: Path, date: np.datetime64 | None) -> FileFinding:
     options: tuple[str, ...] = ()
     try:
-        log = read_positions(path, heights="optional", antennas="several")
+        log = read_positions(path, date=date, heights="optional", antennas="several")
     except InputFileError as error:
         if LENIENT not in str(error):
             raise
-        log = read_positions(path, broken_lines="count", heights="optional", antennas="several")
+        log = read_positions(path, broken_lines="count", date=date, heights="optional", antennas="several")
         options = ("--lenient",)
     known = log.time[~np.isnat(log.time)]
     span = (known.min(), known.max()) if len(known) else None
@@ -311,11 +311,13 @@ _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     "toml": ("vehicle", "settings"), **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
 }  # fmt: skip
-#: What reads each kind of file.
-_READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
+#: What reads each kind of file, with a date and without.
+_DATED: Final[dict[Kind, Callable[[Path, np.datetime64 | None], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
     "positions": _positions,
+}
+_READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "track": _track,
     "orbits": _orbits,
     "sbas": _sbas,
@@ -373,7 +375,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
     return problems
 
 
-def _command(findings: Sequence[FileFinding]) -> str:
+def _command(findings: Sequence[FileFinding], date: np.datetime64 | None) -> str:
     """Return the command of a run, blank where a file for it is missing."""
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     logs = [log for log in logs if log.span is not None]
@@ -394,4 +396,5 @@ def _command(findings: Sequence[FileFinding]) -> str:
     for kind, (option, most) in options.items():
         words += [word for finding in _filter(findings, kind)[:most] for word in (option, str(finding.path))]
     words += list(dict.fromkeys(word for finding in findings for word in finding.options))
+    words += [] if date is None else ["--date", str(date.astype("datetime64[s]"))]
     return shlex.join([*words, "--out", "results"])
