@@ -15,7 +15,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.files import LENIENT
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import ObservationHeader
 from railfix.io.file_kind import KIND_WORDS, MAPS, POSITIONS, FileKind, find_kind, has_times
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.mate import mate_table
@@ -126,35 +126,26 @@ def _unknown(path: Path) -> FileFinding:
 
 def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
     """Read a log piece by piece: the facts of the whole, in the memory of a piece."""
-    first: Observations | None = None
-    epochs, longest_s, steps = 0, 0.0, []
-    satellites: set[str] = set()
-    signals: set[str] = set()
-    end = np.datetime64("NaT", "ns")
+    header: ObservationHeader | None = None
+    times, channels = [np.empty(0, dtype="datetime64[ns]")], set[tuple[str, str]]()
     broken, notes = Counter[str](), list[str]()
     for piece in scan_observations(path, broken_lines="count", date=date):
         broken.update({what: n for what, n in piece.skipped.items() if what.startswith(("broken", "epochs out of"))})
         notes += piece.problems
-        if not len(piece):
-            continue
-        first = piece if first is None else first
-        time = piece.time if np.isnat(end) else np.concatenate([[end], piece.time])
-        between = np.diff(time) / _SECOND
-        steps.append(float(np.median(between)) if len(between) else np.nan)
-        longest_s = max(longest_s, float(between.max(initial=0.0)))
-        epochs, end = epochs + len(piece), piece.time[-1]
-        satellites |= set(piece.satellite.tolist())
-        signals |= {f"{name[0]} {code}" for name, code in zip(piece.satellite, piece.signal, strict=True)}
-    if first is None:
+        header = piece.header if header is None and len(piece) else header
+        times.append(piece.time)
+        channels |= {*zip(piece.satellite.tolist(), piece.signal.tolist(), strict=True)}
+    if header is None:
         raise InputFileError(path, "has no epoch of observations")
-    step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else np.nan
-    systems = {letter: sum(name[0] == letter for name in satellites) for letter in sorted({s[0] for s in satellites})}
+    time = np.concatenate(times)
+    between = np.diff(time) / _SECOND if len(time) > 1 else np.array([np.nan])
+    systems = Counter(satellite[0] for satellite in {satellite for satellite, _ in channels})
+    signals = sorted({f"{satellite[0]} {signal}" for satellite, signal in channels})
     facts = [
-        f"{epochs:,} epochs, one every {step:g} s, the longest gap {longest_s:g} s",
-        "satellites: " + ", ".join(f"{letter} {count}" for letter, count in systems.items()),
-        f"signals: {', '.join(sorted(signals))}",
+        f"{len(time):,} epochs, one every {np.median(between):g} s, the longest gap {between.max():g} s",
+        "satellites: " + ", ".join(f"{letter} {count}" for letter, count in sorted(systems.items())),
+        f"signals: {', '.join(signals)}",
     ]
-    header = first.header
     words = [word for word in (header.receiver, header.antenna) if word]
     facts += [f"receiver and antenna: {', '.join(words)}"] if words else []
     facts += [f"note: {note.removeprefix(f'{path}, ')}" for note in notes[:_MOST_NOTES]]
@@ -166,7 +157,7 @@ def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
         path=path,
         kind="observations",
         facts=(*facts, *_place_facts(place)),
-        span=(first.time[0], end),
+        span=(time[0], time[-1]),
         place_ecef_m=place if np.isfinite(place).all() else None,
         ephemerides=None if own is None else own[1],
         options=("--lenient",) if broken and _needs_lenient(path, date) else (),
