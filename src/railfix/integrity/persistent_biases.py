@@ -17,7 +17,7 @@ from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.receiver_noise import LastingErrorLimits, LastingErrorState
 from railfix.positioning.windows import Windows
 
-#: Below this share of its own error in its residual a range shows nothing of it.
+#: Below this fraction of its own error in its residual a range does not show its error.
 _LEAST_REDUNDANCY: Final = 0.1
 #: A mean that is smaller is forgotten.
 _FORGOTTEN: Final = 1e-12

@@ -1,4 +1,4 @@
-"""Sums over earlier epochs with exponential forgetting, of the epochs of several antennas one after the other."""
+"""Sums over earlier epochs with exponential forgetting, for the epochs of several antennas in sequence."""
 
 from __future__ import annotations
 

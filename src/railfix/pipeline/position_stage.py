@@ -34,7 +34,14 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions, Slips
 from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
-from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
+from railfix.positioning.map_offset import (
+    LinePositions,
+    MapOffset,
+    OffsetErrors,
+    beyond_threshold,
+    map_offset,
+    offset_from_line,
+)
 from railfix.positioning.normal_equations import SinglePoint, misfit, point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
 from railfix.positioning.receiver_noise import (
@@ -61,7 +68,7 @@ def satellites_rejected(member: Integers, reason: Bits) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """Positions of one antenna, T epochs, before coordinates are dropped where the status says so."""
+    """Positions of one antenna, T epochs, before coordinates are dropped because of their status."""
 
     point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
     #: 3-D positions of the ranges that agree, without excluded ones; NaN where they contradict each other; (T, 3).
@@ -82,7 +89,7 @@ class Solution:
     protection: ProtectionResult | None
     map_offset: MapOffset
     off_map: Masks  #: The train is away from the line: `railfix.pipeline.off_map`; shape (T,).
-    #: Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
+    #: Result of `railfix.pipeline.level_stage`, which follows; None without an integrity support message.
     araim: AraimResult | None = None
 
 
@@ -108,15 +115,21 @@ def position_stage(
     corrected = reject(corrected, _alone_on_clock(corrected, points.ties), Reason.ALONE_ON_ITS_CLOCK)
     checked, noise = check_ranges(corrected, points.ranges, antennas, fix, config, states)
     corrected, fix, model, scale = checked.corrected, checked.fix, checked.model, checked.scale
-    constrained, off_map = fix.constrained, checked.off_map
-    on_map = np.isfinite(constrained.arc_m) & ~off_map
+    constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
+    # ranges that contradict each other in space contradict every map
+    unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
+    off_map = checked.off_map & ~unresolved
 
-    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
-        return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
-
-    away, off_map_states = antennas.each_with_state(own_absence, states)
     excluded = checked.lasting | checked.raim.excluded
     agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
+    right_m = offset_from_line(free.ecef_m, constrained.arc_m, antennas)[:, 0]
+
+    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
+        return off_map_epochs(
+            time[rows], on_map[rows], off_map[rows], right_m[rows], state.off_map, least_s=OFF_MAP_S
+        )  # fmt: skip
+
+    away, off_map_states = antennas.each_with_state(own_absence, states)
     offset, map_states = map_offset(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
@@ -137,10 +150,14 @@ def position_stage(
         map_offset=offset, off_map=away,
     )  # fmt: skip
     if sigma.phase is not None:
-        off_map = _off_map(checked.ranges, antennas, fix, sigma.arc_m, config)
+        off_map = _off_map(checked.ranges, antennas, fix, sigma.arc_m, config) & ~unresolved
     observed = np.asarray(np.isfinite(corrected.code_m).any(axis=1))
+    inconsistent = raim.faulty | unresolved
     solution = copy_with(
-        solution, status=_status(observed, checked.ranges, solution, sigma.judged_m, off_map, open_elsewhere, config)
+        solution,
+        status=_status(
+            observed, checked.ranges, solution, sigma.judged_m, (off_map, inconsistent, open_elsewhere), config
+        ),
     )
     after = [
         copy_with(
@@ -192,8 +209,8 @@ def check_ranges(
 ) -> tuple[CheckedRanges, NoiseStates]:
     """Return positions without satellites that are wrong for long, then without single faults, and noise scales.
 
-    The robust scale, which RAIM tests with, is learnt from ranges that agree with each other; the stated one from those
-    that RAIM left.
+    The robust scale, which RAIM tests with, is estimated from ranges that agree with each other; the stated one from
+    those that RAIM accepted.
     """
     time, near = corrected.time, corrected.near_ecef_m
     on, noises = "raim" in config.screens, [state.noise for state in states]
@@ -253,30 +270,31 @@ def check_ranges(
 
 #: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.
 _LARGEST_VARIANCE: Final = 1e4
-#: Variance of an epoch's ranges in space over that of the receiver from which on they contradict each other.
+#: Ratio of the variance of an epoch's ranges in 3-D to that of the receiver from which on they contradict each other.
 _CONTRADICT: Final = 25.0
 
 
 def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
-    """Return ranges and 3-D positions that judge the map: without the `excluded` satellites where all ranges together
-    contradict each other, NaN where they still do or nothing tells which one is wrong.
+    """Return ranges and 3-D positions for the test of the map: without the `excluded` satellites where all ranges
+    together contradict each other, NaN where they still do or the wrong one cannot be identified.
     """
-
-    def contradict(point: SinglePoint, ranges: Ranges) -> Masks:
-        freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
-        return np.asarray(point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2)
-
-    wrong = excluded & (agreeing.weight > 0) & contradict(free, agreeing)[:, None]
+    wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
     if len(changed):
         agreeing = without(agreeing, wrong)
         start = np.where(np.isnan(free.ecef_m), corrected.near_ecef_m, free.ecef_m)[changed]
         solved = point_position(agreeing.take(changed), start, limits=config.single_point)
         free = patch_rows(free, changed, solved)
-    unusable = corrected.unsure | contradict(free, agreeing)
+    unusable = corrected.unsure | _contradict(free, agreeing, scale)
     return agreeing, copy_with(free, ecef_m=np.where(unusable[:, None], np.nan, free.ecef_m))
+
+
+def _contradict(point: SinglePoint, ranges: Ranges, scale: Floats) -> Masks:
+    """Return the epochs whose ranges contradict each other in space, shape (T,)."""
+    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
+    return np.asarray(point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2)
 
 
 class PublishedPositions(NamedTuple):
@@ -285,7 +303,7 @@ class PublishedPositions(NamedTuple):
     arc_m: Floats
     along_m: Floats  #: Standard deviation along the line.
     own_m: Floats  #: Single-epoch sigma.
-    judged_m: Floats  #: What `Config.largest_sigma_m` is compared with.
+    judged_m: Floats  #: Sigma that is compared with `Config.largest_sigma_m`.
     phase: PhasePositions | None
 
 
@@ -331,10 +349,10 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
-    """Return the mean square distance to the best other place of ambiguous epochs, shape (T,).
+    """Return the mean square distance to the best other position of ambiguous epochs, shape (T,).
 
-    The other place fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
-    (normal likelihoods, neither place likelier beforehand).
+    The other position fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
+    (normal likelihoods, equal priors).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
@@ -376,11 +394,14 @@ def _status(
     ranges: Ranges,
     solution: Solution,
     sigma: Floats,
-    off_map: Masks,
-    open_elsewhere: Masks,
+    failed: tuple[Masks, Masks, Masks],
     config: Config,
 ) -> Codes:
-    """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first."""
+    """Return the status of each epoch, shape (T,): the first condition that is true, the most serious first.
+
+    `failed`: ranges that contradict the map, or each other, and other possible positions; shape (T,) each.
+    """
+    off_map, inconsistent, open_elsewhere = failed
     redundancy, constrained, section = ranges.redundancy, solution.fix.constrained, solution.fix.section
     conditions = [
         (~observed, Status.NO_OBSERVATION),
@@ -389,12 +410,13 @@ def _status(
         (~np.isfinite(solution.arc_m), Status.NO_CONVERGENCE),
         (off_map, Status.OFF_MAP),
         (beyond_threshold(solution.map_offset, config.map_offset), Status.MAP_OFFSET),
-        (solution.raim.faulty, Status.INCONSISTENT),
+        (inconsistent, Status.INCONSISTENT),
         (sigma > config.largest_sigma_m, Status.UNCERTAIN),
         (
             (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,
             Status.AMBIGUOUS,
         ),
+        (constrained.overshoot_m > 0.0, Status.MAP_END),
     ]
     status = np.full(len(ranges), Status.OK, dtype=np.int8)
     for condition, value in reversed(conditions):

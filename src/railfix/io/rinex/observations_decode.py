@@ -48,7 +48,7 @@ class Fields:
 
     value: Floats  #: NaN where blank, and where `bad`.
     lock: Bytes  #: Loss-of-lock digit, 0 where blank.
-    bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is no digit.
+    bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is not a digit.
 
 
 def join_fields(parts: Sequence[Fields]) -> Fields:
