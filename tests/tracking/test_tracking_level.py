@@ -101,7 +101,7 @@ def test_a_tilted_ionosphere_is_a_hypothesis_of_the_level() -> None:
     vector = information @ [0.0, slow[0]]
     information[1, 1] += 1.0 / TILT_M[0] ** 2 - 1.0 / LIMITS.slow_code_m**2
     tilted = np.linalg.inv(information)
-    assert tilted[0, 0] > 3.5
+    assert tilted[0, 0] > 2.0
     place, sigma = np.array([0.0, 0.4, (tilted @ vector)[0]]), np.array([1.0, 1.1, tilted[0, 0] ** 0.5])
     prior = np.array([1.0, risks.prior[0], LIMITS.level_tilt_prior])
     parts = prior * (norm.sf((found - place) / sigma) + norm.sf((found + place) / sigma))

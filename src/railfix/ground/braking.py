@@ -17,7 +17,7 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 GRAVITY_MPS2: Final = 9.80665
-#: Highest speed that is looked for [m/s], and the number of halvings of it.
+#: Highest speed that is searched for [m/s], and the number of halvings of it.
 _TOP_MPS, _HALVINGS = 150.0, 40
 
 

@@ -46,17 +46,28 @@ def _placed(
 
 
 def correct_interval(
-    state: Interlocking, train: int, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
+    state: Interlocking,
+    train: int,
+    layout: Layout,
+    *,
+    direction: int,
+    rear_m: float,
+    front_m: float,
+    track: int,
+    silent: bool = False,
 ) -> Changed:
     """Return the state with the interval of a stopped train set by hand, and the reason of a refusal.
 
-    Its routes and its authority end; points that it does not occupy are free.
+    Its routes and its authority end, and points that it no longer stands on are free: so the train has to report that
+    it obeys the order to brake, unless it has been `silent` for longer than an authority lasts on board.
     """
     known = state.trains.get(train)
     if known is None:
         return state, f"no such train: {train}"
     if known.stop is None:
         return state, f"train {train} is not stopped: stop it first"
+    if known.unbraked and not silent:
+        return state, f"train {train} has not reported that it obeys the order to brake, and may run on: wait for that"
     moved = _placed(known, layout, direction=direction, rear_m=rear_m, front_m=front_m, track=track)
     if isinstance(moved, str):
         return state, moved

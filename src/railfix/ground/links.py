@@ -128,7 +128,7 @@ class LinkChoice:
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:
         """Return the choice after new results of both links.
 
-        The spare link is taken after misses of the normal one in a row, unless it misses as well; the normal link
+        The spare link is taken after misses of the normal one in per row, unless it misses as well; the normal link
         again after answers in a row and a time, or at once where only the spare one misses.
         """
         limits = normal.limits

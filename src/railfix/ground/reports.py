@@ -271,6 +271,7 @@ def _noted(report: PlacedReport) -> TrainInterval:
         claimed_m=None,
         contradiction=None,
         held_end_m=report.held_m,
+        unbraked=message.brake_order is None and (message.authority is not None or report.known.unbraked),
     )
 
 

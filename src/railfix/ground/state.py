@@ -60,6 +60,8 @@ class TrainInterval:
     reported_m: tuple[float, float] | None = None
     contradiction: str | None = None
     held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
+    #: Its reports have named an authority, and no order to brake since: it may run on by what it was granted.
+    unbraked: bool = False
     stop: str | None = None  #: Why the train is stopped, until it is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
     asked_number: int = 0  #: Number of the first authority that requests it.

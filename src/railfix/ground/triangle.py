@@ -129,7 +129,7 @@ def compare_triangle(
     points_m : ndarray, shape (3, 2) [m]
         Known points, east and north of any origin.
     fixes_m : ndarray, shape (T, 3, 2) [m]
-        Raw fixes from the same satellites at the same epoch, in the same frame; NaN where there is none.
+        Raw fixes from the same satellites at the same epoch, in the same frame; NaN where missing.
     cn0_fallen : ndarray of bool, shape (T, 3), optional
         True where the C/N0 of a receiver has fallen.
 
@@ -313,7 +313,7 @@ class MonitoredLog:
     orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:
-        """Return one row an epoch: verdict, receiver, errors of the fixes and of the sides."""
+        """Return one row per epoch: verdict, receiver, errors of the fixes and of the sides."""
         triangle = self.triangle
         columns: dict[str, object] = {
             "time_gpst": self.fixes.time,

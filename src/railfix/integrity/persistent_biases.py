@@ -66,7 +66,7 @@ def reject_persistent_biases(
     noise : ndarray, shape (T,)
         Noise scale of the receiver.
     states : sequence of LastingErrorState
-        Of each antenna after the chunk before; `LastingErrorState()` at the start.
+        Of each antenna after the previous chunk; `LastingErrorState()` at the start.
     limits : BiasLimits
         With `LastingErrorLimits.most_satellites` 0 nothing is rejected.
     """

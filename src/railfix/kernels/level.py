@@ -14,7 +14,7 @@ from railfix.kernels.compiling import inner, kernel
 _CLOSE = 5e-4
 #: Steps at most; a level that they do not come close to stays at the lowest one found within the risk.
 _STEPS = 60
-#: From this step on every other one halves the bracket: steps between two points would go on for ever.
+#: From this step on every other one halves the bracket: steps between two points would continue for ever.
 _HALVING = 8
 #: Fraction of the risk that remains unused.
 _AIM = 0.002

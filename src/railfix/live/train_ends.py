@@ -14,7 +14,7 @@ from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
 
-#: Distance against the end that runs ahead after which the train has changed ends: further than it rolls back [m].
+#: Distance against the end that runs ahead after which the train has changed ends: farther than it rolls back [m].
 CHANGED_ENDS_M: Final = 50.0
 
 

@@ -349,7 +349,7 @@ def gnss_epochs(
         np.where(np.isnan(air), 0.0, air),
     )
     epochs = GnssEpochs(
-        time=obs.time, satellite=ranges.satellite, clock=ranges.channels.clock,
+        time=obs.time, satellite=ranges.satellite, signal=ranges.signal, clock=ranges.channels.clock,
         sat_ecef_m=ranges.satellites.position_ecef_m, sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
         code_m=np.where(healthy, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
         phase_m=np.where(moving & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],

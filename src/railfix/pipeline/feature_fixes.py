@@ -74,7 +74,7 @@ class RateSeries:
     known: Datetimes
     distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).
     arc_m: Floats  #: Position of the antenna by the wheel; NaN where it is not known; shape (K,).
-    #: Change of heading (+ to the right) and of pitch (+ nose up) since the tick before, shape (K,).
+    #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
     turned_rad: Floats
     climbed_rad: Floats
     speed_mps: Floats  #: In rising arc length, shape (K,).

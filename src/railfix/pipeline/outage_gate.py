@@ -52,8 +52,8 @@ def gated_codes(
     again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
     and after `SensorLimits.return_s` in any case. Where no sensor gives a distance nothing is refused.
 
-    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the epoch before; `place_m`, `sigma_m`
-    of each epoch by itself; NaN where missing. `state` has the position of the filter at the epoch before the
+    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the previous epoch; `place_m`,
+    `sigma_m` of each epoch by itself; NaN where missing. `state` has the position of the filter at the epoch before the
     first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)

@@ -112,7 +112,7 @@ def float_column(values: Floats) -> pl.Series:
 
 
 def make_table(columns: Mapping[str, Column[Source]], source: Source, rows: int, **given: str) -> pl.DataFrame:
-    """Return a table of columns with one row an epoch; `given` has the value of columns that the source has not."""
+    """Return a table of columns with one row per epoch; `given` has the value of columns that the source has not."""
     return pl.DataFrame(
         {name: column.series(given.get(name, column.of(source)), rows) for name, column in columns.items()}
     )

@@ -120,8 +120,8 @@ class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
     arc_m: Floats  #: NaN where missing, shape (T,).
-    #: The train is away from the line. These epochs have a separate window: positions off the line say nothing about
-    #: the map when the train has returned to it; shape (T,).
+    #: The train is away from the line. These epochs have a separate window: positions off the line contain no
+    #: information on the map when the train has returned to it; shape (T,).
     off_map: Masks
 
 

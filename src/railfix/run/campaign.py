@@ -1,4 +1,4 @@
-"""Campaigns: many logs positioned side by side, resumable, each with its own results folder.
+"""Campaigns: many logs positioned adjacent, resumable, each with its own results folder.
 
 The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables
 together are one hive-partitioned data set: ``pl.scan_parquet(out / "runs/**/positions.parquet")``.

@@ -268,7 +268,7 @@ class Tally:
     min_satellites: int = 3  #: Satellites that an epoch needs.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)  #: Used as keys, in the order of arrival.
-    #: First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
+    #: First epoch of each chunk, its epochs of all antennas, and the time since the previous chunk [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
     order: AntennaOrder | None = None  #: Test of the order of two antennas.
 

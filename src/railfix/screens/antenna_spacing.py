@@ -51,7 +51,7 @@ def antenna_spacing_screen(
     Parameters
     ----------
     chainage_front_m, chainage_rear_m : array_like, shape (P,) [m]
-        Of the same instants, counted along one line; NaN where there is no position: not judged.
+        Of the same instants, counted along one line; NaN without a position: not judged.
     spacing_m : array_like, shape (P,) or scalar [m]
         Front less rear along the track as the chainages count it, not negative: the antennas' distance
         where each chainage is the one abeam its antenna, 0 where both are that of one reference point.

@@ -162,7 +162,7 @@ class ObservationScreen(Screen[Limits]):
         Parameters
         ----------
         state : object
-            Returned with the chunk before; None at the start. Screens without memory return None.
+            Returned with the previous chunk; None at the start. Screens without memory return None.
         """
 
 

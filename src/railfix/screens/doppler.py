@@ -95,7 +95,7 @@ def _jerk_m(interval: Floats, limits: DopplerLimits) -> Floats:
 
 
 def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimits) -> Floats:
-    """Limit of mode "sigma", shape (T, M) [m], from sigmas of the codes with the epoch before, shape (T + 1, M)."""
+    """Limit of mode "sigma", shape (T, M) [m], from sigmas of the codes with the previous epoch, shape (T + 1, M)."""
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
     noise = (sigma_m[1:] ** 2 + sigma_m[:-1] ** 2) * fresh + (limits.doppler_sigma_mps * interval) ** 2
@@ -197,9 +197,9 @@ def doppler_screen(
     break_before : array_like of bool, shape (T,), optional
         Nothing is differenced across the step into these epochs.
     code_sigma_m : array_like, shape (T, M) [m], optional
-        Noise of the codes, asked for by mode "sigma"; NaN there: not judged.
+        Noise of the codes, requested by mode "sigma"; NaN there: not judged.
     state : DopplerState, optional
-        Left by the chunk before.
+        Left by the previous chunk.
 
     Returns
     -------

@@ -31,8 +31,8 @@ RASTERS: Final = (
 HeightSource = FilePath | PositionLog  #: A file, or positions in memory.
 _SPACING_M: Final = 50.0  #: Largest distance of the points that heights are put on [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Cells of a raster read at a time.
-_NEAR_M: Final = 15.0  #: Positions further than this from the line in plan are of another line [m].
-_REACH_M: Final = 200.0  #: Points further than this from a height along the line have none [m].
+_NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan are of another line [m].
+_REACH_M: Final = 200.0  #: Points farther than this from a height along the line have none [m].
 #: Standard deviation of the weights of positions along the line [m]: of fixed ones, and of single ones, whose errors
 #: last for hundreds of metres; a vertical curve of 2 km radius is then off by up to 5 m.
 _KERNEL_M: Final = 15.0

@@ -276,7 +276,7 @@ class Network:
         return chainage, offset
 
     def kilometrage_on(self, track: Indices, chainage_m: Floats) -> Floats:
-        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where there is none."""
+        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where missing."""
         kilometrage = np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
             rows = track == number
@@ -323,7 +323,7 @@ class Network:
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Return the tracks of the shortest route that passes the given tracks in order; None where there is none."""
+        """Return the tracks of the shortest route that passes the given tracks in order; None without one."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         best: dict[int, tuple[float, list[int]]] = {4 * wanted[0] + e: (0.0, [wanted[0]]) for e in (1, 3)}
         for stop in wanted[1:]:

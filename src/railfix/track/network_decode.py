@@ -64,8 +64,8 @@ class Residuals:
     `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
     without a candidate; `beyond_m` how far the position lies beyond an end; `above_m` its height above the track, NaN
     without (n, m). `clear` tells which `SHIFTS_M` from the nearest track are clear of all tracks (n, S), `moved_m` how
-    far that track lies right of the nearest one of the position before, and `turned` whether its direction is opposite
-    (n,). `weight` is the share of the correlation time that a position covers, `seconds` since the one before;
+    far that track lies right of the nearest one of the previous position, and `turned` whether its direction is
+    opposite (n,). `weight` is the share of the correlation time that a position covers, `seconds` since the one before;
     `sigma_m` and `common_m` are of one horizontal axis, `common_up_m` is 0 where heights do not count.
     """
 

@@ -14,9 +14,10 @@ from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.ranges.atmosphere import geomagnetic_latitude
 from railfix.track.trajectory import Trajectory, joins_m
 
-#: Displacement along the line by a tilted ionosphere, by geomagnetic latitude: a third of the standard deviation of the
-#: vertical delay that DO-229D J.2.3 assumes without SBAS, up to 20 deg, up to 55 deg, and beyond [m].
-TILT_M: Final = (3.0, 1.5, 2.0)
+#: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude: 2/9 of that of
+#: the vertical delay that DO-229D J.2.3 assumes without SBAS, 9 m up to 20 deg, 4.5 m up to 55 deg, 6 m beyond [m].
+#: At middle latitudes it is that of `slow_code_m`.
+TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 

@@ -146,7 +146,7 @@ def suspicion(causes: Bits) -> Codes:
 
     The cause that explains most signs comes first. One error of the time tags, fitted to all ranges, moves positions
     and clocks as a spoofer would. Jumps, equal C/N0 and different constellations are not caused by leaving the map. A
-    train that leaves its map shows no sign but that, and neither does jamming. Satellites that are wrong by themselves
+    train that leaves its map shows no sign but that, and neither does jamming. Satellites that are wrong separately
     are excluded before.
     """
     order = (

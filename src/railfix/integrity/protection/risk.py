@@ -27,7 +27,7 @@ from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 
-#: Probability that a satellite is faulty at a time: 1e-5 an hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
+#: Probability that a satellite is faulty at a time: 1e-5 per hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
 #: Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the Galileo service definition after it); the
 #: others as Galileo, as no commitment of theirs is as old.
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
@@ -58,11 +58,11 @@ Probability = Annotated[float, Field(ge=0, lt=1)]  #: A probability below 1.
 class RiskBudget(Settings):
     """Integrity risk, its allocation, and the probabilities of faults."""
 
-    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 an hour.
+    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 per hour.
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s: multipath of a
     #: moving train changes within seconds, that of a standing one within tens of seconds, SBAS corrections within
-    #: minutes (DO-229D appendix J counts 10 samples an hour). More samples are the safe side; from 10 to 3600 the
+    #: minutes (DO-229D appendix J counts 10 samples per hour). More samples are the safe side; from 10 to 3600 the
     #: fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
     #: Fractions of the risk of an epoch; together at most 1. They determine the three parts, from the largest of which

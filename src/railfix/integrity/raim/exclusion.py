@@ -97,9 +97,9 @@ def detect(
     Parameters
     ----------
     wsse : array_like, shape (T,)
-        Weighted sum of squared residuals; NaN where there is no position.
+        Weighted sum of squared residuals; NaN without a position.
     residual_m : array_like, shape (T, M) [m]
-        0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel` allow for the map error, those
+        0 (or NaN) where not used; requested in fixed mode only. Those of a `LinearModel` allow for the map error, those
         of a `Constrained` position do not: the same only where the map is taken as exact, as in P1 (a sigma of a
         millimetre).
     freedom : array_like of int, shape (T,)

@@ -141,7 +141,7 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact(RowArrays):
-    """Residuals and their projector of the used channels alone, side by side: T epochs by n."""
+    """Residuals and their projector of the used channels alone, adjacent: T epochs by n."""
 
     channel: Indices  #: Channel of the model at each index, shape (T, n).
     used: Masks  #: False at indices beyond the epoch's own channels, shape (T, n).

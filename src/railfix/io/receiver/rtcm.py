@@ -159,7 +159,7 @@ def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move GLONASS times, whose day some encoders leave at 0 (DF416), by whole days to the message before."""
+    """Move GLONASS times, whose day some encoders leave at 0 (DF416), by whole days to the previous message."""
     others = np.flatnonzero(~glonass)
     if not len(others) or not glonass.any():
         return time
