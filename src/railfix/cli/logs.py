@@ -213,11 +213,13 @@ def export(
     show_files(console, [path for path in (out, style) if path is not None])
 
 
+@from_models
 def doctor(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Logs, navigation, track, vehicle, references.")
     ],
     *,
+    reading: Annotated[LogReading, Without("broken_lines", "reader")],
     as_json: JsonOption = False,
 ) -> None:
     """Identify files before a run, check whether they fit together, and print the command to run.
@@ -232,7 +234,7 @@ def doctor(
     """
     from railfix.run.doctor import examine_files
 
-    diagnosis = examine_files(files)
+    diagnosis = examine_files(files, date=reading.instant)
     problems = diagnosis.problems
     if as_json:
         print_json(diagnosis.as_dict())

@@ -27,9 +27,6 @@ from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
-Columns = Annotated[
-    list[str] | None, typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description))
-]
 
 #: Settings of reading a track that only a run needs.
 RUN_ALONE = ("reference", "cache")

@@ -32,8 +32,7 @@ def read_network(
     paths: Sequence[FilePath], reading: MapReading | None = None, *, tolerance_m: float = TOLERANCE_M
 ) -> Network:
     """Read a network from map files, connected as they state, else where ends, or an end and a track, meet."""
-    of_file = replace(reading or MapReading(), duplicates="keep")
-    tracks = [track for path in paths for track in read_segments(path, of_file)]
+    tracks = [track for path in paths for track in read_segments(path, reading or MapReading())]
     check_order(tracks)
     return connect_network(tracks, paths, tolerance_m=tolerance_m)
 

@@ -229,6 +229,9 @@ class _HeaderRecords:
 
     def scale_factor(self, text: str) -> None:
         """SYS / SCALE FACTOR."""
+        if re.match(r" +[A-Z] +\d+( |$)", text):
+            self._remark("SYS / SCALE FACTOR")
+            text = f"{text.lstrip():<60}"
         names = [text[k : k + 3].strip() for k in range(11, 59, 4)]
         names = [name for name in names if name]
         if text[0] != " ":
