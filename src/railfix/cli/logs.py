@@ -86,7 +86,7 @@ def which_track(
     Each track of the map within 60 m is a hypothesis; one more is a track missing from the map (`none`). The
     codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with
     a base station carrier phases count, too. The decision is taken when the probability of all other hypotheses
-    together is below `--risk`; else all probabilities are printed.
+    together is below `--risk`; otherwise all probabilities are printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 

@@ -65,7 +65,7 @@ def check(
     """Check a track map and print its faults.
 
     Checked: spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
-    where given, else from the circle through neighbouring points), kinks, jumps and reversals of the
+    where given, otherwise from the circle through neighbouring points), kinks, jumps and reversals of the
     kilometrage, gradients and height spikes, cant, and curve attributes against the points.
 
     Example: `railfix map check line.csv --out report`

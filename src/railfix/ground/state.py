@@ -115,7 +115,7 @@ class PointState:
 
     @property
     def lies(self) -> bool:
-        """Whether the points are detected where they are wanted."""
+        """Whether the points are detected in their commanded position."""
         return self.detected == self.wanted
 
 
@@ -202,7 +202,7 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
             values = json.loads(text or "")
             station, side = map(int, name.removeprefix(_POINTS).split())
             points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
-    # in the order of the line, whatever the order of the texts
+    # in the order of the line, in any order of the texts
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
         granted=head["granted"], bars=frozenset((name, kind) for name, kind in head["bars"]),

@@ -122,7 +122,7 @@ def solve_level(
     share : ndarray, shape (T, kinds)
         Risk that each kind may use.
     reserved : ndarray, shape (T,)
-        Risk taken off their sum beforehand.
+        Risk subtracted from their sum beforehand.
 
     Returns
     -------

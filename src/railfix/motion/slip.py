@@ -1,7 +1,7 @@
 r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
 
-``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; else it becomes
-one that no line has. Two rules:
+``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; otherwise it
+becomes one that no line has. Two rules:
 
 * ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
 slip, not its speed: at constant slip speed the rule is silent. * ``"map"``: against the gradient of the line at the
@@ -110,7 +110,7 @@ class SlipState:
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the rate of the pitch from body rates (N, 3), the roll in curves taken out, shape (N,) [rad/s].
+    """Return the rate of the pitch from body rates (N, 3), the roll in curves eliminated, shape (N,) [rad/s].
 
     The body leans with the cant: ``w_y cos(phi) - w_z sin(phi)`` with ``sin(phi) = (v w_z - f_y) / g``. Raw it would be
     wrong by 3.4 mrad/s in a curve of 400 m at 17 m/s.

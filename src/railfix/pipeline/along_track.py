@@ -332,7 +332,7 @@ def gnss_epochs(
     standard deviation is that of the range times `noise_scale`, shape (T,).
 
     The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in
-    the Dopplers; the change of the carrier phase has both taken off.
+    the Dopplers; the change of the carrier phase has both subtracted.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state

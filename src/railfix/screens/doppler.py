@@ -197,7 +197,7 @@ def doppler_screen(
     break_before : array_like of bool, shape (T,), optional
         Nothing is differenced across the step into these epochs.
     code_sigma_m : array_like, shape (T, M) [m], optional
-        Noise of the codes, requested by mode "sigma"; NaN there: not judged.
+        Noise of the codes, requested by mode "sigma"; NaN there: not tested.
     state : DopplerState, optional
         Left by the previous chunk.
 

@@ -1,4 +1,4 @@
-"""Ephemerides put together from navigation subframes as they are received.
+"""Ephemerides combined from navigation subframes as they are received.
 
 A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV1,
 B-CNAV2) or ten pages (D2), GLONASS four strings. `assemble_records` combines the subframes of a piece of a stream with

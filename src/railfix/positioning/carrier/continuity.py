@@ -163,7 +163,7 @@ def track_jumps(
     phases : TrackedPhases
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
-        Positions of codes alone, good to some metres; NaN: the epoch cannot judge nor be judged.
+        Positions of codes alone, good to some metres; NaN: the epoch is not used.
     state : ContinuityState, optional
     limits : ContinuityLimits, optional
 

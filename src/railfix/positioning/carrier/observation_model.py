@@ -1,6 +1,6 @@
 """P4's observation equations, linearised, the unknowns of each epoch eliminated.
 
-Per epoch t and channel i, around a place on the line::
+Per epoch t and channel i, around a position on the line::
 
     code  - range = -u.e d + (-u.c m1 - u.h m2) + b_g
     phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
@@ -86,7 +86,7 @@ class Linearised:
     #: Observed less computed, less `clock_m`; shape (T, M).
     code_m: Floats
     phase_m: Floats
-    #: First values of the epoch's clocks, taken off codes and phases; shape (T,).
+    #: First values of the epoch's clocks, subtracted from codes and phases; shape (T,).
     clock_m: Floats
     phase_clock_m: Floats
     known: Floats  #: Prior information: errors of the map, ties between clocks; shape (T, P, P).
