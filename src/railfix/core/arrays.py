@@ -65,7 +65,7 @@ def freeze_arrays(instance: DataclassInstance) -> None:
 
 
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
-    """Freeze the arrays of a dataclass that has one row of each; ValueError where one is longer or shorter."""
+    """Freeze the arrays of a dataclass with one row per item; ValueError where one is longer or shorter."""
     rows = len(vars(instance)[first])
     for name, value in vars(instance).items():
         if isinstance(value, np.ndarray) and len(value) != rows:
