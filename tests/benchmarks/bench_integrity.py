@@ -149,7 +149,7 @@ def parts_of_sbas(log: Log, rounds: int) -> None:
         spent: dict[str, float] = {}
         for first in range(0, len(result), size):
             rows = slice(first, first + size)
-            when, at = result.time[rows], result.satellites.position_ecef_m[rows]
+            when, at = result.time[rows], result.corrected.satellites.position_ecef_m[rows]
             here = np.broadcast_to(place, (len(when), 3))
             elevation, azimuth = elevation_azimuth(at, here)
             sight = (at - place) / np.linalg.norm(at - place, axis=-1, keepdims=True)

@@ -98,7 +98,7 @@ def test_two_satellites_are_enough_when_allowed():
     assert positioned.mean() > 0.9
     assert np.all(found.n_used == 2)
     # On the true section two ranges give the place: the residuals vanish.
-    assert np.nanmax(np.abs(found.residual_m[found.constrained.overshoot_m == 0])) < 1e-3
+    assert np.nanmax(np.abs(found.residual_m[found.fix.constrained.overshoot_m == 0])) < 1e-3
 
 
 @pytest.mark.requirement("A3")
@@ -125,7 +125,7 @@ def test_off_map_beyond_the_end():
     here = int(np.searchsorted(clean_trajectories()["front"].arc_m, whole().arc_m.min()))
     found = front_alone(front(), MASK_ONLY, trajectories=line(clean_trajectories()["front"].ecef_m[: here - 8]))
     all_are(found, Status.OFF_MAP)
-    assert (found.constrained.overshoot_m > 5.0).all()
+    assert (found.fix.constrained.overshoot_m > 5.0).all()
     assert np.all(found.arc_m == found.arc_m.max())
 
 
@@ -145,7 +145,7 @@ def test_unobservable():
 def test_no_convergence():
     """One step allowed: epochs whose nearest point lies ahead of them would have had to walk into its section."""
     found = front_alone(front(), MASK_ONLY | {"constrained": {"max_iterations": 1}})
-    walked = whole().constrained.iterations > 1
+    walked = whole().fix.constrained.iterations > 1
     assert 0 < walked.sum() < len(walked)
     assert np.array_equal(found.status == Status.NO_CONVERGENCE, walked)
     assert np.array_equal(np.isnan(found.arc_m), walked)

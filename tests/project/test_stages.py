@@ -83,9 +83,9 @@ def names() -> dict[str, Any]:
 
 def assert_same_positions(fix: Any, result: Any, *, least: float) -> None:
     """Assert that positions by hand and by the pipeline are equal to a millimetre at every epoch, gaps included."""
-    assert np.isfinite(result.constrained.arc_m).mean() > least
-    np.testing.assert_allclose(fix.constrained.arc_m, result.constrained.arc_m, rtol=0.0, atol=1e-3)
-    np.testing.assert_array_equal(fix.section.vertex, result.section.vertex)
+    assert np.isfinite(result.fix.constrained.arc_m).mean() > least
+    np.testing.assert_allclose(fix.constrained.arc_m, result.fix.constrained.arc_m, rtol=0.0, atol=1e-3)
+    np.testing.assert_array_equal(fix.section.vertex, result.fix.section.vertex)
 
 
 @pytest.mark.requirement("S1")

@@ -77,7 +77,7 @@ def test_protection_level_is_known_where_no_fault_is_left(result: Result) -> Non
     # a level is noise (3.29 sigma at a risk of 0.001) and a fault on top; satellites and atmosphere are no part of P4's
     for antenna in result.antennas.values():
         known = np.isfinite(antenna.raim.protection_level_m)
-        noise = antenna.noise_scale * antenna.constrained.exact_map_sigma_m
+        noise = antenna.noise_scale * antenna.fix.constrained.exact_map_sigma_m
         assert (antenna.raim.protection_level_m[known] > 3.29 * noise[known]).all()
 
 

@@ -315,13 +315,13 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
     if way.positions == "checked":
         kept = ~np.isin(got.status, CHECK_FAILED)
     if way.positions not in ("conventional", "validated", "filtered"):
-        kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
+        kept &= (got.epoch_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
     error = chainage - truth.chainage_m
     return Found(
         error_m=np.where(kept, error, np.nan),
         status=got.status,
         n_used=got.n_used,
-        own_sigma_m=got.own_sigma_m,
+        own_sigma_m=got.epoch_sigma_m,
         horizontal_m=horizontal_m(place - truth.ecef_m, truth.ecef_m),
     )
 
@@ -342,7 +342,7 @@ def broken(piece: Piece, got: AntennaResult, found: Found, t: int, *, passage: i
         passage=passage,
         epoch=before + t,
         error_m=float(found.error_m[t]),
-        dilution=float(got.constrained.dilution[t]),
+        dilution=float(got.fix.constrained.dilution[t]),
         late=int(np.count_nonzero(np.abs(wrong[used] - np.quantile(wrong[used], 0.25)) > LATE_M)) if len(used) else 0,
         signals=" ".join(
             f"{observed.satellite[k]}({geometry.elevation_deg[t, k]:.0f},{around[k]:+.0f},"

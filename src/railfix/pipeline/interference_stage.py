@@ -30,8 +30,8 @@ from railfix.integrity.interference import (
     suspicion,
 )
 from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
+from railfix.pipeline.solution import Solution
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.range_arrays import InterSystemBiases
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Reasons given because ranges contradict others: those of a spoofer do.
@@ -93,25 +93,13 @@ class Interference:
         return suspicion(self.causes)
 
 
-class PositionEpochs(NamedTuple):
-    """Results of single epochs that the signs are looked for in, T epochs."""
-
-    #: 3-D positions without the map, of all ranges; and of those that agree, NaN where ranges contradict each other;
-    #: shape (T, 3).
-    point_ecef_m: Floats
-    consistent_ecef_m: Floats
-    noise_scale: Floats  #: Shape (T,).
-    ties: InterSystemBiases  #: Inter-system biases known before each epoch.
-    status: Codes  #: `Status`, before causes are known; shape (T,).
-
-
 def _motion_inputs(
-    corrected: CorrectedRanges, single: PositionEpochs, antennas: AntennaRows, rows: Indices, broken: Masks
+    corrected: CorrectedRanges, single: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
     """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line = single.consistent_ecef_m[rows], np.empty(len(rows))
-    near = np.where(np.isnan(consistent), single.point_ecef_m[rows], consistent)
+    near = np.where(np.isnan(consistent), single.point.ecef_m[rows], consistent)
     first = 0
     for index, own in antennas.split(rows):
         part = slice(first, first := first + len(own))
@@ -260,7 +248,7 @@ def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
 
 def judge_interference(
     corrected: CorrectedRanges,
-    single: PositionEpochs,
+    single: Solution,
     antennas: AntennaRows,
     states: list[InterferenceState],
     limits: InterferenceLimits,

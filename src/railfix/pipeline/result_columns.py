@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -21,13 +20,13 @@ from railfix.integrity.interference import Suspicion, cause_text
 from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
-from railfix.pipeline.along_track import innovations
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.two_frequencies import Combined
 from railfix.ranges.second_codes import SecondCodes
 from railfix.screens import SCREENS, ScreenColumn
+from railfix.tracking import Kind
 
 Source = TypeVar("Source")
 #: Unit by the last part of a name.
@@ -140,15 +139,11 @@ class Observed:
 
     def on_all_channels(self, values: Floats | None) -> Floats:
         """Return values of the channels that were positioned with, on all channels: shape (T, M), NaN elsewhere."""
-        full = np.full(self.result.reason.shape, np.nan)
-        if values is not None:
-            full[:, self.result.columns] = values
-        return full
+        return self.result.on_all_channels(np.nan if values is None else values)
 
-    @cached_property
-    def innovations(self) -> Mapping[str, Floats]:
-        """Innovations of the filter and weights of codes, by column."""
-        return innovations(self.tracked, self.result.columns, self.result.reason.shape)
+    def innovation(self, kind: Kind) -> Floats:
+        """Return the filter's innovations of a kind of measurement of each channel, shape (T, M); NaN without it."""
+        return self.on_all_channels(None if self.tracked is None else self.tracked.tracked.innovation[:, kind])
 
 
 #: Columns that the tables of positions and of the filter share: of the epoch, the line, the place.
@@ -175,7 +170,11 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
         *ON_LINE,
         Column("along_sigma_m", "standard deviation along the line, other places of an ambiguous epoch included"),
-        Column("own_sigma_m", "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit"),
+        Column(
+            "own_sigma_m",
+            "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit",
+            "epoch_sigma_m",
+        ),
         *IN_SPACE,
         Column("n_used", "satellites used", dtype=pl.Int16()),
         Column("n_rejected", "satellites with a pseudorange that were not used", dtype=pl.Int16()),
@@ -328,7 +327,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
 
 def _second(observed: Observed, values: Callable[[Combined, SecondCodes], Floats]) -> Floats | None:
     """Return values of the combination of two codes on all channels; None with one frequency."""
-    combined, second = observed.result.combined, observed.result.second
+    combined, second = observed.result.combined, observed.result.corrected.second
     return None if combined is None or second is None else observed.on_all_channels(values(combined, second))
 
 
@@ -381,17 +380,17 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         Column(
             "innovation_code_m",
             "filter along the track: code less what earlier epochs predict, where codes count (once a second)",
-            lambda o: o.innovations["innovation_code_m"],
+            lambda o: o.innovation(Kind.CODE),
         ),
         *of_one_meaning(
             "the same of the carrier phase's change, of the Doppler",
-            innovation_phase_m=lambda o: o.innovations["innovation_phase_m"],
-            innovation_doppler_mps=lambda o: o.innovations["innovation_doppler_mps"],
+            innovation_phase_m=lambda o: o.innovation(Kind.PHASE),
+            innovation_doppler_mps=lambda o: o.innovation(Kind.DOPPLER),
         ),
         Column(
             "weight_code",
             "weight of the code in the filter; 1 is that of an error of one standard deviation",
-            lambda o: o.innovations["weight_code"],
+            lambda o: o.on_all_channels(None if o.tracked is None else o.tracked.tracked.weight[:, Kind.CODE]),
         ),
     )
 )

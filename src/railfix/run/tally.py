@@ -16,7 +16,7 @@ from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES, Suspicion
 from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
-from railfix.pipeline.antennas import AntennaOrder
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.processor import EpochProcessor
@@ -340,7 +340,7 @@ class ResultRows:
             tables["passings"] = passing_table(result)
         for name, kept in self.replays.items():
             if name in result.fusion:
-                kept.keep(result.fusion[name].replay)
+                kept.keep(result.replays[name])
         if self.line.route is not None:
             tables["positions"], tables["tracks"] = self.line.route.on_tracks(tables["positions"], self.line.track)
             if "train" in tables:
