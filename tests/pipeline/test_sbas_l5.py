@@ -24,7 +24,7 @@ from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.decode import read_fields
 from railfix.ranges.sbas.dfmc import LAYOUTS, DfmcService, DfmcState
 from railfix.ranges.sbas.messages import with_parity
-from railfix.ranges.sources import DFMC_REASONS
+from railfix.ranges.sbas.sources import DFMC_REASONS
 from railfix.run.processor import make_processor
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate import sbas_stream as stream

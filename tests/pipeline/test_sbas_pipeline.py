@@ -35,7 +35,7 @@ from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import point_position
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
-from railfix.ranges.sources import REASONS
+from railfix.ranges.sbas.sources import REASONS
 from railfix.run.processor import make_processor
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv

@@ -34,7 +34,7 @@ from railfix.ranges.sbas import (
     SbasCorrections,
     read_sbas,
 )
-from railfix.ranges.sources import apply_long_term, sbas_delays
+from railfix.ranges.sbas.sources import apply_long_term, sbas_delays
 from railfix.run.processor import make_processor
 from recordings_score import straight_line
 

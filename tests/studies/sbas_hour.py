@@ -33,7 +33,7 @@ from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorModel, read_error_model
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
-from railfix.ranges.sources import apply_long_term
+from railfix.ranges.sbas.sources import apply_long_term
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from sbas_levels import sbas_level

@@ -105,7 +105,7 @@ def test_many_faulty_satellites_are_a_wrong_map() -> None:
     )
     north = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))[1]
     aside = Track.from_ecef(np.asarray(turning.ecef_m) + 10.0 * north)
-    line = Line.of(Trajectory.from_antenna_path(aside))
+    line = Line(Trajectory.from_antenna_path(aside))
     wrong, _ = track(case.epochs, line, levels=True)
     many = wrong.faulty.sum(axis=1) > 2
     assert many.sum() > 50

@@ -80,7 +80,7 @@ def compile_filter() -> None:
     )  # fmt: skip
     inputs = demo_inputs()
     assert inputs.vehicle is not None
-    line = Line.of(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
+    line = Line(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
     state, limits = TrackState.empty(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)

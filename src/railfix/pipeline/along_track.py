@@ -64,7 +64,7 @@ def along_track(
     ranges: CorrectedRanges,
     slips: Slips | None,
     single: SingleEpochs,
-    trajectory: Trajectory,
+    line: Line,
     config: Config,
     state: FilterState,
     *,
@@ -79,10 +79,9 @@ def along_track(
     """
     epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
     epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
-    line = Line.of(trajectory) if state.line is None else state.line
+    trajectory = line.trajectory
     tracked, sensed, replays, after = _run_filter(
-        epochs, trajectory, line, config, copy_with(state, slips=after_slips), samples, references,
-        (single.arc_m, single.sigma_m),
+        epochs, line, config, copy_with(state, slips=after_slips), samples, references, (single.arc_m, single.sigma_m)
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
     tracked = mark_doubtful(tracked, beside, TrackStatus.MAP_OFFSET)
@@ -107,7 +106,7 @@ def along_track(
         direction=direction.astype(np.int8), standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS, sensed=sensed,
         spacing_error_m=np.full(len(tracked), np.nan), wheel=wheel,
     )  # fmt: skip
-    return result, replays, copy_with(after, line=line)
+    return result, replays, after
 
 
 def single_epochs(chunk: Chunk, antenna: str, config: Config) -> SingleEpochs:
@@ -193,7 +192,6 @@ def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tra
 
 def _run_filter(
     epochs: GnssEpochs,
-    trajectory: Trajectory,
     line: Line,
     config: Config,
     state: FilterState,
@@ -225,7 +223,7 @@ def _run_filter(
             state = _restart_state(state, state.fixed)
         before = state.sensors
         sensors, sensed, kept = sensor_epochs(
-            samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
+            samples, part.time, line.trajectory, before, limits=config.sensors, sine_at=sine_at,
             sources=config.filter_sources, references=references,
         )  # fmt: skip
         samples = None

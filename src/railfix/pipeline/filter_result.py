@@ -18,7 +18,7 @@ from railfix.pipeline.sensor_epochs import SensorState
 from railfix.positioning.carrier import CycleSlipState
 from railfix.screens import FilteredMotion
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import Line, Tracked, TrackState
+from railfix.tracking import Tracked, TrackState
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
 from railfix.tracking.state import StateIndex
@@ -57,7 +57,6 @@ class SingleEpochs:
 class FilterState(NotebookTable):
     """State of the filter along the track of one antenna after a chunk."""
 
-    line: Line | None = None  #: The trajectory as the filter sees it, made once.
     slips: CycleSlipState | None = None  #: Of the carrier phases.
     track: TrackState | None = None
     level: LevelState = field(default_factory=LevelState)  #: Of the filter that gives the levels.

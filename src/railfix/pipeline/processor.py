@@ -57,6 +57,7 @@ from railfix.screens import (
 from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line
 
 
 class EpochProcessor:
@@ -164,6 +165,11 @@ class EpochProcessor:
     def __getstate__(self) -> dict[str, Any]:
         """Return everything but the threads, which another process has of its own."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
+
+    @cached_property
+    def lines(self) -> dict[str, Line]:
+        """The trajectories as the filter along the track takes them, by antenna."""
+        return {name: Line(trajectory) for name, trajectory in self.trajectories.items()}
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -351,7 +357,7 @@ class EpochProcessor:
             rows, sensors = chunk.rows[name], chunk.sensors
             return along_track(
                 take_epochs(chunk.corrected, rows), take_epochs(chunk.slips, rows),
-                single_epochs(chunk, name, self.config), self.trajectories[name], self.config,
+                single_epochs(chunk, name, self.config), self.lines[name], self.config,
                 state.fusion.get(name) or FilterState(), samples=sensors,
                 references=self._line_references(name, sensors),
             )  # fmt: skip

@@ -388,7 +388,7 @@ def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, fold
     smoothed = {}
     for name, kept in replays.items():
         trajectory = processor.trajectories[name]
-        result = smooth(kept.backward(), Line.of(trajectory), processor.config.tracking)
+        result = smooth(kept.backward(), Line(trajectory), processor.config.tracking)
         smoothed[name] = smoothed_table(result, trajectory)
     done = dict.fromkeys(smoothed, 0)
 

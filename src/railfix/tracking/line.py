@@ -2,46 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.kernels.tracking.layout import LINE, VERTEX, Records
-from railfix.track.trajectory import Trajectory, joins_m
+from railfix.track.trajectory import Trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
 class Line:
-    """Vertices of a trajectory with their axes."""
+    """A trajectory with smooth axes at its points; places beyond its ends are on it too."""
 
-    arc_m: Floats  #: Shape (V,).
-    ecef_m: Floats  #: Shape (V, 3).
-    axes: Floats  #: Rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3).
-    segment: Floats  #: Unit vector of each segment; shape (V - 1, 3).
-    gradient: Floats  #: Climb over horizontal length of each segment; shape (V - 1,).
-    sigma_plan_m: float
-    sigma_height_m: float
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.arc_m: Floats = trajectory.arc_m  #: Shape (V,).
+        self.ecef_m: Floats = trajectory.ecef_m  #: Shape (V, 3).
+        self.segment: Floats = trajectory.tangent  #: Unit vector of each segment; shape (V - 1, 3).
+        self.joins_m = trajectory.joins_m
 
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> Line:
-        """Return the axes at the vertices of a trajectory."""
-        segment = np.asarray(trajectory.tangent)
+    @cached_property
+    def axes(self) -> Floats:
+        """Axes at the points, rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3)."""
+        segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
-        up = np.concatenate([trajectory.up[:1], trajectory.up])
-        right = np.cross(tangent, up)
+        right = np.cross(tangent, np.concatenate([up[:1], up]))
         right /= np.linalg.norm(right, axis=1, keepdims=True)
-        return cls(
-            arc_m=np.asarray(trajectory.arc_m),
-            ecef_m=np.asarray(trajectory.ecef_m),
-            axes=np.stack([tangent, right, np.cross(right, tangent)], axis=1),
-            segment=segment,
-            gradient=np.asarray(trajectory.gradient_permille) / 1e3,
-            sigma_plan_m=trajectory.sigma_plan_m,
-            sigma_height_m=trajectory.sigma_height_m,
-        )
+        return np.stack([tangent, right, np.cross(right, tangent)], axis=1)
+
+    @cached_property
+    def gradient(self) -> Floats:
+        """Climb over horizontal length of each segment, shape (V - 1,)."""
+        return self.trajectory.gradient_permille / 1e3
 
     def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
         """Points and axes at arc lengths, beyond the ends of a closed line where it goes on, of others straight on.
@@ -63,11 +56,6 @@ class Line:
         axes = (1.0 - share) * self.axes[index] + share * self.axes[index + 1]
         axes = axes / np.sqrt((axes * axes).sum(axis=-1, keepdims=True))
         return self.ecef_m[index] + along[:, None] * self.segment[index], axes
-
-    @cached_property
-    def joins_m(self) -> tuple[float, float]:
-        """Arc lengths at which a closed line goes on before its start and after its end; NaN at an open end."""
-        return joins_m(self.arc_m, self.ecef_m)
 
     @cached_property
     def bounds_m(self) -> tuple[float, float]:
@@ -134,7 +122,7 @@ class Line:
             vertex[name] = getattr(self, name)
         for name in ("segment", "middle_m", "gradient"):
             vertex[name][:-1] = getattr(self, name)
-        line["sigma_plan_m"], line["sigma_height_m"] = self.sigma_plan_m, self.sigma_height_m
+        line["sigma_plan_m"], line["sigma_height_m"] = self.trajectory.sigma_plan_m, self.trajectory.sigma_height_m
         line["start_m"], line["end_m"] = self.bounds_m
         line["start_turn_m"] = np.nan_to_num(self.joins_m[0] - self.arc_m[0])
         line["end_turn_m"] = np.nan_to_num(self.arc_m[-1] - self.joins_m[1])
