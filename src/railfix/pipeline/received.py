@@ -66,12 +66,17 @@ class Received:
     base: BaseErrors | None = None  #: Range errors that a base station has measured.
 
 
-def correction_source(received: Received, config: Config) -> CorrectionSource:
-    """Return the source of corrections of what has been received."""
-    models = BroadcastSource(
+def broadcast_source(received: Received, config: Config) -> BroadcastSource:
+    """Return the source of corrections by the records and models alone."""
+    return BroadcastSource(
         navigation=received.navigation, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
         troposphere=config.troposphere, nominal=config.nominal,
     )  # fmt: skip
+
+
+def correction_source(received: Received, config: Config) -> CorrectionSource:
+    """Return the source of corrections of what has been received."""
+    models = broadcast_source(received, config)
     source: CorrectionSource = models
     if isinstance(received.sbas, DfmcService):
         source = DfmcSource(models=models, service=received.sbas)
