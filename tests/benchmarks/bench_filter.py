@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 import tracking_cases
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

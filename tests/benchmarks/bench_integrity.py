@@ -40,7 +40,7 @@ from railfix.ranges.error_model import ErrorModel, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fit_bins
 from railfix.ranges.sbas import SbasCorrections, read_sbas
 from railfix.run.driver import RunOptions
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

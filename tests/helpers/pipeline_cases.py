@@ -19,8 +19,8 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.simulate import Scenario, write_run
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track

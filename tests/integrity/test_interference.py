@@ -24,7 +24,7 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion import MotionInputs, MotionSigns
+from railfix.integrity.interference.motion_signs import MotionInputs, MotionSigns
 
 LIMITS = InterferenceLimits()
 START = np.datetime64("2024-03-05T03:10:00", "ns")

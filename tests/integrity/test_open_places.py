@@ -24,7 +24,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

@@ -21,7 +21,7 @@ from railfix.integrity.raim import (
     noncentrality,
     reliability,
 )
-from railfix.integrity.raim.model import compact
+from railfix.integrity.raim.position_model import compact
 from railfix.io import read_observations
 from railfix.positioning.normal_equations import Constrained, position_on_line
 from railfix.positioning.range_arrays import Ranges

@@ -22,7 +22,7 @@ from plain_kernels import plain
 from railfix import kernels
 from railfix.core.arrays import read_only
 from railfix.integrity.protection import RiskBudget, protection_level
-from railfix.integrity.protection.level import MapDeviation, RangeBounds
+from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.kernels import compiling
@@ -33,7 +33,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
 from railfix.positioning.normal_equations import misfit, normal_equations, point_position, position_on_line
 from railfix.positioning.receiver_noise import robust_fit
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 import synthetic
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, linear_model
-from railfix.integrity.raim.model import _model
+from railfix.integrity.raim.position_model import _model
 from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.ranges.channels import clock_groups

@@ -23,8 +23,8 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
-from railfix.integrity.protection.level import Asked, Errors
-from railfix.integrity.raim.model import LinearModel, ModelArrays, compact
+from railfix.integrity.protection.solution_separation import Asked, Errors
+from railfix.integrity.raim.position_model import LinearModel, ModelArrays, compact
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 NO_EFFECT: Final = 1e-6

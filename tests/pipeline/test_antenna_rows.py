@@ -21,14 +21,14 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline import processor as processing
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import Models, correct_ranges
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.screen_stage import screen_filtered, screen_positions
-from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.error_model import ErrorModel
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track

@@ -18,7 +18,7 @@ from railfix.integrity.interference.limits import InterferenceLimits, PowerState
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_files
 
 pytestmark = pytest.mark.requirement("A8")

@@ -14,11 +14,11 @@ from railfix.core.timescale import timedelta
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.result_tables import antenna_positions
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.tables import antenna_positions
+from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, robust_fit
-from railfix.positioning.windows import Windows
 from railfix.simulate.demonstration import demo_files
 
 

@@ -34,7 +34,7 @@ from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 
 #: Epochs a chunk, and epochs of the log.
 CHUNKS = {1: 60, 7: 200, 1000: 1200}

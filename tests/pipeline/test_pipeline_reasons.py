@@ -24,8 +24,8 @@ from pipeline_cases import (
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
+from railfix.pipeline.result_tables import observations_table
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.tables import observations_table
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

@@ -21,22 +21,22 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
 from railfix.integrity.fault_exclusion import compute_statistic
-from railfix.integrity.protection.level import RangeBounds
+from railfix.integrity.protection.solution_separation import RangeBounds
 from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import fit_ranges
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.line_fix import fix_on_line
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import point_position
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
-from railfix.ranges.sbas.sources import REASONS
-from railfix.run.processor import make_processor
+from railfix.ranges.sbas.sbas_sources import REASONS
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv
 from railfix.track.trajectory import Trajectory

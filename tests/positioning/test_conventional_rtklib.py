@@ -35,7 +35,7 @@ from railfix.positioning.normal_equations import point_position
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.ranges.channels import clock_groups
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 

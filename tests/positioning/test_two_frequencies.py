@@ -28,7 +28,7 @@ from railfix.positioning.two_frequencies import (
     share_of_second,
 )
 from railfix.ranges.second_codes import SecondCodes, signal_delays
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory
 

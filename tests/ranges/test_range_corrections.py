@@ -34,8 +34,8 @@ from railfix.ranges.sbas import (
     SbasCorrections,
     read_sbas,
 )
-from railfix.ranges.sbas.sources import apply_long_term, sbas_delays
-from railfix.run.processor import make_processor
+from railfix.ranges.sbas.sbas_sources import apply_long_term, sbas_delays
+from railfix.run.processor_setup import make_processor
 from recordings_score import straight_line
 
 pytestmark = pytest.mark.requirement("A4")

@@ -33,7 +33,7 @@ from railfix.ranges.error_model import read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run import RunOptions, read_record, run_files
 from railfix.run.driver import open_inputs
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import Scenario, Simulation, demo_files
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import from_positions

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from railfix.pipeline.antennas import AntennaOrder
 from typer.testing import CliRunner
 
 from railfix import Config, EpochProcessor, antenna_trajectory, read_track, read_vehicle
 from railfix.cli import app
 from railfix.live.engine import LiveEngine
 from railfix.live.settings import LiveSettings
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.simulate.demonstration import demo_files
 from railfix.track.trajectory import Trajectory
 

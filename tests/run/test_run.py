@@ -21,10 +21,10 @@ from railfix.evaluate import evaluate_run
 from railfix.io import read_navigation, read_observations, scan_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.result_tables import TRAIN_COLUMNS, observations_table, positions_table, to_xarray, train_table
 from railfix.pipeline.results import Result
-from railfix.pipeline.tables import TRAIN_COLUMNS, observations_table, positions_table, to_xarray, train_table
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

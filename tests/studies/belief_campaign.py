@@ -57,7 +57,7 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import Result
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.run import truth_table, vehicle_table
 from railfix.simulate.scenario_file import list_scenarios, load_recipe
 from railfix.track import Track, antenna_trajectory, read_track, read_vehicle

@@ -46,7 +46,7 @@ from railfix.positioning.normal_equations import position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, Ranges
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.channels import clock_groups
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

@@ -32,14 +32,14 @@ from railfix.integrity.raim import (
     reliability,
     threshold,
 )
-from railfix.integrity.raim.model import compact
+from railfix.integrity.raim.position_model import compact
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import position_on_line
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.channels import clock_groups
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 

@@ -26,7 +26,7 @@ from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.pipeline import along_track
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.smoothing import Replay, SmoothedTrack, smooth
+from railfix.pipeline.smoothed_track import Replay, SmoothedTrack, smooth
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track

@@ -25,7 +25,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 

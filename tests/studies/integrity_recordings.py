@@ -39,7 +39,7 @@ from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run.driver import open_inputs
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.record import read_record
 from railfix.track.trajectory import Trajectory
 

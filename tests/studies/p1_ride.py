@@ -22,10 +22,10 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.sensors import read_sensors
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table

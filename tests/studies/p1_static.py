@@ -20,7 +20,7 @@ from railfix.core.reasons import Status
 from railfix.core.settings import write_toml
 from railfix.gnss.observations import Observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.line_file import Element, LineSettings

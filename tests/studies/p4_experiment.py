@@ -24,7 +24,7 @@ from railfix.integrity.raim import Outcome, RaimLimits
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

@@ -14,7 +14,7 @@ from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import BIAS_FAULTY, BIAS_SHORT
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.tally import Tally
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory

@@ -142,7 +142,7 @@ def _monitor_live(
     from railfix.ground.triangle import LiveMonitor
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
-    from railfix.run.processor import parse_position
+    from railfix.run.processor_setup import parse_position
 
     if not choices.point:
         raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")

@@ -15,19 +15,19 @@ import polars as pl
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.core.reasons import Status
-from railfix.evaluate.figures import Score, score
+from railfix.evaluate.accuracy import Score, score
 from railfix.evaluate.place import along_track_error, interpolate_reference
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.driver import Progress, collect_notes, open_inputs, read_samples_and_units
 from railfix.run.inputs import ColumnNames, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.record import NO_FIGURES, RunProvenance, package_versions, run_record
 from railfix.run.sensors import load_balises
 from railfix.run.sources import align_logs

@@ -13,9 +13,9 @@ import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
-from railfix.evaluate.epochs import antenna_epochs, below
-from railfix.evaluate.figures import ALL, KEYS, USED, figures_by
-from railfix.evaluate.inputs import (
+from railfix.evaluate.accuracy import ALL, KEYS, USED, figures_by
+from railfix.evaluate.epoch_table import antenna_epochs, below
+from railfix.evaluate.evaluation_inputs import (
     NO_MORE,
     POSITIONS_TABLE,
     TABLES,
@@ -48,7 +48,7 @@ class RunAndReference:
     run: Path
     reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` beside the run's log.
     configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
-    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.inputs.list_position_tables`.
+    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.evaluation_inputs.list_position_tables`.
     #: Another run on the same log, whose conventional positions take the place of the run's own: one with the screens
     #: elevation and C/N0 alone gives those that P1 compares with.
     conventional: Path | None = None

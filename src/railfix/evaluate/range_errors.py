@@ -25,19 +25,19 @@ from railfix.evaluate.place import bracket, interpolate_reference
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
 from railfix.io.reference_log import AntennaReference, read_reference
-from railfix.pipeline.base_station import BaseStation
+from railfix.pipeline.base_station_stage import BaseStation
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import collect_conditions
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.positioning.receiver_noise import RobustClock, robust_clock
 from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource, condition_differences
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, faulty_stretches, fit_bins
 from railfix.run.driver import open_inputs
 from railfix.run.inputs import ColumnNames, input_option
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.record import read_record
 from railfix.run.sources import align_logs
 from railfix.track.trajectory import Trajectory

@@ -33,10 +33,10 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.pipeline.tables import round_floats
+from railfix.pipeline.result_tables import round_floats
 from railfix.run.driver import find_record_time
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
-from railfix.run.processor import check_base_place, make_processor, parse_position
+from railfix.run.processor_setup import check_base_place, make_processor, parse_position
 from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
 

@@ -23,7 +23,7 @@ from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, S
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
-from railfix.pipeline.smoothing import Replay, SmoothedTrack
+from railfix.pipeline.smoothed_track import Replay, SmoothedTrack
 from railfix.pipeline.solution import with_coordinates
 from railfix.positioning.carrier import CycleSlipState, Slips, corrected_phase_m, find_slips
 from railfix.positioning.map_offset import beyond_threshold

@@ -14,12 +14,13 @@ from railfix.core.reasons import Reason
 from railfix.integrity.fault_exclusion import RaimResult, compute_statistic, exclude_faults
 from railfix.integrity.persistent_biases import BiasLimits, reject_persistent_biases
 from railfix.integrity.raim import LinearModel
-from railfix.integrity.raim.model import update_model
+from railfix.integrity.raim.position_model import update_model
 from railfix.pipeline.config import Config
+from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import reject
-from railfix.pipeline.state import AntennaState
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.line_fix import LineFix
+from railfix.positioning.noise_windows import Windows
 from railfix.positioning.normal_equations import misfit
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import (
@@ -29,7 +30,6 @@ from railfix.positioning.receiver_noise import (
     noise_scale,
     robust_on_line,
 )
-from railfix.positioning.windows import Windows
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.

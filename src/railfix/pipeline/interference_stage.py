@@ -29,7 +29,7 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion import MotionFit, MotionInputs, fit_motion
+from railfix.integrity.interference.motion_signs import MotionFit, MotionInputs, fit_motion
 from railfix.pipeline.solution import Solution
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.ranges.corrected import CorrectedRanges

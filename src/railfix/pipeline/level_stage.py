@@ -22,8 +22,8 @@ from railfix.integrity.protection import (
     protection_level,
 )
 from railfix.integrity.protection.araim import AraimGeometry, AraimResult, IntegritySupport, araim_levels
-from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.protection.open_places import places_beyond_the_level
+from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, linear_model
 from railfix.pipeline.config import Config
 from railfix.pipeline.fault_stage import CheckedRanges

@@ -24,9 +24,9 @@ from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.fault_stage import CheckedRanges, check_ranges, contradict_map
 from railfix.pipeline.level_stage import level_stage
 from railfix.pipeline.off_map import OffMapState, off_map_epochs
+from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import fit_ranges, reject
 from railfix.pipeline.solution import Solution
-from railfix.pipeline.state import AntennaState
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions, Slips
 from railfix.positioning.inter_system import TieLimits, tie_constellations

@@ -24,8 +24,8 @@ from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import along_track, apply_spacing_verdict, single_epochs, with_passings
 from railfix.pipeline.antenna_order import AntennaOrder
-from railfix.pipeline.base_station import BaseStation, Stations, check_base
-from railfix.pipeline.channels import ChannelBook, missing_notes
+from railfix.pipeline.base_station_stage import BaseStation, Stations, check_base
+from railfix.pipeline.channel_book import ChannelBook, missing_notes
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.feature_fixes import LineFeatures
@@ -33,13 +33,13 @@ from railfix.pipeline.filter_result import AlongTrack, FilterState
 from railfix.pipeline.interference_stage import judge_interference, with_statuses
 from railfix.pipeline.level_stage import compute_araim
 from railfix.pipeline.position_stage import position_stage
+from railfix.pipeline.processor_state import AntennaState, State
 from railfix.pipeline.range_stage import Models, collect_conditions, correct_ranges
 from railfix.pipeline.received import correction_source, known_from_start, receive
 from railfix.pipeline.results import Result, antenna_results
 from railfix.pipeline.screen_stage import screen_antennas, screen_filtered, screen_pairs, screen_positions
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
-from railfix.pipeline.smoothing import Replay
-from railfix.pipeline.state import AntennaState, State
+from railfix.pipeline.smoothed_track import Replay
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.error_model import condition_differences

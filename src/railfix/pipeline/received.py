@@ -16,7 +16,7 @@ from railfix.gnss.plausible_records import plausible_navigation
 from railfix.pipeline.config import Config
 from railfix.ranges.base_station import BaseErrors
 from railfix.ranges.sbas import DfmcService, SbasCorrections, SbasMessages, SbasState
-from railfix.ranges.sbas.sources import DfmcSource, SbasSource
+from railfix.ranges.sbas.sbas_sources import DfmcSource, SbasSource
 from railfix.ranges.sources import BaseStationSource, BroadcastSource, CorrectionSource, choose_ionosphere
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)

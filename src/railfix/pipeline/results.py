@@ -19,7 +19,7 @@ from railfix.pipeline.coordinates import LineCoordinates
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.interference_stage import Interference, with_statuses
 from railfix.pipeline.level_stage import apply_verdicts
-from railfix.pipeline.smoothing import Replay
+from railfix.pipeline.smoothed_track import Replay
 from railfix.pipeline.solution import Solution, with_coordinates
 from railfix.positioning.two_frequencies import Combined
 from railfix.ranges.corrected import CorrectedRanges
@@ -216,7 +216,7 @@ class Result(NotebookTable):
     notes: tuple[str, ...]  #: Differences between what was requested and what was used, one sentence each.
     #: Positions of the filter along the track, by antenna; empty where it is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
-    #: What the filter was given, by antenna, to smooth its positions (`railfix.pipeline.smoothing`).
+    #: What the filter was given, by antenna, to smooth its positions (`railfix.pipeline.smoothed_track`).
     replays: Mapping[str, tuple[Replay, ...]] = field(default_factory=dict)
 
     def __getitem__(self, antenna: str) -> AntennaResult:

@@ -14,9 +14,9 @@ from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.frequency_stage import combine_frequencies
 from railfix.pipeline.observable_checks import check_observables
+from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import apply_verdict
 from railfix.pipeline.solution import Solution, with_coordinates
-from railfix.pipeline.state import AntennaState
 from railfix.screens import FilteredMotion, PairedEpochs, Screened, ScreenSetup
 from railfix.screens.base import on_pairs
 

@@ -4,7 +4,7 @@ from .base_station import BaseErrors, BaseLimits
 from .channels import DEFAULT_SIGNALS, SECOND_SIGNALS, Channels, select_channels
 from .corrected import AntennaRanges, CorrectedRanges, SatelliteRanges, corrected_ranges, find_satellites
 from .range_sigma import CodeNoise, NominalErrors, code_sigma_m
-from .sbas.sources import DfmcSource, SbasSource
+from .sbas.sbas_sources import DfmcSource, SbasSource
 from .second_codes import SecondCodes
 from .sources import BaseStationSource, BroadcastSource, CorrectionSource, SourceDelays, SourceSatellites
 

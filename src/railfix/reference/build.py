@@ -37,7 +37,7 @@ from railfix.reference.smoother import (
     slip_m,
     smooth,
 )
-from railfix.reference.wheel import Wheel, estimate_wheel
+from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
 #: Speeds further apart leave the distance between them unknown [s], with this variance [m2].

@@ -311,7 +311,7 @@ def range_notes(
 
 
 def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
-    """Return times and speeds of filtered positions (`railfix.pipeline.tables`) for which Dopplers were used."""
+    """Return times and speeds of filtered positions (`railfix.pipeline.result_tables`) for which Dopplers were used."""
     known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
     return known.select("time_gpst", "speed_mps")
 

@@ -14,12 +14,12 @@ from railfix.core.errors import MismatchError
 from railfix.core.geodesy import axes_at, range_with_rotation
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import RangesWithoutMap, locate, ranges_without_map
 from railfix.pipeline.received import known_from_start
+from railfix.pipeline.without_map import RangesWithoutMap, locate, ranges_without_map
 from railfix.positioning.standstill_phase import MeanPhases
-from railfix.positioning.which_track import StandstillErrors, StandstillFix, standstill_fix
+from railfix.positioning.track_choice import StandstillErrors, StandstillFix, standstill_fix
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
 #: Satellites in fewer than this share of the epochs are left out, so that the mean is over the same ones.

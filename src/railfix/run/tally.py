@@ -20,9 +20,7 @@ from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.results import AntennaResult, Result
-from railfix.pipeline.smoothing import Replay, smooth
-from railfix.pipeline.tables import (
+from railfix.pipeline.result_tables import (
     antenna_positions,
     antenna_train,
     observations_table,
@@ -33,6 +31,8 @@ from railfix.pipeline.tables import (
     train_table,
     with_smoothed,
 )
+from railfix.pipeline.results import AntennaResult, Result
+from railfix.pipeline.smoothed_track import Replay, smooth
 from railfix.run.output import OutputFolder
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sources import OpenedLine

@@ -15,7 +15,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.range_stage import raw_ranges
 from railfix.pipeline.received import Received, broadcast_source

@@ -35,7 +35,7 @@ from railfix.pipeline.result_columns import (
 )
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
-from railfix.pipeline.smoothing import SmoothedTrack
+from railfix.pipeline.smoothed_track import SmoothedTrack
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind, TrackStatus
 
