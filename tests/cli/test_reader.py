@@ -34,7 +34,7 @@ def call(*words: object) -> str:
     return result.output
 
 
-@pytest.mark.requirement("A7")
+@pytest.mark.requirement("A7", "S2")
 def test_a_run_and_positions_by_georinex_are_those_by_our_own_reader(files: dict[str, Path], tmp_path: Path) -> None:
     tables, positions = [], []
     for reader in ("railfix", "georinex"):

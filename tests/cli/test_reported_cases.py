@@ -8,7 +8,7 @@ import pytest
 
 from reported_cases import Row, list_rows, run_row, station_error_m
 
-pytestmark = pytest.mark.requirement("A6")
+pytestmark = pytest.mark.requirement("A6", "G5")
 
 
 @pytest.mark.filterwarnings("default")

@@ -654,7 +654,7 @@ def test_the_reference_beside_the_log_must_be_the_only_one(tmp_path: Path):
 
 
 def test_the_document_names_every_column():
-    text = (ROOT / "docs" / "evaluation-columns.md").read_text()
+    text = (ROOT / "docs" / "columns.md").read_text()
     every = (EPOCH_COLUMNS, FIGURE_COLUMNS, INTERVAL_COLUMNS, LEVEL_COLUMNS, STANFORD_COLUMNS, BEYOND_COLUMNS)
     every += (OUTAGE_COLUMNS, BRANCH_COLUMNS)
     for columns in every:

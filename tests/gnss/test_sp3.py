@@ -135,7 +135,7 @@ def test_files_are_joined_and_the_first_one_counts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s: "  3.05 NAVIGATION\n" + s, "first line must begin with #a"),
+        (lambda s: "  3.05 NAVIGATION\n" + s, "first line begins with #a"),
         (lambda s: s.replace("GPS ccc", "TAI ccc"), "time system 'TAI'"),
         (lambda s: s.split("*")[0], "has no satellite position"),
         (lambda s: s.replace("PG05", "PGX5", 1), "line 25"),

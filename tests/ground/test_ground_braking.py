@@ -24,7 +24,7 @@ from railfix.ground.braking import (
 from railfix.ground.layout import Gradient, Layout, LoopStation
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 
-pytestmark = pytest.mark.requirement("F4")
+pytestmark = pytest.mark.requirement("F4", "F7")
 
 BRAKES = BrakeLimits()
 

@@ -20,7 +20,7 @@ from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.writer import ThreadWriter
 from railfix.io.train_message import MessageStatus, TrainMessage, encode
 
-pytestmark = pytest.mark.requirement("F2", "F4", "F6")
+pytestmark = pytest.mark.requirement("F2", "F4", "F6", "F7")
 
 #: West 0 to 600 m, Mid 2500 to 3100 m, East 5000 to 5600 m; points of 60 m.
 LINE = Layout(

@@ -47,7 +47,7 @@ TIMES = MonitorLimits()
 
 
 def table_verdict(inside: tuple[bool, ...], small: tuple[bool, ...], coincide: bool) -> tuple[TriangleVerdict, int]:
-    """The table of docs/ground-triangle.md, written a second time by counting; sides are 01, 12, 20."""
+    """The table of docs/ground.md, written a second time by counting; sides are 01, 12, 20."""
     outside, large = inside.count(False), small.count(False)
     between = {frozenset({0, 2}): 0, frozenset({0, 1}): 1, frozenset({1, 2}): 2}
     shared = between.get(frozenset(k for k in range(3) if not small[k]), -1) if large == 2 else -1

@@ -276,7 +276,7 @@ MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
     "track_as_vehicle": ({}, _RUN + " --vehicle {desk}/line.csv", 3, "; a vehicle file was expected"),
     "log_as_navigation": (
         {}, "run --front {desk}/front.obs --nav {desk}/rear.obs --track {desk}/line.csv --out {out}", 3,
-        "is a RINEX observation file; give it with --front or --rear",
+        "is a RINEX observation file (--front, --rear)",
     ),
     "reference_is_the_run_itself": (
         {}, "evaluate {desk}/results --reference {desk}/results/positions.csv", 5,

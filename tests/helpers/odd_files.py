@@ -229,6 +229,37 @@ def _other_sentences(lines: list[str], rng: Random) -> list[str]:
     return [*lines[:k], "!AIVDM,1,1,,A,14eG;o@034o8sd<L9i:a;WF>062D,0*7D\n", "boot 3.1\n", *lines[k:]]
 
 
+def _point_left_out(lines: list[str], rng: Random) -> list[str]:
+    """Leave out one of the lines that hold a point."""
+    rows = [k for k, line in enumerate(lines) if re.search(r"\d\.\d{5}", line)]
+    k = rng.choice(rows[1:-1])
+    return [*lines[:k], *lines[k + 1 :]]
+
+
+def _point_doubled(lines: list[str], rng: Random) -> list[str]:
+    rows = [k for k, line in enumerate(lines) if re.search(r"\d\.\d{5}", line)]
+    k = rng.choice(rows[1:-1])
+    return [*lines[:k], lines[k], *lines[k:]]
+
+
+def _height_left_out(lines: list[str], rng: Random) -> list[str]:
+    """Leave out the last number of one line that holds a point, or its element ``ele``."""
+    rows = [k for k, line in enumerate(lines) if re.search(r"\d\.\d{5}", line)]
+    k = rng.choice(rows)
+    return [*lines[:k], re.sub(r"<ele>[^<]*</ele>|,\s*-?[\d.]+(?=[\]\s])", "", lines[k], count=1), *lines[k + 1 :]]
+
+
+def _fields_of_pos(mark: str) -> Form:
+    """Return a form in which the columns of RTKLIB's solution have another separator."""
+    return lambda lines, _: [line if line[0] == "%" else mark.join(line.split()) + "\n" for line in lines]
+
+
+_XML_FORMS: Final[dict[str, Form]] = {
+    "XML comment": lambda lines, _: [lines[0], "<!-- a remark -->\n", *lines[1:]],
+    "no XML declaration": lambda lines, _: lines[1:],
+    "Latin-1": lambda lines, _: ['<?xml version="1.0" encoding="ISO-8859-1"?>\n<!-- \xfc -->\n', *lines[1:]],
+    "point left out": _point_left_out, "point doubled": _point_doubled, "no height": _height_left_out,
+}  # fmt: skip
 #: Forms of text by kind of file.
 FORMS: Final[dict[str, dict[str, Form]]] = {
     "observations": {
@@ -253,6 +284,36 @@ FORMS: Final[dict[str, dict[str, Form]]] = {
         "no checksum": _sentence_without_checksum, "no height": _fix_without_height, "others": _other_sentences,
         "prefix": _letters_replaced({"$G": "NMEA,$G"}), "line left out": _line_left_out, "line doubled": _line_doubled,
     },
+    "rtklib": {
+        "commas": _fields_of_pos(","), "comments": _comment_lines, "line left out": _line_left_out,
+        "line doubled": _line_doubled, "rows shuffled": _rows_shuffled,
+    },
+    "gpx": {
+        **_XML_FORMS, "1.0": _letters_replaced({"GPX/1/1": "GPX/1/0", 'version="1.1"': 'version="1.0"'}),
+        "prefix": _letters_replaced({"<trk": "<g:trk", "</trk": "</g:trk", "<gpx ": "<g:gpx ", "</gpx": "</g:gpx",
+                                     "<time": "<g:time", "</time": "</g:time", "<ele": "<g:ele", "</ele": "</g:ele",
+                                     "xmlns=": "xmlns:g="}),
+        "no times": lambda lines, _: [re.sub("<time>.*?</time>", "", line) for line in lines],
+    },
+    "kml": {
+        **_XML_FORMS, "clamped to the ground": _letters_replaced({">absolute<": ">clampToGround<"}),
+        "above the ground": _letters_replaced({">absolute<": ">relativeToGround<"}),
+        "no mode": _letters_replaced({"<altitudeMode>absolute</altitudeMode>": ""}),
+        "blanks after commas": lambda lines, _: [re.sub(r"(?<=\d),(?=\d)", ", ", line) for line in lines],
+        "no name": _letters_replaced({"<name>line</name>": ""}),
+        "a station": _letters_replaced({"<Document>": "<Document><Placemark><Point><coordinates>8,47</coordinates>"
+                                                      "</Point></Placemark>"}),
+    },
+    "geojson": {
+        "point left out": _point_left_out, "point doubled": _point_doubled, "no height": _height_left_out,
+        "in one line": lambda lines, _: ["".join(lines).replace("\n", "")],
+        "no datum": _letters_replaced({'"height_datum": "ellipsoidal"': '"remark": 1'}),
+        "a feature without geometry": _letters_replaced(
+            {'"features": [': '"features": [{"type": "Feature", "properties": null, "geometry": null},'}
+        ),
+        "old CRS member": _letters_replaced({'"features": [': '"crs": {"type": "name", "properties": '
+                                             '{"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}, "features": ['}),
+    },
     "track": {
         "semicolons": _letters_replaced({",": ";"}), "tabs": _letters_replaced({",": "\t"}),
         "semicolons and decimal commas": _letters_replaced({",": ";", ".": ","}),
@@ -269,7 +330,11 @@ _NAMES: Final = {
     "navigation": ("brdc.nav", "brdc.24n", "eph.txt", "download"),
     "positions": ("run.csv", "run.txt", "run.dat"),
     "nmea": ("run.nmea", "run.txt", "run.log"),
-    "track": ("line.csv",),
+    "rtklib": ("run.pos", "run.txt", "run"),
+    "gpx": ("run.gpx", "run.xml", "run"),
+    "kml": ("line.kml", "line.xml", "line"),
+    "geojson": ("line.geojson", "line.json", "line.txt"),
+    "track": ("line.csv", "line.txt", "line"),
 }
 
 

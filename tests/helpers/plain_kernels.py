@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from railfix import kernels
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
 from railfix.tracking.bank import OTHERS, SourceKind, classify_source
@@ -22,7 +23,7 @@ from railfix.tracking.state import CLOCKS, HYPOTHESIS, MONITORS, SATELLITES
 
 def _compiled_modules() -> list[str]:
     """Modules with compiled functions: compiled or not, they are imported together."""
-    kept = (".layout", ".constants", ".compiling")
+    kept = (".index", ".layout", ".constants", ".compiling")
     return [name for name in sys.modules if name.startswith("railfix.kernels.") and not name.endswith(kept)]
 
 
@@ -70,7 +71,7 @@ def kernel_state(
     listed = [*names, *OTHERS] if names else []
     count, satellites = len(log_probability), sum(classify_source(name) == SourceKind.SATELLITE for name in names)
     x, P = np.zeros((count + len(listed), SATELLITES)), np.zeros((count + len(listed), SATELLITES, SATELLITES))
-    x[: len(place_m), layout.ARC], P[: len(place_m), layout.ARC, layout.ARC] = place_m, np.square(sigma_m)
+    x[: len(place_m), ix.ARC], P[: len(place_m), ix.ARC, ix.ARC] = place_m, np.square(sigma_m)
     hypothesis, values = np.zeros(count, dtype=HYPOTHESIS), np.zeros(1, dtype=MONITORS)
     hypothesis["log_probability"], values["hypotheses"] = log_probability, count
     for name, value in monitors.items():

@@ -9,6 +9,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from helpers import synthetic
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import timedelta
 from railfix.integrity.interference import (
@@ -24,7 +25,9 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion_signs import MotionInputs, MotionSigns
+from railfix.integrity.interference.motion_signs import MotionSigns
+from railfix.integrity.interference.range_fits import MotionInputs
+from railfix.positioning.search_index import SearchIndex
 
 LIMITS = InterferenceLimits()
 START = np.datetime64("2024-03-05T03:10:00", "ns")
@@ -126,10 +129,14 @@ def scene(*, epochs: int = 40, jump: float = 0.0, clock: float = 0.0, parted: fl
         corrected_code_m=corrected,
         sigma_m=np.full(distance.shape, 0.5),
         used=np.ones(distance.shape, dtype=bool),
+        named=np.zeros(distance.shape, dtype=bool),
         noise_scale=np.ones(epochs),
         clock_offset_m=np.broadcast_to(np.array([0.0, 8.0]), (epochs, 2)),
         clock_sigma_m=np.broadcast_to(np.array([0.0, 1.0]), (epochs, 2)),
         off_line_m=np.full(epochs, 1.0),
+        doubted=np.zeros(epochs, dtype=bool),
+        antenna=np.zeros(epochs, dtype=np.intp),
+        lines=(SearchIndex(synthetic.line()),),
     )
 
 
@@ -231,7 +238,8 @@ def test_the_clock_is_compared_channel_by_channel_when_their_order_changes() -> 
     inputs = inputs._replace(code_m=code)
     order = np.array([9, 1, 7, 2, 4, 0, 11, 5, 3, 6])
     turned = MotionInputs(*(
-        v[order] if n in ("channel", "group") else v[25:, order] if v.shape[1:2] == (12,) else v[25:]
+        v if n == "lines" else v[order] if n in ("channel", "group") else v[25:, order] if np.shape(v)[1:2] == (12,)
+        else v[25:]
         for n, v in inputs._asdict().items()
     ))  # fmt: skip
     _, state = motion_signs(inputs._replace(**{
@@ -269,6 +277,56 @@ def test_parted_constellations_are_those_of_two_fits_by_numpy() -> None:
         solved.append((x - np.array([0.0, 0.0, 0.0, inputs.clock_offset_m[k, g]]), covariance))
     difference, both = solved[0][0] - solved[1][0], solved[0][1] + solved[1][1]
     assert found.part_sigmas[k] == pytest.approx(np.sqrt(difference @ np.linalg.solve(both, difference)), rel=1e-6)
+
+
+def few_satellites(*, late_s: float = 0.0, wrong_m: dict[int, float] | None = None) -> MotionInputs:
+    """Seven satellites of one constellation, each with a velocity of its own, seen by an antenna at rest for 15 s."""
+    rng, epochs = np.random.default_rng(4), 15
+    line, time = synthetic.line(), times(epochs)
+    antenna = line.at_arc(500.0)
+    first = synthetic.satellites(rng, 1, "G" * 7)[0]
+    velocity = np.cross(first, rng.standard_normal((7, 3)))
+    velocity *= 3900.0 / np.linalg.norm(velocity, axis=1, keepdims=True)
+    now = np.arange(epochs, dtype=float)[:, None, None]
+    tagged, true = first + velocity * now, first + velocity * (now - late_s)
+    code = synthetic.travelled_range(true, antenna) + 500.0 + 2.0 * rng.standard_normal((epochs, 7))
+    for channel, size in (wrong_m or {}).items():
+        code[:, channel] += size
+    nothing, every = np.full((epochs, 7), np.nan), np.ones((epochs, 7), dtype=bool)
+    return MotionInputs(
+        time=time, break_before=np.zeros(epochs, dtype=bool), channel=np.array([f"G{k:02d}1C" for k in range(7)]),
+        group=np.zeros(7, dtype=np.intp), near_ecef_m=np.broadcast_to(antenna + 50.0, (epochs, 3)),
+        sat_ecef_m=tagged, sat_velocity_mps=np.broadcast_to(velocity, tagged.shape), code_m=code, rate_mps=nothing,
+        corrected_code_m=code, sigma_m=np.full((epochs, 7), 4.0), used=every, named=~every,
+        noise_scale=np.ones(epochs), clock_offset_m=np.zeros((epochs, 1)), clock_sigma_m=np.zeros((epochs, 1)),
+        off_line_m=np.zeros(epochs), doubted=np.ones(epochs, dtype=bool), antenna=np.zeros(epochs, dtype=np.intp),
+        lines=(SearchIndex(line),),
+    )  # fmt: skip
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("named", [(), (0, 3, 5)])
+def test_an_error_of_the_time_tags_is_found_with_seven_satellites_though_some_are_named_as_wrong(
+    named: tuple[int, ...],
+) -> None:
+    inputs = few_satellites(late_s=1.0)
+    wrong = np.isin(np.arange(7), named) & inputs.used
+    found, _ = motion_signs(inputs._replace(used=~wrong, named=wrong), MotionSignState(), LIMITS)
+    assert np.abs(found.tag_error_s[3:] - 1.0).max() < 0.05
+    assert (found.tag_error_sigmas[3:] > LIMITS.tag_sigmas).all()
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("size_m", [200.0, -1e3, 3e5])
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("known", [False, True])
+def test_bad_codes_of_seven_satellites_are_no_error_of_the_time_tags(size_m: float, count: int, known: bool) -> None:
+    for bad in itertools.combinations(range(7), count):
+        inputs = few_satellites(wrong_m=dict.fromkeys(bad, size_m))
+        named = np.isin(np.arange(7), bad) & inputs.used & known
+        found, _ = motion_signs(inputs._replace(used=~named, named=named), MotionSignState(), LIMITS)
+        shown = (np.abs(found.tag_error_s) > LIMITS.tag_error_s) & (found.tag_error_sigmas > LIMITS.tag_sigmas)
+        assert not shown.any(), bad
 
 
 @pytest.mark.requirement("B8")

@@ -91,9 +91,9 @@ def test_south_and_west_of_zero_degrees(tmp_path: Path) -> None:
     [
         (lambda t: t.replace("%  GPST", "%  ----"), "no RTKLIB header line"),
         (lambda t: "\n".join(t.splitlines()[:3]) + "\n", "no position below"),
-        (lambda t: t.replace("35.342057994", "35.34205x994"), "line 5: '35.34205x994' is not a number"),
-        (lambda t: t.replace("282601.200", "28260l.200"), "line 5: '2176 28260l.200' is not a time"),
-        (lambda t: t.replace("35.342057994", "95.342057994"), "line 5: latitude 95.3421 is over 90"),
+        (lambda t: t.replace("35.342057994", "35.34205x994"), "line 5: column latitude_deg: '35.34205x994' is"),
+        (lambda t: t.replace("282601.200", "28260l.200"), "line 5: column tow_s: '28260l.200' is not a number"),
+        (lambda t: t.replace("35.342057994", "95.342057994"), "line 5: latitude_deg 95.3421 is over 90"),
         (lambda t: t + "2176 282602.000  35.3\n", "line 6: 3 fields"),
         (lambda t: t.replace("WGS84/ellipsoidal", "WGS84/geodetic"), "above the geoid"),
         (

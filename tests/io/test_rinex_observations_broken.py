@@ -227,13 +227,13 @@ def _navigation() -> bytes:
 
 
 WRONG_FILE: dict[str, tuple[bytes, str]] = {
-    "navigation file": (_navigation(), "is a RINEX navigation file; give it with --nav"),
-    "SP3 file": (_sp3(), "is an SP3 orbit file"),
-    "NMEA log": (b"$GNGGA,023313.00,2218.0,N,11410.0,E,1,12,0.6,5.0,M,,M,,*7F\n" * 9, "looks like an NMEA log"),
+    "navigation file": (_navigation(), "is a RINEX navigation file (--nav); a RINEX observation file was expected"),
+    "SP3 file": (_sp3(), "is a file of precise orbits"),
+    "NMEA log": (b"$GNGGA,023313.00,2218.0,N,11410.0,E,1,12,0.6,5.0,M,,M,,*7F\n" * 9, "is an NMEA log"),
     "log of a phone": (b"# \n# Header Description:\n# \n# Version: 1.4.0.0, Platform: N\n", "Android's GnssLogger"),
-    "position log": (b"% program   : RTKPOST ver.2.4.3\n" * 9, "looks like a position log"),
-    "other text": (b"latitude,longitude\n35.0,139.0\n", "is not a RINEX file"),
-    "clock file": (text_of([record("     3.00           C", "RINEX VERSION / TYPE")]), "is a RINEX clock file"),
+    "position log": (b"% program   : RTKPOST ver.2.4.3\n" * 9, "is a solution of RTKLIB"),
+    "other text": (b"latitude,longitude\n35.0,139.0\n", "is a table; a RINEX observation file was expected"),
+    "clock file": (text_of([record("     3.00           C", "RINEX VERSION / TYPE")]), "is a RINEX file of clocks"),
     "empty": (b"", "is empty"),
     "blank": (b" \n\n", "is empty"),
     "empty gzip": (gzip.compress(b""), "is empty"),

@@ -11,11 +11,13 @@ import pytest
 import pipeline_cases
 import signal_attacks
 from live_outputs import output_of
-from railfix.core.reasons import Status
-from railfix.gnss.observations import Observations
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.reasons import Reason, Status
+from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
 from railfix.pipeline.results import Result
+from railfix.run.tally import AntennaTally
 from railfix.tracking import TrackStatus
 from railfix.tracking.result import is_bounded
 from signal_attacks import Scene
@@ -180,6 +182,9 @@ def test_wrong_time_tags_are_named_with_their_size_and_give_no_level(late_s: flo
     assert np.abs(median - late_s * since)[named].max() < 0.1
     assert not np.isin(found.status[named], (Status.OK, Status.AMBIGUOUS, Status.SPOOFING_SUSPECTED)).any()
     assert not (found.protection.status[named] == LevelStatus.AVAILABLE).any()
+    tally = AntennaTally()
+    tally.add(found)
+    assert tally.map_offset is None or tally.map_offset.statistic < 9.2, "the map is not blamed"
 
 
 @pytest.mark.requirement("B8")
@@ -218,3 +223,73 @@ def test_signs_and_units_of_observables_are_named_and_nothing_else_changes(
     assert (found.interference.suspicion == Suspicion.NONE).all()
     assert np.nanmax(np.abs(found.chainage_m - clean["front"].chainage_m)) < 5.0
     assert (found.status == Status.OK).mean() > (clean["front"].status == Status.OK).mean() - 0.05
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"G10": 60.0}, Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR),
+        ({"G10": 20.0}, Reason.LASTING_ERROR),
+        ({"G10": 1e3}, Reason.GROSS_ERROR),
+        ({"E05": -3e5}, Reason.GROSS_ERROR),
+        ({"E05": 500.0, "G01": -2e3}, Reason.GROSS_ERROR),
+        ({"E11": 400.0, "G15": 9e3, "G01": -3e5}, Reason.GROSS_ERROR),
+    ],
+)
+def test_satellites_named_as_wrong_are_in_no_monitor(wrong: dict[str, float], reason: Reason) -> None:
+    """Wrong codes are no interference, no error of the map or of the time tags, and no place off the map."""
+    log = scene().observations
+    added = sum(size * (log.satellite == name) for name, size in wrong.items())
+    processor = pipeline_cases.processor({"filter": "track"})
+    result, _ = processor.process({"front": replace(log, code_m=log.code_m + added)})
+    clean, _ = processor.process({"front": log})
+    found, tracked, best = result["front"], result.fusion["front"].tracked, clean.fusion["front"].tracked
+    named = (found.reason[:, np.isin(log.satellite, list(wrong))] & int(reason)) != 0
+    assert named.mean() > 0.3
+    assert not found.interference.causes.any()
+    assert not np.isin(found.status, (Status.OFF_MAP, Status.MAP_OFFSET, Status.SPOOFING_SUSPECTED)).any()
+    assert np.nanmax(found.map_offset.statistic) < 9.2, "from where on a run has a note"
+    assert np.nanmax(np.abs(found.interference.motion.clock_jump_m)) < 10.0
+    assert (tracked.status == TrackStatus.TRACKING).sum() >= (best.status == TrackStatus.TRACKING).sum() - 3
+
+
+@pytest.mark.requirement("C6")
+def test_dopplers_and_clocks_of_one_bad_satellite_are_no_jump() -> None:
+    """A satellite's Doppler is off by 30 m/s, or its clock drifts by 5 m/s with code, phase and Doppler."""
+    log = scene().observations
+    own = log.satellite == "G10"
+    wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(log.satellite, log.signal)
+    later = np.maximum(np.arange(len(log)) - AT, 0)[:, None]
+    beaten = replace(log, doppler_hz=log.doppler_hz - 30.0 / wavelength * (own & (later > 0)))
+    drifting = replace(
+        log, code_m=log.code_m + 5.0 * later * own, phase_cycles=log.phase_cycles + 5.0 * later * own / wavelength,
+        doppler_hz=log.doppler_hz - 5.0 / wavelength * (own & (later > 0)),
+    )  # fmt: skip
+    for wrong in (beaten, drifting):
+        found = result_of(wrong)["front"]
+        assert not found.interference.suspicion.any()
+        assert not np.isin(found.status, (Status.OFF_MAP, Status.MAP_OFFSET)).any()
+
+
+@pytest.mark.requirement("C6")
+def test_while_all_positions_of_a_minute_fail_a_check_the_filter_is_not_tracking() -> None:
+    settings = {"filter": "track", "raim": {"mode": "fixed", "fixed_limit_m2": 1e-9}}
+    result, _ = pipeline_cases.processor(settings).process({"front": scene().observations})
+    found, tracked = result["front"], result.fusion["front"].tracked
+    assert (found.status == Status.INCONSISTENT).all()
+    contradicted = found.interference.suspicion == Suspicion.CONTRADICTED
+    since = (found.time - found.time[0]) / np.timedelta64(1, "s")
+    assert np.array_equal(contradicted, since >= 60.0)
+    assert (tracked.status[contradicted] == TrackStatus.DOUBTFUL).all()
+    assert not np.isfinite(tracked.level_m[contradicted]).any()
+    assert (tracked.status[10:50] == TrackStatus.TRACKING).all()
+
+
+@pytest.mark.requirement("C6")
+def test_positions_that_are_only_imprecise_leave_the_filter_tracking() -> None:
+    settings = {"filter": "track", "largest_sigma_m": 0.01}
+    result, _ = pipeline_cases.processor(settings).process({"front": scene().observations})
+    assert (result["front"].status == Status.UNCERTAIN).all()
+    assert not result["front"].interference.suspicion.any()
+    assert (result.fusion["front"].tracked.status[10:] == TrackStatus.TRACKING).mean() > 0.95

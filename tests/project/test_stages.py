@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -31,8 +32,9 @@ from railfix.gnss.observations import Observations
 from railfix.positioning.receiver_noise import LastingErrorLimits
 from railfix.track import Track, from_positions
 from railfix.track.point_files import write_track_csv
-from test_site import cells
 
+#: The example that calls the stages one by one.
+EXAMPLE = ROOT / "docs" / "gallery" / "stages_by_hand.py"
 #: Stages of P1's figure 1, in their order, by room.
 STAGES = {
     "ranges": ("select_channels", "find_satellites", "corrected_ranges"),
@@ -75,8 +77,7 @@ def test_every_public_stage_has_a_caller_in_the_pipeline() -> None:
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Names of the notebook after its cells have run, with a recording where the recordings are present."""
-    found: dict[str, Any] = {}
+    """Names of the example after it has run, with a recording where the recordings are present."""
     data = ROOT.parent / "shared" / "data"
     with pytest.MonkeyPatch.context() as patch:
         if data.is_dir():
@@ -85,9 +86,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
                 (folder / own).symlink_to(recorded)
             write_track_csv(_path(data, "m8t"), folder / "path.csv")
             patch.setenv("RECORDING", str(folder))
-        for cell in cells((ROOT / "docs" / "notebooks" / "stages.md").read_text(encoding="utf-8")):
-            exec(compile(cell, "stages.md", "exec"), found)
-    return found
+        return runpy.run_path(str(EXAMPLE))
 
 
 def assert_same_positions(fix: Any, result: Any, *, least: float) -> None:
@@ -99,9 +98,9 @@ def assert_same_positions(fix: Any, result: Any, *, least: float) -> None:
 
 @pytest.mark.requirement("S1")
 @pytest.mark.requirement("G2")
-def test_the_stages_of_the_notebook_are_the_pipeline_to_a_millimetre(names: dict[str, Any]) -> None:
-    text = (ROOT / "docs" / "notebooks" / "stages.md").read_text(encoding="utf-8")
-    by_hand = [line for cell in cells(text)[:3] for line in cell.splitlines() if line.strip()]
+def test_the_stages_of_the_example_are_the_pipeline_to_a_millimetre(names: dict[str, Any]) -> None:
+    text = EXAMPLE.read_text(encoding="utf-8").split('"""', 2)[2].split("# Comparison with the pipeline")[0]
+    by_hand = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     assert len(by_hand) <= 30
     for case, (fix, result) in names["compared"].items():
         assert_same_positions(fix, result, least=0.3 if case == "recording" else 0.8)

@@ -245,7 +245,7 @@ def test_a_broken_line_is_named(tmp_path: Path, fault: str) -> None:
     [
         ("nothing of the kind\n", "begins no SBAS file"),
         ("# only a comment\n", "holds no SBAS message"),
-        (f"{2.10:9.2f}           {'N: GPS NAV DATA':40s}RINEX VERSION / TYPE\n", "type 'N', type B"),
+        (f"{2.10:9.2f}           {'N: GPS NAV DATA':40s}RINEX VERSION / TYPE\n", "is a RINEX navigation file"),
         (as_rinex(a_log()).replace("END OF HEADER", "COMMENT"), "no END OF HEADER"),
         (as_rinex(a_log()).rsplit("\n", 2)[0], "no 32 bytes"),
         (as_rinex(a_log()).replace("L1", "L5", 1), "band L5"),

@@ -11,7 +11,7 @@ import pytest
 
 from railfix.pipeline.config import Config
 from railfix.report.headline import _longest_outage
-from railfix.run.driver import _notes_of_levels
+from railfix.run.driver import _describe_sign, _notes_of_levels
 from railfix.run.sensor_checks import _sentences
 from railfix.run.tally import AntennaTally, MapOffsetFound, Tally
 
@@ -45,6 +45,23 @@ def test_time_tags_that_come_after_the_satellites_are_late(lag_s: float, word: s
     found: Any = SimpleNamespace(unit="m/s", ratio=1.0, lag_s=lag_s)
     (text,) = _sentences("radar", found, "scale {:.1f} %")
     assert f"0.6 s {word} against" in text
+
+
+@pytest.mark.parametrize(
+    ("low_s", "high_s", "text"),
+    [
+        (-18.02, -17.98, "18.00 s early, so that no position has a level (are they UTC, not GPS time?)"),
+        (-14.1, -13.9, "14.00 s early, so that no position has a level (are they BeiDou time, not GPS time?)"),
+        (18.99, 19.03, "19.01 s late, so that no position has a level (are they TAI, not GPS time?)"),
+        (17.98, 18.02, "18.00 s late, so that no position has a level (are they GPS time?)"),
+        (0.97, 1.01, "0.99 s late, so that no position has a level (are they GPS time?)"),
+        (-0.25, -0.15, "0.20 s early, so that no position has a level (are they GPS time?)"),
+        (-0.1, 1.5, "between -0.10 and +1.50 s off (+ late), so that no position has a level (do they drift?)"),
+        (-18.4, -17.6, "between -18.40 and -17.60 s off (+ late), so that no position has a level (do they drift?)"),
+    ],
+)
+def test_an_error_of_the_time_tags_has_its_size_its_sign_and_a_guess(low_s: float, high_s: float, text: str) -> None:
+    assert _describe_sign("time_tags", (low_s, high_s)) == f"the time tags are {text}"
 
 
 def test_the_end_of_an_outage_has_its_error_and_its_sigma() -> None:

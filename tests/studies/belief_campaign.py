@@ -567,6 +567,10 @@ def whole_faults(case: Case, along: np.ndarray, random: np.random.Generator) -> 
             for size in (200.0, 1000.0, 300000.0):
                 fault = Fault("", size * wrong.repeat(len(t), 0), nothing, nothing)
                 yield f"{count} codes +{size / 1e3:g} km", "satellite", with_fault(case, fault)
+    step = SPEED_OF_LIGHT * 1e-3 * (t >= 45.0)[:, None] * np.ones(obs.code_m.shape)
+    yield "clock +1 ms", "nothing", with_fault(case, Fault("", step, step, nothing))
+    yield "no C/N0", "nothing", replace(case, observations=replace(obs, cn0_dbhz=np.full(obs.cn0_dbhz.shape, np.nan)))
+    yield "one epoch in 5 s", "nothing", case.part(0, len(t), 5)
     if len(letters) > 1:
         lost = ((letter != letters[-1])[None, :]) & (t >= 45.0)[:, None]
         gone = {f: np.where(lost, np.nan, getattr(obs, f)) for f in ("code_m", "phase_cycles", "doppler_hz")}
@@ -579,6 +583,10 @@ def whole_faults(case: Case, along: np.ndarray, random: np.random.Generator) -> 
     step = 500.0 * (t >= 45.0)[:, None] * np.ones(obs.code_m.shape)
     yield "codes +500 m, all", "spoofing", with_fault(case, Fault("", step, nothing, nothing))
     yield "off the map", "off the map", ended(case)
+    up = np.asarray(case.trajectory.ecef_m) / np.linalg.norm(case.trajectory.ecef_m, axis=1, keepdims=True)
+    yield "map 100 m too high", "map", on_line(case, np.asarray(case.trajectory.ecef_m) + 100.0 * up)
+    fall = np.where(t >= 45.0, 8.0, 0.0)[:, None]
+    yield "C/N0 8 dB lower", "jamming", replace(case, observations=replace(obs, cn0_dbhz=obs.cn0_dbhz - fall))
 
 
 def on_tags(case: Case, late_s: np.ndarray) -> Case:
@@ -596,6 +604,8 @@ def named_cause(result: Result) -> str:
     for kind, cause in ((Suspicion.TIME_TAGS, "time tags"), (Suspicion.SPOOFING_SUSPECTED, "spoofing")):
         if kinds.count(kind) > 3:
             return cause
+    if kinds.count(Suspicion.JAMMING_SUSPECTED) > 3:
+        return "jamming"
     away = (found.status == Status.OFF_MAP) | np.isin(filtered, (TrackStatus.OFF_MAP, TrackStatus.LOST))
     if kinds.count(Suspicion.LEFT_MAP) > 3 or away.sum() > 10:
         return "off the map"
@@ -605,8 +615,22 @@ def named_cause(result: Result) -> str:
     return "map" if (filtered == TrackStatus.MAP_OFFSET).sum() > 10 else "nothing"
 
 
-def show_causes(case: Case, args: argparse.Namespace) -> None:
-    """Print the cause put in against the cause named, and what went over its level, by kind of fault."""
+#: Causes put in, or named, in the order in which they are decided.
+CAUSES: Final = ("nothing", "time tags", "observable", "satellite", "spoofing", "jamming", "off the map", "map")
+
+
+def show_matrix(counts: Counter[tuple[str, str]]) -> None:
+    """Print how often each cause that was put in was named as each."""
+    print(f"\n| put in | {' | '.join(CAUSES)} |\n|---|{'---:|' * len(CAUSES)}")
+    for cause in CAUSES:
+        if any(counts[cause, named] for named in CAUSES):
+            print(f"| {cause} | {' | '.join(str(counts[cause, named] or '') for named in CAUSES)} |")
+    right, total = sum(counts[cause, cause] for cause in CAUSES), counts.total()
+    print(f"\n{right} of {total} causes named right, {100 * right / max(total, 1):.1f} %")
+
+
+def show_causes(case: Case, args: argparse.Namespace) -> Counter[tuple[str, str]]:
+    """Print the causes named and what went over its level by kind of fault; return how often each was named as each."""
     random = np.random.default_rng(args.seed)
     config = parse_config({"filter": "track", "elevation": {"mask_deg": args.mask[0]}, **args.settings})
     along, _ = sights(case)
@@ -616,25 +640,33 @@ def show_causes(case: Case, args: argparse.Namespace) -> None:
     for begin in np.arange(t[known[0]], t[known[-1]] - 90.0, args.fault_every):
         first, end = (int(k) for k in np.searchsorted(t, [begin, begin + args.length]))
         for label, cause, faulty in whole_faults(case.part(first, end), along[first:end], random):
+            if args.only and args.only not in label:
+                continue
             processor = make_processor(config, faulty.navigation, {"front": faulty.trajectory})
             result, _ = processor.process({"front": faulty.observations})
             trial = judged(faulty, result.fusion["front"].tracked)
-            rows.setdefault((label, cause), []).append((named_cause(result), trial))
+            cause_named, bad = named_cause(result), over(label, trial) & trial.tracking
+            if args.verbose and (bad.any() or (cause and cause != cause_named)):
+                text = first_of(trial, bad) if bad.any() else "none over its level"
+                print(f"    start {begin:.0f} s, {label}: named {cause_named}, {text}", flush=True)
+            rows.setdefault((label, cause), []).append((cause_named, trial))
     print(
         f"| {case.name}: put in | has to be named | trials | named | tracking % | over, on the ground, sure and wrong |"
     )
     print("|---|---|---:|---|---:|---|")
-    right = total = 0
+    counts: Counter[tuple[str, str]] = Counter()
     for (label, cause), found in rows.items():
         named = Counter(name for name, _ in found)
         trial = joined([each for _, each in found])
-        right, total = right + named[cause], total + (len(found) if cause else 0)
+        counts.update({(cause, name): count for name, count in named.items() if cause})
         print(
             f"| {label} | {cause or '-'} | {len(found)} | {', '.join(f'{n} {c}' for n, c in named.most_common())} | "
             f"{100 * trial.tracking.mean():.0f} | {int((trial.over | trial.over_chainage).sum())}, "
             f"{int(trial.over_ground.sum())}, {int(trial.sure_and_wrong.sum())} |"
         )
-    print(f"{case.name}: {right} of {total} causes named right", flush=True)
+    right = sum(count for (cause, name), count in counts.items() if cause == name)
+    print(f"{case.name}: {right} of {counts.total()} causes named right", flush=True)
+    return counts
 
 
 def over(label: str, found: Judged) -> np.ndarray:
@@ -775,6 +807,7 @@ def main() -> int:
     parser.add_argument("--frequencies", choices=("one", "two"), default="one")
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--causes", action="store_true", help="faults of whole trials: cause put in against named")
+    parser.add_argument("--only", default="", help="with --causes: kinds with this in their name alone")
     parser.add_argument("--pairs", type=int, default=0, help="with --faults: so many pairs in their place")
     parser.add_argument("--fault-every", type=float, default=90.0)
     parser.add_argument("--seed", type=int, default=0)
@@ -788,6 +821,7 @@ def main() -> int:
     known = cases(paths.DATA) if paths.DATA.is_dir() else {}
     if not (args.faults or args.causes):
         print(HEAD)
+    named: Counter[tuple[str, str]] = Counter()
     for name in args.folders or list(known):
         if name in known:
             case = known[name]()
@@ -797,11 +831,13 @@ def main() -> int:
         if args.whole:
             show_whole(case, args)
         if args.causes:
-            show_causes(case, args)
+            named += show_causes(case, args)
         elif args.faults:
             show_faults(case, args)
         elif not args.no_starts:
             show_starts(case, args)
+    if args.causes:
+        show_matrix(named)
     return 0
 
 

@@ -3,13 +3,14 @@
 ``python tests/studies/benchmark_cases.py CASES`` makes a folder of each recording: log, navigation, ground truth, and
 the map made from it (5 m, standing still removed). ``python tests/studies/public_recording.py CASES/town`` adds the
 held-out case. ``python tests/studies/benchmark_cases.py CASES --page OUT`` runs the benchmark into OUT and writes
-``docs/benchmark-recordings.md``.
+``docs/benchmarks.md``.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -23,7 +24,9 @@ from case_files import write_case
 from railfix.track import from_positions
 from railfix.track.point_files import write_track_csv
 
-PAGE: Final = paths.ROOT / "docs" / "benchmark-recordings.md"
+PAGE: Final = paths.ROOT / "docs" / "benchmarks.md"
+#: Heading of the section of the page that is written.
+HEADING: Final = "## Recordings: railfix, RTKLIB and 3-D positions"
 _URBANNAV: Final = {
     "licence": "terms of the UrbanNav dataset",
     "fetch": "UrbanNav dataset, Hong Kong, light urban (TST) of 2021-05-17",
@@ -81,7 +84,7 @@ ABOUT: Final[dict[str, dict[str, Any]]] = {
         },
     },
 }
-_TEXT: Final = """# Benchmark on recordings
+_TEXT: Final = """{heading}
 
 `{command}` on {date}, commit `{commit}`: cars with a satellite receiver,
 the map made from the ground truth, every setting at its default. [How to](how-to.md#compare-with-other-programs).
@@ -144,13 +147,16 @@ def write_page(cases: Path, out: Path) -> None:
     record = json.loads((out / "benchmark.json").read_text())
     told = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=paths.ROOT)
     text = _TEXT.format(
+        heading=HEADING,
         command="python tests/studies/benchmark_cases.py CASES --page OUT",
         date=record["date"][:10],
         commit=told.stdout.strip(),
         table=page_table((out / "benchmark.md").read_text()),
         notes="".join(f"\n- {note}" for note in record["notes"]),
     )
-    PAGE.write_text(text.rstrip() + "\n", encoding="utf-8")
+    before, _, after = PAGE.read_text(encoding="utf-8").partition(HEADING)
+    rest = re.split(r"^(?=## )", after, maxsplit=1, flags=re.MULTILINE)[1:]
+    PAGE.write_text(before + "\n".join([text.rstrip() + "\n", *rest]), encoding="utf-8")
 
 
 def main() -> int:

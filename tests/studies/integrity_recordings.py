@@ -1,7 +1,7 @@
 """Protection levels on real recordings with references, each by error models of other recordings.
 
 ``python tests/studies/integrity_recordings.py FOLDER`` with the recordings beside the checkout writes references, maps,
-runs and models to the folder, and prints the tables of ``docs/integrity-recordings.md``; ``--epochs`` lists every epoch
+runs and models to the folder, and prints the tables of ``docs/level-results.md``; ``--epochs`` lists every epoch
 whose error passes its level.
 """
 

@@ -1,7 +1,7 @@
 """Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
 
 ``python tests/studies/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
-``docs/bounds.md``: faults, maps, sigmas, starts, priors, together, sides, late, ionosphere,
+``docs/level-results.md``: faults, maps, sigmas, starts, priors, together, sides, late, ionosphere,
 coefficients.
 """
 
@@ -52,7 +52,7 @@ SETTINGS: Final = parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}
 SIZES_M: Final = (20.0, 50.0, 100.0)
 #: Offsets of the map: right of the line and up [m].
 OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 0), (0, 10), (0, 20), (0, 37))
-#: Priors of local faults that cities ask for (docs/bounds.md).
+#: Priors of local faults that cities ask for (docs/level-results.md).
 LOCAL_PRIORS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4)
 #: Navigation files with Klobuchar coefficients of other days, beside `DATA`.
 COEFFICIENT_FILES: Final = (

@@ -1,6 +1,6 @@
 """P1's experiments on simulated lines: chapter 5 (tables 4 to 6, figures 10 to 12), 3.2 and 3.3 (figures 7 and 8).
 
-Run ``python tests/studies/p1_experiment.py PART`` for the tables of docs/p1-results.md, one part at a time:
+Run ``python tests/studies/p1_experiment.py PART`` for the tables of docs/paper-experiments.md, one part at a time:
 
 ========== =====================================================================
 short      the first two minutes of that, in seconds

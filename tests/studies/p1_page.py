@@ -1,4 +1,6 @@
-"""Table and picture of docs/p1-results.md from the kept outputs: ``python tests/studies/p1_page.py`` writes both.
+"""Table and picture of docs/paper-experiments.md from the kept outputs.
+
+``python tests/studies/p1_page.py`` writes both.
 
 The table is that of P1's chapter 5 (ways without tunnels). The picture docs/pictures/p1-lines.png shows, of twenty
 lines each, the share of errors over 10 m with its 95 % interval, and the largest error.
@@ -16,7 +18,7 @@ from matplotlib.figure import Figure
 
 import paths
 
-PAGE: Final = paths.ROOT / "docs" / "p1-results.md"
+PAGE: Final = paths.ROOT / "docs" / "paper-experiments.md"
 PICTURE: Final = paths.ROOT / "docs" / "pictures" / "p1-lines.png"
 RESULTS: Final = paths.ROOT / "tests" / "references" / "results"
 #: Columns of a row of figures (`p1_experiment.HEAD`): rate, points lost, p95, largest, errors over 10 m.
@@ -79,8 +81,9 @@ def table() -> Iterator[str]:
 def page(text: str) -> str:
     """Page with the table as it is now."""
     lines = text.splitlines()
-    at = [k for k, line in enumerate(lines) if line.startswith("|")]
-    return "\n".join([*lines[: at[0]], *table(), *lines[at[-1] + 1 :]]) + "\n"
+    first = next(k for k, line in enumerate(lines) if line.startswith("|"))
+    after = next(k for k in range(first, len(lines)) if not lines[k].startswith("|"))
+    return "\n".join([*lines[:first], *table(), *lines[after:]]) + "\n"
 
 
 def lines_of(part: str) -> list[Lines]:

@@ -1,6 +1,6 @@
 """P1 chapter 5 on lines that nothing was chosen on, with intervals, and without each screen in turn.
 
-Run ``python tests/studies/p1_seeds.py PART`` for the tables of docs/p1-results.md:
+Run ``python tests/studies/p1_seeds.py PART`` for the tables of docs/paper-experiments.md:
 
 ======== ===========================================================================
 seeds    the first ten minutes of twenty lines and places of seeds of their own: station, tall buildings, town

@@ -1,5 +1,5 @@
-"""Reference pages from the docstrings: ``python tests/studies/reference_document.py`` writes reference.md, columns.md,
-evaluation-columns.md, settings.md and settings-filter.md in ``docs``."""
+"""Reference pages from the docstrings: ``python tests/studies/reference_document.py`` writes reference.md, columns.md
+and settings.md in ``docs``."""
 
 from __future__ import annotations
 
@@ -91,10 +91,17 @@ def _named(names: Iterable[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)
 
 
-def _columns(heading: str, columns: Mapping[str, Column[Any] | str], *, without: Iterable[str] = ()) -> list[str]:
+def _columns(
+    heading: str, columns: Mapping[str, Column[Any] | str], *, without: Iterable[str] = (), level: str = "##"
+) -> list[str]:
     texts = {name: column if isinstance(column, str) else column.meaning for name, column in columns.items()}
     rows = groupby((name for name in texts if name not in without), key=lambda name: texts[name])
-    return ["", f"## {heading}", "", *(f"- {_named(names)}: {meaning.replace('``', '`')}" for meaning, names in rows)]
+    return [
+        "",
+        f"{level} {heading}",
+        "",
+        *(f"- {_named(names)}: {meaning.replace('``', '`')}" for meaning, names in rows),
+    ]
 
 
 def _members(heading: str, kind: type[IntEnum] | type[IntFlag]) -> list[str]:
@@ -160,19 +167,17 @@ def _setting_cells(prefix: str, group: Settings) -> Iterator[tuple[str, str, str
         yield prefix, name, " ".join(filter(None, (default, "" if known else unit, _bounds(field)))), sentence
 
 
-def settings_page(title: str, text: str, settings: Iterable[tuple[str, str, str, str]]) -> str:
-    """Page of settings, by their groups, those without one first; neighbours of one meaning are one entry."""
-    lines = [f"# {title}", "", WRITTEN, "", text]
+def _settings(settings: Iterable[tuple[str, str, str, str]], level: str) -> Iterator[str]:
+    """Yield the lines of settings by group, ungrouped ones first; neighbours with one meaning are one entry."""
     groups: dict[str, list[tuple[str, str, str, str]]] = {"": []}
     for cell in settings:
         groups.setdefault(cell[0], []).append(cell)
     for prefix, group in groups.items():
-        lines += ["", f"## `[{prefix}]`" if prefix else "## Outside of tables", ""]
+        yield from ("", f"{level} `[{prefix}]`" if prefix else f"{level} Outside of tables", "")
         for meaning, cells in groupby(group, key=lambda cell: cell[3]):
             _, names, values, _ = zip(*cells, strict=True)
             each = values if len(set(values)) > 1 else values[:1]
-            lines.append(f"- {_named(names)}: {', '.join(each)}. {meaning}")
-    return "\n".join(lines) + "\n"
+            yield f"- {_named(names)}: {', '.join(each)}. {meaning}"
 
 
 def reference() -> str:
@@ -191,9 +196,10 @@ def reference() -> str:
     return "\n".join(lines) + "\n"
 
 
-def run_columns() -> str:
-    """Page of the columns of a run's tables."""
+def table_columns() -> str:
+    """Return the page of the columns of a run's tables and of its evaluation."""
     lines = ["# Columns", "", WRITTEN, f"Names end with their unit: {', '.join(ENDINGS)}."]
+    lines += ["", "The columns that `railfix evaluate` writes are [at the end](#columns-of-the-evaluation)."]
     common = {
         name: column for name, column in POSITION_COLUMNS.items() if _meaning(TRAIN_COLUMNS, name) == column.meaning
     }
@@ -205,23 +211,23 @@ def run_columns() -> str:
     lines += _columns("`positions.*` and `train.*` on a network", ON_TRACK_COLUMNS)
     lines += _columns("`tracks.csv`, `tracks.parquet`", TRACK_COLUMNS)
     lines += _columns("`observations.parquet`", OBSERVATION_COLUMNS, without=("time_gpst", "antenna"))
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", *evaluation_columns()]) + "\n"
 
 
 def _meaning(columns: Mapping[str, Column[Any]], name: str) -> str | None:
     return columns[name].meaning if name in columns else None
 
 
-def evaluation_columns() -> str:
-    """Page of the columns of `railfix evaluate`."""
-    lines = ["# Columns of the evaluation", "", WRITTEN, "What they mean together: [evaluation](evaluation.md)."]
+def evaluation_columns() -> list[str]:
+    """Return the section of the columns of `railfix evaluate`."""
+    lines = ["## Columns of the evaluation", "", "[Evaluation](evaluation.md) defines the figures."]
     count = Counter(item for columns in EVALUATION.values() for item in columns.items())
     common = {name: meaning for (name, meaning), number in count.items() if number > 1}
-    lines += _columns("Columns of several files", common)
+    lines += _columns("Columns of several files", common, level="###")
     for heading, columns in EVALUATION.items():
         rest = {name: meaning for name, meaning in columns.items() if common.get(name) != meaning}
-        lines += _columns(heading, rest)
-    return "\n".join(lines) + "\n"
+        lines += _columns(heading, rest, level="###")
+    return lines
 
 
 def pages() -> dict[Path, str]:
@@ -229,18 +235,18 @@ def pages() -> dict[Path, str]:
     general = (
         "Keys of the configuration file (TOML), by its tables, each with its default, or one for all keys of an entry. "
         "`--set` takes `table.key=value`. Names end with their [unit](columns.md). Numbers are above 0 unless other "
-        "bounds follow; `[0, 1)` includes 0. P1 to P5 are [papers](papers.md). The filter has "
-        "[settings of its own](settings-filter.md)."
+        "bounds follow; `[0, 1)` includes 0. P1 to P5 are [papers](papers.md). The settings of the filter are "
+        "[at the end](#settings-of-the-filter-and-its-sensors)."
     )
     every = list(_setting_cells("", Config()))
     of_filter = [cell for cell in every if f"{cell[0]}.{cell[1]}".lstrip(".").startswith(FILTER)]
-    title = "Settings of the filter and its sensors"
+    others = [cell for cell in every if cell not in of_filter]
+    title = "## Settings of the filter and its sensors"
+    lines = ["# Settings", "", WRITTEN, "", general, *_settings(others, "##"), "", title, *_settings(of_filter, "###")]
     return {
         DOCS / "reference.md": reference(),
-        DOCS / "columns.md": run_columns(),
-        DOCS / "evaluation-columns.md": evaluation_columns(),
-        DOCS / "settings.md": settings_page("Settings", general, [cell for cell in every if cell not in of_filter]),
-        DOCS / "settings-filter.md": settings_page(title, "Read as the other [settings](settings.md).", of_filter),
+        DOCS / "columns.md": table_columns(),
+        DOCS / "settings.md": "\n".join(lines) + "\n",
     }
 
 

@@ -1,7 +1,7 @@
 """Files that users reported, through every command that reads them: a table of what each command makes of it.
 
-Usage: ``python tests/studies/reported_cases.py [WORD]``; the files are those of ``shared/data/cases`` beside the
-checkout. `WORD` restricts the table to rows that contain it.
+Usage: ``python tests/studies/reported_cases.py [WORD] [--table]``; the files are those of ``shared/data/cases`` beside
+the checkout. `WORD` restricts the rows to those that contain it; ``--table`` prints the table of ``docs/formats.md``.
 """
 
 from __future__ import annotations
@@ -26,13 +26,20 @@ LOG_COMMANDS = {
     "locate": "locate --log {log} --nav {nav} --out {out}/place.pos --overwrite",
     "convert": "convert {log} --out {out}/log.obs --overwrite",
     "run": "run --front {log} --nav {nav} --track {line} --set filter=off --out {out}/run --overwrite",
+    "which-track": "which-track --front {log} --nav {nav} --map {line}",
     "doctor": "doctor {log} {nav} {line}",
 }
+#: The recording on the line of the newcomers' maps.
+_RUN = "kinematic/japan_mosaic_2021265_with_GEONET3034"
 #: Commands that read a track map, with the options that state its heights.
 MAP_COMMANDS = {
     "check": "map check {map} {heights}",
-    "network": "map network {map}",
+    "network": "map network {map} {heights}",
     "doctor": "doctor {map}",
+    "route": "map route {map} {heights} --out {out}/route.csv --overwrite",
+    "match": f"map match {{map}} {{heights}} --log {_RUN}/rtklib_rtk_ref_l1_GE.pos --out {{out}}/m.csv --overwrite",
+    "run": f"run --front {_RUN}/SEPT265G.21O --nav {_RUN}/SEPT2650.21P --track {{map}} {{heights}} --out {{out}}/run "
+    "--overwrite",
 }
 
 
@@ -64,6 +71,7 @@ def _log_rows() -> Iterator[Row]:
                 "locate": f"{n} epochs, {n} positions.*{note}",
                 "convert": rf"{n} epochs, RINEX 3.*{note}",
                 "run": f"a position in {n} of {n} epochs.*{note}",
+                "which-track": f"track: undecided.*{note}",
                 "doctor": f"the files fit together.*{n} epochs.*{note}",
             }
             yield Row(name, command, words.replace("{log}", "reports/" + name), 0, texts[command])
@@ -76,12 +84,15 @@ def _navigation_rows() -> Iterator[Row]:
         "galileo-type-E.nav": "",
     }
     for name, text in rejected.items():
-        for command in ("locate", "run", "doctor"):
+        for command in ("locate", "run", "which-track", "doctor"):
             words = LOG_COMMANDS[command].replace("{log}", "reports/base.rnx").replace("{nav}", "reports/" + name)
-            found = {"locate": "8 positions", "run": "a position in 8 of 8", "doctor": "the files fit together"}
+            found = {
+                "locate": "8 positions", "run": "a position in 8 of 8", "which-track": "track: undecided",
+                "doctor": "the files fit together",
+            }  # fmt: skip
             yield Row(name, command, words, 0, f"{found[command]}.*{text}")
     yield Row("galileo-type-E.nav", "doctor", "doctor reports/galileo-type-E.nav", 5, "9 ephemerides: E 9")
-    for command, code in (("locate", 3), ("run", 3), ("doctor", 5)):
+    for command, code in (("locate", 3), ("run", 3), ("which-track", 3), ("doctor", 5)):
         words = LOG_COMMANDS[command].replace("{log}", "reports/base.rnx")
         words = words.replace("{nav}", "reports/glonass-xyz-equal.nav")
         yield Row("glonass-xyz-equal.nav", command, words, code, "3 records of GLONASS rejected .R03, R04, R10")
@@ -104,38 +115,67 @@ def _position_rows() -> Iterator[Row]:
         backward = name.startswith("date")
         text = "line 6: the time is before that of the position above; sort them" if backward else note
         yield Row(name, "from-positions", made, 3 if backward else 0, text)
+        along = f"map route {line} --positions reports/{name} --out {{out}}/r.csv --overwrite"
+        yield Row(name, "route", along, 0, f"route: T1.*{note}")
 
 
 def _map_rows() -> Iterator[Row]:
     heights = "--height-datum ellipsoidal"
-    lengths = {
-        "reports/null-geometry.geojson": (heights, "10 points.*1 feature 1 without geometry"),
-        "reports/zero-length-line.xml": (heights, r"890\.1 m"),  # 889.776 m on the grid
-        "reports/easting-first.xml": (heights, r"890\.1 m.*easting before northing"),
-        "reports/wgs84-egm96.fgb": ("", "12 points.*EGM96"),
-        "newcomer/line.kml": (heights, "253 points"),
-        "newcomer/names.csv": (heights, "253 points"),
-        "newcomer/simple.csv": (heights, "253 points"),
-        "newcomer/bom.csv": ("", "253 points"),
-        "newcomer/feet2.csv": ("", "253 points"),
-        "newcomer/shuf.csv": ("", "253 points.*direction turns by 17"),
+    read = {
+        "null-geometry.geojson": (heights, "10 points", "1 feature 1 without geometry"),
+        "zero-length-line.xml": (heights, "points, 890", ""),  # 889.776 m on the grid
+        "easting-first.xml": (heights, "points, 890", "easting before northing"),
+        "wgs84-egm96.fgb": ("", "12 points", "EGM96"),
     }
-    for name, (given, text) in lengths.items():
-        short = name.partition("/")[2]
-        check = MAP_COMMANDS["check"].replace("{map}", name).replace("{heights}", given)
-        yield Row(short, "check", check, 6 if name.startswith("newcomer") else 0, text)
-        findings = "|".join(["map check.*errors" if name.startswith("newcomer") else "track"])
-        yield Row(short, "doctor", f"doctor {name}", 5, rf"{text.partition('.*')[0].removesuffix('.1 m')}.*|{findings}")
+    for name, (given, text, note) in read.items():
+        words = {"{map}": "reports/" + name, "{heights}": given}
+        yield _map_row(name, "check", words, 0, f"{text}.*{note}")
+        yield _map_row(name, "network", words, 0, "1 tracks")
+        yield _map_row(name, "doctor", words, 5, f"{text}.*{note}")
     refused = {
-        "zero-heights.geojson": (heights, 3, "the coordinates have no height"),
-        "rd-nap.fgb": ("", 4, "nl_nsgi_nlgeo2018.tif, not installed .projsync"),
+        "zero-heights.geojson": (heights, 3, "the coordinates have no height", "without heights"),
+        "rd-nap.fgb": ("", 4, "nl_nsgi_nlgeo2018.tif, not installed .projsync", "nl_nsgi_nlgeo2018.tif"),
     }
-    for name, (given, code, text) in refused.items():
-        yield Row(name, "check", f"map check reports/{name} {given}", code, text)
-        yield Row(name, "doctor", f"doctor reports/{name}", 5, text)
+    for name, (given, code, text, found) in refused.items():
+        words = {"{map}": "reports/" + name, "{heights}": given}
+        yield _map_row(name, "check", words, code, text)
+        yield _map_row(name, "doctor", words, 5, found)
     yield Row("way-of-one-node.osm", "network", "map network reports/way-of-one-node.osm", 0, "2 tracks.*way/3")
+    yield Row("way-of-one-node.osm", "doctor", "doctor reports/way-of-one-node.osm", 5, "8 points, 708 m.*way/3")
     route = "map route reports/easting-first-no-profile.xml --tracks A --heights reports/heights-by-chainage.csv"
     yield Row("easting-first-no-profile.xml", "route", f"{route} {heights} --out {{out}}/e.csv", 0, r"890\.1 m")
+    yield from _newcomer_rows()
+
+
+def _newcomer_rows() -> Iterator[Row]:
+    """Maps as people have them of the line of a recording, through every command that takes a map, `run` among them."""
+    same = {
+        "check": (6, "253 points, 1,473.9 m"), "doctor": (5, "253 points, 1,474 m"), "network": (0, "1 tracks, 1.5 km"),
+        "route": (0, "253 points, 1,473.9 m"), "match": (0, r"360 positions, 360 on a track \(100.0%\)"),
+        "run": (0, "a position in 360 of 360 epochs"),
+    }  # fmt: skip
+    in_feet = same | {  # heights in feet make slopes steeper
+        "check": (6, "253 points, 1,474.3 m"), "route": (0, "253 points, 1,474.3 m"),
+        "run": (7, "are the heights of the map in feet"),
+    }  # fmt: skip
+    order = (3, "turns by more than 90 degrees at 162 of 253 points, which are not in the order of the line")
+    shuffled = dict.fromkeys(same, order) | {"check": (6, "direction turns by 17"), "doctor": (5, order[1])}
+    maps = {
+        "line.kml": same, "names.csv": same, "simple.csv": same, "bom.csv": same, "feet2.csv": in_feet,
+        "shuf.csv": shuffled,
+    }  # fmt: skip
+    for name, expected in maps.items():
+        stated = name in ("bom.csv", "feet2.csv", "shuf.csv")
+        words = {"{map}": "newcomer/" + name, "{heights}": "" if stated else "--height-datum ellipsoidal"}
+        for command, (code, text) in expected.items():
+            yield _map_row(name, command, words, code, text)
+
+
+def _map_row(name: str, command: str, words: dict[str, str], code: int, text: str) -> Row:
+    line = MAP_COMMANDS[command]
+    for old, new in words.items():
+        line = line.replace(old, new)
+    return Row(name, command, line, code, text)
 
 
 def _receiver_rows() -> Iterator[Row]:
@@ -168,7 +208,8 @@ def run_row(row: Row, cases: Path, out: Path) -> tuple[bool, int, str]:
     words = []
     for word in row.words.replace("{nav}", "reports/base.nav").split():
         word = word.replace("{out}", str(out)).replace("{line}", str(line))
-        words.append(str(cases / word) if re.match("(reports|newcomer)/", word) else word)
+        folder = cases.parent if word.startswith("kinematic/") else cases
+        words.append(str(folder / word) if re.match("(reports|newcomer|kinematic)/", word) else word)
     result = CliRunner(env={"COLUMNS": "500"}).invoke(app, words)
     text = " ".join(f"{result.stdout} {result.stderr}".split())
     codes = (row.exit_code,) if isinstance(row.exit_code, int) else row.exit_code
@@ -184,25 +225,36 @@ def station_error_m(path: Path) -> float:
     return float(np.linalg.norm(read_positions(path).ecef_m - STATION_ECEF_M, axis=1).max())
 
 
+def print_table(rows: list[tuple[Row, bool, int]]) -> None:
+    """Print the exit code of each file by command, and in bold those that are not right."""
+    commands = list(dict.fromkeys(row.command for row, _, _ in rows))
+    print("| file | " + " | ".join(commands) + " |")
+    print("| --- |" + " ---: |" * len(commands))
+    for file in dict.fromkeys(row.file for row, _, _ in rows):
+        codes = {row.command: str(code) if right else f"**{code}**" for row, right, code in rows if row.file == file}
+        print(f"| `{file}` | " + " | ".join(codes.get(command, "") for command in commands) + " |")
+
+
 def main() -> None:
     cases = Path(__file__).resolve().parents[3] / "shared" / "data" / "cases"
-    wanted = sys.argv[1] if len(sys.argv) > 1 else ""
-    wrong = 0
+    wanted = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+    found = []
     with tempfile.TemporaryDirectory() as folder:
         for row in list_rows():
             if wanted not in f"{row.file} {row.command}":
                 continue
             right, code, text = run_row(row, cases, Path(folder))
-            wrong += not right
-            error = (
-                f"{station_error_m(Path(folder) / 'place.pos'):5.1f} m off"
-                if row.command == "locate" and not code
-                else ""
-            )
+            found.append((row, right, code))
+            if "--table" in sys.argv:
+                continue
+            located = row.command == "locate" and not code
+            error = f"{station_error_m(Path(folder) / 'place.pos'):5.1f} m off" if located else ""
             print(f"{'right' if right else 'WRONG'}  {row.file:32} {row.command:16} rc {code}  {error}")
             if not right:
                 print(f"       expected {row.exit_code} {row.expected}\n       printed {text[:600]}")
-    print(f"{wrong} rows wrong")
+    if "--table" in sys.argv:
+        print_table(found)
+    print(f"{len(found)} rows, {sum(not right for _, right, _ in found)} wrong", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Protection levels along a line over Japan for an hour of MSAS messages: geometry alone, no receiver.
 
 ``python tests/studies/sbas_hour.py [FOLDER]`` with the recordings beside the checkout prints the tables of
-``docs/integrity-recordings.md``, and writes a picture of each line to the folder. The lines are great circles with a
+``docs/level-results.md``, and writes a picture of each line to the folder. The lines are great circles with a
 point a kilometre; every ten seconds each satellite of the navigation file that MSAS corrects (issues of data
 matched) gives a range of its own sigma, and the level is that of a train at the point.
 """
@@ -36,7 +36,6 @@ from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, Satellite
 from railfix.ranges.sbas.sbas_sources import apply_long_term
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
-from sbas_levels import sbas_level
 
 #: Latitude, longitude [deg] of the ends.
 LINES: Final = {
@@ -188,7 +187,7 @@ def _at_point(
     return (
         used.sum(axis=1),
         np.sqrt((gain**2).sum(axis=1)),
-        sbas_level(model, k=risk.sample_k),
+        risk.sample_k * np.sqrt(model.position_covariance_m2(np.ones(len(model)))[:, 0, 0]),
         level.level_m,
         np.concatenate([parts, rest[:, None]], axis=1),
     )

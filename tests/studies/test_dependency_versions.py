@@ -30,6 +30,7 @@ def test_what_differs_is_found(tmp_path: Path) -> None:
         assert compare(here, results(tmp_path / f"other{k}", **change))[0] == float("inf")
 
 
+@pytest.mark.requirement("S2")
 @pytest.mark.slow
 @pytest.mark.parametrize("how", RESOLUTIONS)
 def test_the_demonstration_is_the_same_with_other_versions(how: str) -> None:

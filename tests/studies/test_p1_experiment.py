@@ -1,4 +1,4 @@
-"""P1's experiments on simulated lines print what docs/p1-results.md is taken from, and hold what it says."""
+"""P1's experiments on simulated lines print what docs/paper-experiments.md is taken from, and hold what it says."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RESULTS = ROOT / "tests" / "references" / "results"
 
 
 def shown(part: str) -> list[str]:
-    """The output of a part that docs/p1-results.md is taken from."""
+    """The output of a part that docs/paper-experiments.md is taken from."""
     return (RESULTS / f"p1-{part}.txt").read_text(encoding="utf-8").rstrip().splitlines()
 
 

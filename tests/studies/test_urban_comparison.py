@@ -19,7 +19,7 @@ def urban() -> Sample:
 
 
 def test_the_urban_railway_keeps_its_figures(urban: Sample) -> None:
-    """docs/simulator-multipath.md prints them: 0.9 m, 33 m, 9 % over 20 m, nearly all of them late, 94 % tracked."""
+    """docs/simulator.md prints them: 0.9 m, 33 m, 9 % over 20 m, nearly all of them late, 94 % tracked."""
     f = figures(urban)
     assert f.codes > 50_000
     assert 0.7 < f.p50_m < 1.2

@@ -12,6 +12,7 @@ import pytest
 from plain_kernels import named_tuple, plain
 from railfix.core.arrays import copy_with
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, range_with_rotation
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking import layout
 from railfix.kernels.tracking.constants import (
     FORCE_WALK_MPS2,
@@ -124,8 +125,8 @@ def _design(rows: Any, equations: Any, unknowns: int) -> np.ndarray:
     codes, size = rows.code.stop, len(equations.unknown)
     quantities = np.zeros((size, unknowns))
     np.add.at(quantities, (np.arange(size)[:, None], equations.unknown), equations.coefficient)
-    moving = equations.design[codes : rows.sensor.start] @ quantities[codes : codes + layout.MOTION]
-    return np.concatenate([quantities[:codes], moving, quantities[codes + layout.MOTION :]])
+    moving = equations.design[codes : rows.sensor.start] @ quantities[codes : codes + ix.MOTION]
+    return np.concatenate([quantities[:codes], moving, quantities[codes + ix.MOTION :]])
 
 
 @pytest.mark.requirement("E5", "C2")
@@ -243,7 +244,7 @@ def _ranged(case: Ride, *, kept: float) -> SensorEpochs:
 def test_ranges_to_ground_units_give_the_place_to_decimetres() -> None:
     case = ride(60, noise=1.0, seed=5)
     found, state = track(case.epochs, case.line, sensors=_ranged(case, kept=0.6), levels=True)
-    assert found.used[:, 3 + layout.RANGE_COLUMN].sum() > 40
+    assert found.used[:, 3 + ix.RANGE_COLUMN].sum() > 40
     assert np.abs(found.arc_m - case.arc_m)[10:].max() < 0.4
     assert state.bank is not None
     assert "range" in state.bank.without
@@ -282,14 +283,14 @@ def test_what_is_no_number_in_a_sub_filter_bounds_nothing_and_in_the_filter_begi
 
 def _made_epoch() -> tuple[Any, Any]:
     """Random measurements, 4 codes, 3 phases, 4 Dopplers, 2 sensors, and a correction without weights."""
-    random, update, size = np.random.default_rng(7), plain("tracking.update"), 4 + layout.MOTION + 2
+    random, update, size = np.random.default_rng(7), plain("tracking.update"), 4 + ix.MOTION + 2
     rows = named_tuple(
         layout.Rows, code=slice(0, 4), phase=slice(4, 7), doppler=slice(7, 11), sensor=slice(11, 13),
         variance=random.uniform(1.0, 4.0, 13),
     )  # fmt: skip
-    index = np.full((size, layout.TERMS), StateIndex.WHEEL)
+    index = np.full((size, ix.TERMS), StateIndex.WHEEL)
     index[:, 0], index[:, 1] = StateIndex.ARC, StateIndex.SPEED
-    coefficient, design = random.normal(size=index.shape), np.zeros((13, layout.MOTION))
+    coefficient, design = random.normal(size=index.shape), np.zeros((13, ix.MOTION))
     design[4:7, :4], design[7:11, 2:] = random.normal(size=(3, 4)), random.normal(size=(4, 4))
     equations = update.Equations(index, coefficient, design, 20.0 * random.normal(size=13) + 7.0)
     mixed = random.normal(size=(size, 2 * size))
@@ -309,8 +310,8 @@ def _expected_weights(
     for kind in (rows.code, rows.phase, rows.doppler):
         shift[kind] -= np.median(shift[kind])
     spread = np.concatenate([without_clock[:4], np.zeros(7), without_clock[-2:]])
-    for kind, clock in ((rows.phase, layout.M_CLOCK), (rows.doppler, layout.M_DRIFT)):
-        known = np.delete(np.arange(layout.MOTION), clock)
+    for kind, clock in ((rows.phase, ix.M_CLOCK), (rows.doppler, ix.M_DRIFT)):
+        known = np.delete(np.arange(ix.MOTION), clock)
         design = one.equations.design[kind][:, known]
         spread[kind] = np.diagonal(design @ covariance[np.ix_(4 + known, 4 + known)] @ design.T)
     own = np.where((np.arange(13) < 4) & (shift > 0.0), late, usual)
@@ -351,7 +352,7 @@ def test_six_rows_are_equivalent_to_all_phases_and_dopplers() -> None:
     """Corrected quantities, determinant and distance against one system of all measurements, not compressed."""
     rows, one = _made_epoch()
     plain("tracking.update").fit(rows, one.equations, one.covariance, rows.variance, one.fit)
-    design = np.zeros((13, 4 + layout.MOTION + 2))
+    design = np.zeros((13, 4 + ix.MOTION + 2))
     design[:4, :4], design[4:11, 4:10], design[11:, 10:] = np.eye(4), one.equations.design[4:11], np.eye(2)
     innovation = design @ one.covariance @ design.T + np.diag(rows.variance)
     fitted = one.covariance @ design.T @ np.linalg.solve(innovation, one.equations.value)

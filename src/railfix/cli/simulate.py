@@ -1,4 +1,4 @@
-"""``railfix simulate``: simulated runs as files, with ground truth; ``railfix demo``: the demonstration positioned."""
+"""``railfix simulate``: simulated runs as files, with ground truth."""
 
 from __future__ import annotations
 
@@ -7,35 +7,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from rich.console import Console
 
-from railfix.cli.console import (
-    TableConsole,
-    describe_errors,
-    prepare_kernels,
-    progress_bar,
-    show_budget,
-    show_notes,
-    show_table,
-)
-from railfix.cli.options import OverwriteOption, VerboseOption, check_set_once, from_models, overwriting, set_value
+from railfix.cli.console import progress_bar
+from railfix.cli.options import check_set_once, from_models, set_value
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option
-from railfix.core.tables import plural
-from railfix.evaluate import Evaluation
-from railfix.evaluate.tables import error_tables
-from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import prior_basis_text
-from railfix.report import read_runs, write_page
-from railfix.run import RunOptions, run_files
 from railfix.run.output import Overwrite, check_folder
-from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.simulate.scenario import Scenario
 from railfix.simulate.scenario_file import Recipe, list_scenarios, load_recipe
 
 
 class SimulateOptions(Settings):
-    """Where the runs go, and what overrides the scenario."""
+    """Folder of the runs, and settings that override the scenario."""
 
     out: Path | None = option(
         "Folder for the files; each run of a recipe in its own below it.", None, metavar="DIR", panel="Options"
@@ -92,7 +75,7 @@ def simulate(
 
     Example: `railfix simulate demo --out simulated`
 
-    Exit codes as `railfix --help` says; 5 where the navigation file does not serve the scenario's time.
+    Exit codes are those of `railfix --help`; 5 where the navigation file does not cover the scenario's time.
     """
     if list_shipped:
         for name in list_scenarios():
@@ -167,91 +150,3 @@ def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
                 f"{recipe.names[0]} to {recipe.names[-1]}"
             )
     return sorted(set(numbers))
-
-
-def demo(
-    *,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent.")
-    ] = Path("railfix-demo"),
-    overwrite: OverwriteOption = False,
-    verbose: VerboseOption = False,
-) -> None:
-    """Position the log that comes with railfix, and compare it with its ground truth.
-
-    The log is simulated: a train with two antennas on a line with curves and cant; the README beside the
-    log describes it. railfix positions it as `railfix run` does. The report compares the positions on the
-    map, and the conventional ones (3-D single point of unscreened ranges, moved to the nearest point of the
-    line), with the ground truth, as `railfix report` does.
-
-    Into DIR come `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet`,
-    `run.json`, the folder `unscreened` of the run for the conventional positions, and `report.html`, the page
-    to open in a browser.
-
-    Example: `railfix demo --out first-look`
-
-    Exit codes as `railfix --help` says.
-    """
-    inputs = demo_inputs()
-    prepare_kernels()
-    with progress_bar() as progress:
-        options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
-        summary = run_files(inputs, Config(), out=out, options=options, progress=progress)
-    # the conventional positions of P1 use ranges that are not screened
-    unscreened = Config(filter="off", screens=("elevation",), protection="off")
-    run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="skip"))
-    runs, evaluation = read_runs([out], [demo_truth()], conventional=[out / "unscreened"])
-    page = write_page(runs, evaluation, out / "report.html", title="railfix demonstration: a simulated run")
-    console = TableConsole()
-    for line in summary.verdict.lines():
-        console.print(line)
-    if evaluation is not None:
-        console.print(describe_errors(evaluation))
-    console.print(
-        f"{plural(summary.notes, 'note')} on what this run does not promise: {out / 'run.json'}; --verbose shows all"
-    )
-    console.print(f"the log, its track map, vehicle and ground truth: {inputs.front[0].parent}")
-    console.print(f"the report, to open in a browser: {page}")
-    if verbose:
-        console.print()
-        show_notes(console, summary.notes)
-        show_budget(console, summary)
-        if evaluation is not None:
-            show_errors(evaluation)
-
-
-def show_errors(evaluation: Evaluation) -> None:
-    """Print errors along the line: on the map, of those that passed every check, and of the conventional position."""
-    console = TableConsole()
-    for table in error_tables(evaluation):
-        show_table(console, table)
-    show_levels(evaluation, console)
-
-
-def show_levels(evaluation: Evaluation, console: Console) -> None:
-    """Print the protection level of each antenna: median, availability, and errors above it."""
-    indicative = any(run.protection.get("basis") == "indicative" for run in evaluation.runs)
-    for kind, found in evaluation.integrity.items():
-        rows = found.stanford.filter(grouping="all", levels_of="usable", own_limit=True)
-        for row in rows.filter(rows["antenna"] != "all").iter_rows(named=True):
-            median = median_level(evaluation, kind, row["antenna"])
-            over = found.beyond.filter(antenna=row["antenna"])
-            named = "indicative protection level" if indicative else "protection level"
-            console.print(
-                f"{named} ({kind}), {row['antenna']}: median {'-' if median is None else f'{median:.2f} m'}, "
-                f"within the alarm limit of {row['alarm_limit_m']:g} m at "
-                f"{100 * (row['availability_of_observed'] or 0.0):.2f} % of the epochs with observations, errors over "
-                f"it: {int(over['usable'].sum())} of {row['judged']:,}, and "
-                f"{int((~over['usable']).sum())} where the run had raised an alarm or a doubt"
-            )
-    for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
-        console.print(f"protection level: {text}")
-
-
-def median_level(evaluation: Evaluation, kind: str, antenna: str) -> float | None:
-    """Return the median of the finite levels of the positions of status ok [m]; None where there is none."""
-    if evaluation.levels is None:
-        return None
-    wanted = {"antenna": antenna, "position": "constrained_ok", "level": f"{kind}_protection_level_m"}
-    found: float | None = evaluation.levels.filter(**wanted)["level_p50_m"].item()
-    return found

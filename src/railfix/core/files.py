@@ -34,17 +34,18 @@ from railfix.core.packed import COMPRESS, STREAMS, ZIP, damage_errors, open_zip,
 
 FilePath = str | PathLike[str]
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
-#: What a reader does with a broken line: stop with an error, or leave it out and count it.
+#: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
-Reader = Literal["railfix", "georinex"]  #: What reads RINEX observation files.
+Reader = Literal["railfix", "georinex"]  #: Program that reads RINEX observation files.
 #: Last clause of the error of a broken line: how to go on.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
-_SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")  #: Endings of packed files before which the kind stands.
+#: Endings of compressed files; the ending before them gives the kind.
+_SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
-#: Whole files: text is packed to a twentieth or a fiftieth; more is no text, and could fill the memory.
+#: Whole files: text compresses by a factor of 20 to 50; a larger factor is no text, and could fill the memory.
 _LARGEST_RATIO: Final = 100
 _LARGEST_BYTES: Final = 64_000_000
 
@@ -121,7 +122,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of texts; ValueError where there is none, SettingsError: it is no path."""
+    """Return one or several paths as a list of texts; ValueError where none is given, SettingsError: not a path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise ValueError("no file was given")
@@ -176,11 +177,11 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 def unpacked_file(path: FilePath) -> Iterator[Path]:
     """Yield a file on disk with the unpacked content, for programs that open files themselves.
 
-    A file that is not packed is itself; all files of a zip archive are unpacked beside each other.
+    A file that is not compressed is returned as it is; all files of a zip archive are extracted into one folder.
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)
-    if not head.startswith((ZIP, COMPRESS, *STREAMS)) or (head.startswith(ZIP) and _is_document(path)):
+    if not head.startswith((ZIP, COMPRESS, *STREAMS)):
         yield Path(path)
         return
     with tempfile.TemporaryDirectory(prefix="railfix-") as folder:
@@ -195,11 +196,6 @@ def unpacked_file(path: FilePath) -> Iterator[Path]:
         with open_stream(path, content="bytes") as stream, target.open("wb") as file:
             shutil.copyfileobj(stream, file, _COPY_BYTES)
         yield target
-
-
-def _is_document(path: FilePath) -> bool:
-    """Return whether a zip archive is a document of its own (a spreadsheet), by its name."""
-    return Path(path).suffix.lower() in (".xlsx", ".ods")
 
 
 def read_bytes(path: FilePath) -> bytes:
@@ -229,21 +225,9 @@ def read_text(path: FilePath) -> str:
         raise InputFileError(path, "is not UTF-8 text; save the file as UTF-8", line=line) from None
 
 
-def text_lines(path: FilePath) -> Iterator[str]:
-    """Yield the lines of a decompressed UTF-8 file, without a byte order mark and without their ends."""
-    number = 0
-    with open_stream(path) as stream, io.TextIOWrapper(stream, encoding="utf-8") as text:  # type: ignore[type-var]
-        try:
-            for line in text:
-                number += 1
-                yield from line.splitlines()
-        except UnicodeDecodeError:
-            message = "is not UTF-8 text; save the file as UTF-8"
-            raise InputFileError(path, message, line=number + 1) from None
-
-
 def ending(path: FilePath) -> str:
-    """Return the ending of a file name in lower case, ignoring those of packed files; of a zip archive its file's.
+    """Return the ending of a file name in lower case, ignoring endings of compression; for a zip archive the ending of
+    its file.
 
     >>> ending("Line.GeoJSON.gz")
     '.geojson'
@@ -271,7 +255,9 @@ def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[s
 
 
 def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file; `what` it should be, with its article ("the record of a run")."""
+    """Return the object in a JSON file; `what` names the expected kind of file with its article ("the record of a
+    run").
+    """
     try:
         content = json.loads(read_text(path))
     except RecursionError:
@@ -286,7 +272,7 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
     """Write a text file under a temporary name, then rename it: a failed write leaves no file.
 
-    `what` is the kind of file, for the message of the OutputError where it cannot be written.
+    `what` is the kind of file, for the OutputError raised where it cannot be written.
     """
     with stage_file(path, what=what) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -294,7 +280,7 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
 @contextmanager
 def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
-    """Yield a temporary path beside a file, which replaces the file where the block ends without error."""
+    """Yield a temporary path in the folder of a file, which replaces the file if the block ends without error."""
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
@@ -308,7 +294,7 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
         raise write_error(target, error, what=f"the {what} ") from error
 
 
-#: Errors of a file system without room, and what to do.
+#: Errors of a file system without space, and what to do.
 _FULL: Final = {
     errno.ENOSPC: "free some space on the disk, or name a folder on another",
     errno.EDQUOT: "free some of your quota, or name a folder elsewhere",
@@ -317,7 +303,7 @@ _FULL: Final = {
 
 
 def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputError:
-    """Return the error of a file that cannot be written: the system's reason, and what to do about it."""
+    """Return the error of a file that cannot be written: the system's reason, and what to do."""
     hint = _FULL.get(error.errno or 0, "name a folder that can be written to")
     return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
 
@@ -376,14 +362,14 @@ def hatanaka_program(name: str) -> AbstractContextManager[Path]:
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the decoder on an open source and take over the resources in `held`."""
+    """Start the decoder on an open source and take ownership of the resources in `held`."""
     if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:
             shutil.copyfileobj(unpacked, spool, _COPY_BYTES)
         spool.flush()
         source = spool
-    # the decoder inherits the descriptor, whose place `seek` need not move within what is buffered
+    # the decoder inherits the descriptor; `seek` need not move its position within the buffer
     os.lseek(source.fileno(), 0, os.SEEK_SET)
     log = _temporary(held)
     program = held.enter_context(hatanaka_program("crx2rnx"))

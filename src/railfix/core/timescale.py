@@ -34,7 +34,9 @@ _LEAP_UTC: Final = np.array(
 
 
 def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
-    """Return a GPS time; ValueError where the value is no time, or has a time zone, which numpy would take for UTC."""
+    """Return a GPS time; ValueError where the value is no time, or has a time zone, which numpy would
+    convert to UTC.
+    """
     text = str(value).strip().replace(" ", "T")
     if re.search(r":.*([Zz]|[+-][\d:]+)$", text):
         raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind it by the leap seconds")

@@ -9,7 +9,7 @@ from .georinex_layout import (
 from .logs import read_navigation, read_observations, scan_observations
 from .nmea import read_nmea
 from .position_log import PositionLog
-from .positions import read_any_positions, read_positions
+from .positions import read_positions
 from .reference_log import AntennaReference, read_reference
 from .rinex import write_navigation, write_observations
 from .sp3 import read_sp3
@@ -21,7 +21,6 @@ __all__ = [
     "navigation_to_xarray",
     "observations_from_xarray",
     "observations_to_xarray",
-    "read_any_positions",
     "read_navigation",
     "read_nmea",
     "read_observations",

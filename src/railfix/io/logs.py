@@ -20,8 +20,8 @@ from railfix.gnss.observations import Observations, concatenate
 from railfix.gnss.plausible_records import plausible_navigation
 from railfix.io import rinex
 from railfix.io.epoch_order import EpochOrder, Run
+from railfix.io.file_kind import find_kind
 from railfix.io.mate import mate_table, read_mate_observations
-from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.io.rinex.observations import (
     DEFAULT_EPOCHS,
     check_one_run,
@@ -86,7 +86,7 @@ def _by_georinex(
 
     parts: list[Observations] = []
     for name in paths:
-        if is_receiver_log(read_head(name)):
+        if find_kind(name) == "receiver":
             raise MismatchError(f"{name} is a receiver's log, and georinex reads RINEX; leave out reader (--reader)")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FutureWarning)  # a default of xarray that georinex relies on
@@ -138,7 +138,7 @@ def scan_observations(
         return in_pieces(iter(_by_georinex(paths, letters, start, end)), epochs)
     if any(mate_table(p) == "S_GNSS_SAT" for p in paths):
         return _mate_pieces(paths, letters, (start, end), epochs)
-    receiver = [is_receiver_log(read_head(p)) for p in paths]
+    receiver = [find_kind(p) == "receiver" for p in paths]
     if not any(receiver):
         return rinex.scan_observations(
             paths, epochs=epochs, broken_lines=selection.get("broken_lines", "stop"), systems=letters, start=start,
@@ -242,7 +242,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     Records that describe no orbit of their constellation are rejected, counted and described in the notes.
     """
     names = path_names(paths)
-    receiver = [is_receiver_log(read_head(name)) for name in names]
+    receiver = [find_kind(name) == "receiver" for name in names]
     parts = []
     if not all(receiver):
         files = [name for name, is_log in zip(names, receiver, strict=True) if not is_log]

@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath
+from railfix.core.files import FilePath, read_bytes
 from railfix.core.tables import reading_table
 from railfix.core.timescale import from_week, seconds
 from railfix.gnss.observations import ObservationHeader, Observations
@@ -86,7 +86,8 @@ def read_mate(path: FilePath, needed: tuple[str, ...]) -> pl.DataFrame:
         if file.suffix.lower() == ".parquet":
             table = pl.read_parquet(file)
         else:
-            table = pl.read_csv(file, infer_schema_length=None, schema_overrides=dict.fromkeys(_TEXTS, pl.String()))
+            overrides = dict.fromkeys(_TEXTS, pl.String())
+            table = pl.read_csv(read_bytes(path), infer_schema_length=None, schema_overrides=overrides)
     table = table.rename({column: column.upper() for column in table.columns})
     unknown = [column for column in table.columns if column not in READ[name]]
     if unknown:

@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Integers, Strings
+from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, text_lines
+from railfix.core.files import FilePath, read_text
 
 _BLOCK: Final = 4096  #: Rows that are read before they become compact.
 _SEPARATORS: Final = (";", "\t", "|")  #: Separators of columns other than the comma.
@@ -53,6 +53,10 @@ class NamedColumns:
 
     def __contains__(self, name: str) -> bool:
         return name in self.cells
+
+    def take(self, rows: Indices) -> NamedColumns:
+        """Return some rows in a given order."""
+        return replace(self, line=self.line[rows], cells={name: cell[rows] for name, cell in self.cells.items()})
 
     def error(self, row: int, message: str) -> InputFileError:
         """Return an error that names the line of a row."""
@@ -126,7 +130,7 @@ def read_named_columns(path: FilePath) -> NamedColumns:
 
     InputFileError: it is none.
     """
-    return parse_named_columns(text_lines(path), path)
+    return parse_named_columns(read_text(path).splitlines(), path)
 
 
 def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
+import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import LENIENT, BrokenLines, FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.core.settings import misspelt
-from railfix.core.timescale import SECONDS_PER_WEEK, from_week, timedelta, utc_to_gpst
+from railfix.core.timescale import SECONDS_PER_WEEK, from_week, gpst_to_utc, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
 
 SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Standard deviations of a CSV log.
@@ -23,6 +24,8 @@ CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
     "z_m", "quality", "ratio", *SIGMA_COLUMNS,
 )  # fmt: skip
+#: Further columns of a table of positions, which `PositionLog.table` keeps.
+OTHER_COLUMNS: Final = ("antenna", "chainage_m", "speed_mps", "sigma_m", "source", "environment")
 #: Largest Unix time that is taken for seconds, in 2100.
 _LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
@@ -46,6 +49,7 @@ class PositionLog:
     #: Latitude and longitude of all rows, where some have no height; shape (n, 2).
     plan_deg: Floats | None = None
     antennas: tuple[str, ...] = ()  #: Names of antennas in a table that has them.
+    table: NamedColumns | None = None  #: All columns, where the log is a table with named columns.
 
     @property
     def geodetic(self) -> tuple[Floats, Floats, Floats]:
@@ -97,17 +101,16 @@ def skip_broken(
 
 
 def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> PositionLog:
-    """Parse the positions in a table with named columns; see `railfix.io.positions.read_positions`."""
-    table = rename_columns(parse_named_columns(lines, path), columns, known=CSV_COLUMNS)
-    antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
-    return replace(positions_of_table(table), antennas=tuple(antennas))
+    """Parse the positions in a table with named columns; columns of heights and sigmas may be absent."""
+    table = rename_columns(parse_named_columns(lines, path), columns, known=(*CSV_COLUMNS, *OTHER_COLUMNS))
+    return positions_of_table(table)
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
-    """Convert a table that has been read to a position log; columns of heights and sigmas may be absent."""
+    """Return the positions in a table."""
+    path = table.path
     cartesian = all(name in table for name in _CARTESIAN)
     table = table if cartesian else with_usual_names(table, _GEODETIC)
-    path = table.path
     close = misspelt(table.cells, CSV_COLUMNS)
     absent = {right: wrong for wrong, right in close.items() if right not in table}
     geodetic = all(name in table for name in _GEODETIC[:2])
@@ -141,6 +144,8 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
         notes=notes,
         ratio=numbers_or_nan(table, "ratio") if "ratio" in table else None,
         plan_deg=values[:, :2] if flat else None,
+        antennas=tuple(table.cells["antenna"].unique().sort().to_list()) if "antenna" in table else (),
+        table=table,
     )
 
 
@@ -238,38 +243,50 @@ def _times(texts: list[str]) -> Datetimes:
 
 # --- RTKLIB ------------------------------------------------------------------
 
+#: Columns of a table by those of RTKLIB's solution.
+_OF_RTKLIB: Final = {
+    "latitude": "latitude_deg", "longitude": "longitude_deg", "height": "height_m", "x-ecef": "x_m", "y-ecef": "y_m",
+    "z-ecef": "z_m", "Q": "quality", "sdn": "sigma_north_m", "sde": "sigma_east_m", "sdu": "sigma_up_m",
+}  # fmt: skip
+
 
 def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
     """Parse RTKLIB's solution format (manual 2.4.2, B.1); baselines and heights above the geoid are rejected."""
-    header = [line for line in lines if line.startswith("%")]
+    scale, names = _rtklib_header(path, [line for line in lines if line.startswith("%")])
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]
-    scale, names = _rtklib_header(path, header)
     if not rows:
         raise InputFileError(path, "there is no position below the header")
-    number = np.array([i for i, _ in rows], dtype=np.int64)
     fields = [line.replace(",", " ").replace(";", " ").split() for _, line in rows]
-    sexagesimal = any("(d'" in name for name in names[:2])
-    fixed = 2 + (7 if sexagesimal else 3)
-    for line, row in zip(number, fields, strict=True):
-        if len(row) < max(fixed + 1, len(fields[0])):
+    sexagesimal = "(d'" in names[0]
+    least = max(9 + 1 if sexagesimal else 5 + 1, len(fields[0]))
+    for (line, _), row in zip(rows, fields, strict=True):
+        if len(row) < least:
             message = f"{len(row)} fields; time, coordinates, quality and as many as in the first row were expected"
-            raise InputFileError(path, message, line=int(line))
-    time = _rtklib_times(path, number, [(row[0], row[1]) for row in fields], scale)
-    width = min(len(row) for row in fields)
-    values = _rtklib_numbers(path, number, [row[2:width] for row in fields])
-    coordinates, rest = values[:, : fixed - 2], values[:, fixed - 2 :]
-    after = [name.split("(")[0] for name in names[3:]][: rest.shape[1]]
-    sigmas = [after.index(name) for name in ("sdn", "sde", "sdu") if name in after]
-    return PositionLog(
-        path=str(path),
-        time=time,
-        ecef_m=_rtklib_ecef(path, number, coordinates, names),
-        quality=rest[:, 0].astype(np.int64),
-        sigma_m=rest[:, sigmas] if len(sigmas) == 3 else np.full((len(rest), 3), np.nan),
-        line=number,
-        notes=() if scale == "GPST" else (f"{path}: times converted from {scale} to GPS time",),
-        ratio=rest[:, after.index("ratio")] if "ratio" in after else None,
-    )
+            raise InputFileError(path, message, line=line)
+    columns = [pl.Series(column, dtype=pl.String) for column in zip(*(row[:least] for row in fields), strict=True)]
+    calendar = "/" in fields[0][0]
+    if calendar:
+        name = "time_gpst" if scale == "GPST" else "time_utc"
+        cells = {name: columns[0] + "T" + columns[1]}
+    else:
+        cells = {"week": columns[0], "tow_s": columns[1]}
+    if sexagesimal:
+        names = [*"abcdef", *names[2:]]
+    cells |= {_OF_RTKLIB.get(name := n.split("(")[0], name): c for n, c in zip(names, columns[2:], strict=False)}
+    line = np.array([number for number, _ in rows], dtype=np.int64)
+    table = NamedColumns(path=str(path), metadata={}, header_line=0, line=line, cells=cells)
+    if sexagesimal:
+        for column, parts in (("latitude_deg", "abc"), ("longitude_deg", "def")):
+            degrees, minutes, seconds = (table.numbers(part) for part in parts)
+            sign = np.where(np.signbit(degrees), -1.0, 1.0)
+            cells[column] = pl.Series(map(repr, (sign * (abs(degrees) + minutes / 60.0 + seconds / 3600.0)).tolist()))
+    log = positions_of_table(table)
+    if scale == "GPST":
+        return log
+    time = log.time if calendar else utc_to_gpst(log.time)
+    if scale == "JST":
+        time = utc_to_gpst(gpst_to_utc(time) - timedelta(9 * 3600.0))
+    return replace(log, time=time, notes=(*log.notes, f"{path}: times converted from {scale} to GPS time"))
 
 
 def _rtklib_header(path: FilePath, header: list[str]) -> tuple[str, list[str]]:
@@ -292,49 +309,3 @@ def _rtklib_header(path: FilePath, header: list[str]) -> tuple[str, list[str]]:
         "there is no RTKLIB header line such as '%  GPST  latitude(deg) longitude(deg)  height(m)  Q ...'; write the "
         ".pos file with out-outhead=on",
     )
-
-
-def _rtklib_times(path: FilePath, number: Integers, cells: list[tuple[str, str]], scale: str) -> Datetimes:
-    calendar = "/" in cells[0][0]
-    try:
-        if calendar:
-            time = _times([f"{d.replace('/', '-')}T{t}" for d, t in cells])
-        else:
-            time = from_week([int(w) for w, _ in cells], [float(s) for _, s in cells])
-    except ValueError:
-        form = "2021/09/22 06:30:00.000" if calendar else "2176 282600.000"
-        for line, (first, second) in zip(number, cells, strict=True):
-            by_calendar = calendar and fails(_times, [f"{first.replace('/', '-')}T{second}"])
-            if by_calendar or (not calendar and (fails(int, first) or fails(float, second))):
-                message = f"'{first} {second}' is not a time such as {form}"
-                raise InputFileError(path, message, line=int(line)) from None
-        raise
-    if scale == "JST":
-        time = time - timedelta(9 * 3600.0)
-    return time if scale == "GPST" else utc_to_gpst(time)
-
-
-def _rtklib_numbers(path: FilePath, number: Integers, fields: list[list[str]]) -> Floats:
-    try:
-        return np.array(fields, dtype=np.float64)
-    except ValueError:
-        for line, row in zip(number, fields, strict=True):
-            if wrong := next((cell for cell in row if fails(float, cell)), None):
-                raise InputFileError(path, f"'{wrong}' is not a number", line=int(line)) from None
-        raise
-
-
-def _rtklib_ecef(path: FilePath, number: Integers, values: Floats, names: list[str]) -> Floats:
-    if names[0].startswith("x-ecef"):
-        return values
-    if values.shape[1] == 7:
-        sign = np.where(np.signbit(values[:, [0, 3]]), -1.0, 1.0)
-        degrees = np.abs(values[:, [0, 3]]) + values[:, [1, 4]] / 60.0 + values[:, [2, 5]] / 3600.0
-        latitude, longitude = (sign * degrees).T
-    else:
-        latitude, longitude = values[:, 0], values[:, 1]
-    outside = np.abs(latitude) > 90.0
-    if outside.any():
-        row = int(np.argmax(outside))
-        raise InputFileError(path, f"latitude {latitude[row]:g} is over 90 degrees", line=int(number[row]))
-    return ecef_from_geodetic(latitude, longitude, values[:, -1])

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
-import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, Literal
@@ -13,15 +10,16 @@ import numpy as np
 
 from railfix.core.arrays import take_rows
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import BrokenLines, FilePath, ending, read_text
+from railfix.core.files import BrokenLines, FilePath
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.tables import plural
 from railfix.core.timescale import from_week, utc_to_gpst
 from railfix.gnss.observations import first_problems
+from railfix.io.file_kind import FileKind, find_kind, wrong_kind
 from railfix.io.nmea import read_nmea
 from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtklib_positions, skip_broken
-from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.io.receiver.log import read_receiver_positions
+from railfix.io.xml_lines import read_gpx_lines
 
 #: Quality as RTKLIB numbers it, by the position type of NovAtel.
 _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PPP": 6, "SINGLE": 5, "PSRSP": 5}
@@ -29,39 +27,29 @@ _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PP
 
 def _read_gpx(path: FilePath) -> PositionLog:
     """Read the track points of GPX 1.0 or 1.1 (UTC); heights without ``geoidheight`` are kept, with a note."""
-    try:
-        root = ElementTree.fromstring(read_text(path))
-    except ElementTree.ParseError as error:
-        raise InputFileError(path, f"this is not XML ({error.msg})", line=error.position[0]) from None
-    points = [node for node in root.iter() if node.tag.rsplit("}", 1)[-1] == "trkpt"]
-    if not points:
+    lines = read_gpx_lines(path)
+    if not lines:
         raise InputFileError(path, "there is no track point (trkpt) in this GPX file")
-    rows = []
-    for node in points:
-        texts = {child.tag.rsplit("}", 1)[-1]: (child.text or "").strip() for child in node}
-        try:
-            heights = [texts.get(name) or "nan" for name in ("ele", "geoidheight")]
-            rows.append([float(text) for text in (node.attrib["lat"], node.attrib["lon"], *heights)])
-        except (KeyError, ValueError):
-            raise InputFileError(path, f"track point {len(rows) + 1} has no latitude and longitude") from None
-    stamps = [next((c.text or "" for c in n if c.tag.rsplit("}", 1)[-1] == "time"), "").strip() for n in points]
+    points = np.concatenate([line.points for line in lines])
+    geoid = np.concatenate([line.geoid_m for line in lines])
     try:
-        utc = np.array([s.removesuffix("Z") or "NaT" for s in stamps], dtype="datetime64[ns]")
+        stamps = [stamp.removesuffix("Z") or "NaT" for line in lines for stamp in line.time]
+        utc = np.array(stamps, dtype="datetime64[ns]")
     except ValueError:
         raise InputFileError(path, "a time is not UTC such as 2024-01-01T10:00:00Z") from None
-    values = np.array(rows, dtype=np.float64)
-    geoid = np.nan_to_num(values[:, 3])
-    notes = (
-        () if np.isfinite(values[:, 3]).all() else (f"{path}: heights of GPX are above the geoid; kept as they are",)
-    )
+    known = np.isfinite(points[:, 2])
+    notes = [f"{path}: heights of GPX are above the geoid; kept as they are"] if (known & np.isnan(geoid)).any() else []
+    if not known.all():
+        notes.append(f"{path}: {int((~known).sum()):,} of {len(points):,} points have no height (ele)")
     return PositionLog(
         path=str(path),
         time=utc_to_gpst(utc),
-        ecef_m=ecef_from_geodetic(values[:, 0], values[:, 1], np.nan_to_num(values[:, 2]) + geoid),
-        quality=np.full(len(values), -1),
-        sigma_m=np.full((len(values), 3), np.nan),
-        line=np.arange(1, len(values) + 1),
-        notes=notes,
+        ecef_m=ecef_from_geodetic(points[:, 1], points[:, 0], points[:, 2] + np.nan_to_num(geoid)),
+        quality=np.full(len(points), -1),
+        sigma_m=np.full((len(points), 3), np.nan),
+        line=np.arange(1, len(points) + 1),
+        notes=tuple(notes),
+        plan_deg=None if known.all() else points[:, 1::-1],
     )
 
 
@@ -105,32 +93,6 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
 
 #: Rows that are this much out of order are sorted; those further back are left where they are [s].
 _SORTED_S: Final = 60.0
-_NMEA: Final = re.compile(rb"\$(?:[A-Z]{2}(?:GGA|RMC|ZDA|GSA|GSV|GLL|VTG|GNS|GST|TXT)|P[A-Z]{3})")
-_NOVATEL: Final = re.compile(rb"^[#%](?:BEST(?:GNSS)?POSA|INSPVA[SX]?A|[A-Z0-9]+A),", re.MULTILINE)
-_GPX: Final = re.compile(rb"<(?:\w+:)?gpx[\s>]")
-_RTKLIB: Final = re.compile(rb"^%.*(?:latitude|ecef|baseline|program|GPST|UTC|JST)", re.MULTILINE)
-
-
-def header_line(head: bytes) -> str:
-    """Return the first line of the beginning of a text that is neither blank nor a comment; "" without any."""
-    coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
-    lines = head.decode(coding, "replace").splitlines()
-    return next((line for line in lines if line.strip() and not line.startswith("#")), "")
-
-
-def position_kind(path: FilePath) -> str:
-    """Return the kind of a log of positions by its content: csv, rtklib, nmea, gpx, novatel, receiver; "" of none."""
-    head = read_head(path)
-    if is_receiver_log(head):
-        return "receiver"
-    for kind, pattern in (("gpx", _GPX), ("nmea", _NMEA), ("novatel", _NOVATEL), ("rtklib", _RTKLIB)):
-        if pattern.search(head):
-            return kind
-    first = header_line(head)
-    is_table = any(mark in first for mark in ",;\t|") and any(letter.isalpha() for letter in first)
-    if ending(path) == ".csv" or (is_table and not first.lstrip().startswith(("{", "<", "["))):
-        return "csv"
-    return "rtklib" if ending(path) == ".pos" else ""
 
 
 def read_positions(
@@ -174,11 +136,11 @@ def read_positions(
     SettingsError
         `columns` names a column that railfix does not know, or the file is no table.
     """
-    kind = position_kind(path)
-    if columns and kind != "csv":
+    kind = find_kind(path)
+    if columns and kind != "table":
         raise SettingsError(f"{path}: columns can be renamed in a table with named columns only")
-    parsers: dict[str, Callable[[list[str]], PositionLog]] = {
-        "csv": lambda lines: parse_csv_positions(lines, path, columns or {}),
+    parsers: dict[FileKind, Callable[[list[str]], PositionLog]] = {
+        "table": lambda lines: parse_csv_positions(lines, path, columns or {}),
         "novatel": lambda lines: _parse_novatel(lines, path),
         "rtklib": lambda lines: parse_rtklib_positions(lines, path),
     }
@@ -192,19 +154,14 @@ def read_positions(
     elif kind == "gpx":
         log = _read_gpx(path)
     else:
-        raise InputFileError(
-            path,
-            "is no log of positions: RTKLIB's solution (.pos), NMEA, GPX, NovAtel ASCII, UBX, SBF, or a table (CSV) "
-            "whose first line names its columns was expected",
+        raise wrong_kind(
+            path, "a log of positions: RTKLIB's solution (.pos), NMEA, GPX, NovAtel ASCII, UBX, SBF, or a table (CSV)"
         )
     if antennas == "one" and len(log.antennas) > 1:
         raise InputFileError(path, f"has positions of {' and '.join(log.antennas)}; give those of one antenna")
     if heights == "needed" and log.plan_deg is not None and np.isnan(log.ecef_m).all():
         raise InputFileError(path, "its positions have no height; expected heights above the ellipsoid (height_m)")
     return _in_order(log)
-
-
-read_any_positions = read_positions  #: Its former name.
 
 
 def _in_order(log: PositionLog) -> PositionLog:
@@ -220,5 +177,7 @@ def _in_order(log: PositionLog) -> PositionLog:
     if longest > _SORTED_S or len(known) < len(log):
         note = f"{where} by {longest:,.1f} s{times}; the rows stay in the order of the file"
         return replace(log, notes=(*log.notes, note))
-    ordered = take_rows(log, np.argsort(log.time, kind="stable"))
-    return replace(ordered, notes=(*log.notes, f"{where}{times}; the rows were sorted by time"))
+    rows = np.argsort(log.time, kind="stable")
+    table = None if log.table is None else log.table.take(rows)
+    notes = (*log.notes, f"{where}{times}; the rows were sorted by time")
+    return replace(take_rows(log, rows), table=table, notes=notes)

@@ -22,17 +22,8 @@ from railfix.core.files import BrokenLines, FilePath
 from railfix.core.tables import reading_table
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
-from railfix.io.position_log import (
-    CSV_COLUMNS,
-    PositionLog,
-    numbers_or_nan,
-    positions_of_table,
-    positions_times,
-    qualities_in_words,
-    rename_columns,
-    skip_broken,
-)
-from railfix.io.positions import position_kind, read_positions
+from railfix.io.position_log import PositionLog, numbers_or_nan, positions_times, qualities_in_words
+from railfix.io.positions import read_positions
 
 #: Columns of the file, in this order.
 COLUMNS: Final = (
@@ -107,15 +98,12 @@ def read_reference(
     InputFileError
         No positions, no times, an unknown source, or no column ``antenna`` where two are to be read.
     """
-    table: NamedColumns | None = None
-    if position_kind(path) == "csv":
-        table, log = skip_broken(path, lambda lines: _parse(lines, path, columns or {}), broken_lines=broken_lines)[0]
-    else:
-        log = read_positions(path, columns=columns, broken_lines=broken_lines, date=date)
+    log = read_positions(path, columns=columns, broken_lines=broken_lines, date=date, antennas="several")
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
     if log.has_quality:
         usable &= np.isin(log.quality, [*quality])
-    cells = NamedColumns(path=log.path, metadata={}, header_line=0, line=log.line, cells={}) if table is None else table
+    empty = NamedColumns(path=log.path, metadata={}, header_line=0, line=log.line, cells={})
+    cells = empty if log.table is None else log.table
     owner = cells.texts("antenna", absent=antennas[0])
     if "antenna" not in cells and len(antennas) > 1:
         raise InputFileError(
@@ -129,13 +117,6 @@ def read_reference(
         wanted, there = ", ".join(map(str, quality)), qualities_in_words(log)
         what = f" and quality {wanted} (the log has {there}; railfix evaluate --reference-quality takes others)"
     return {name: _of_antenna(path, name, owner, usable, values, what) for name in antennas}
-
-
-def _parse(lines: list[str], path: FilePath, columns: Mapping[str, str]) -> tuple[NamedColumns, PositionLog]:
-    """Parse a table, and its positions."""
-    known = dict.fromkeys((*CSV_COLUMNS, *COLUMNS))
-    table = rename_columns(parse_named_columns(lines, path), columns, known=known)
-    return table, positions_of_table(table)
 
 
 def _columns(log: PositionLog, table: NamedColumns) -> dict[str, NDArray[np.generic]]:
@@ -249,17 +230,17 @@ class Acceleration:
 def read_pulses(path: FilePath) -> Pulses:
     """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
 
-    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the distance
-    run; with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. InputFileError: no such
-    table, times that do not rise, a direction other than 1 and -1.
+    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``pulse`` the number of a
+    pulse, as `railfix run` takes it, ``distance_m`` the distance run; with none of them each row is one pulse. A column
+    ``direction`` of 1 and -1 gives the sign. InputFileError: no such table, times that do not rise, a direction other
+    than 1 and -1.
     """
     table = _sensor_table(path)
     time = _rising_times(table)
-    kind = "count" if "count" in table else "distance" if "distance_m" in table else "pulse"
-    if kind == "pulse":
-        count = np.arange(len(table), dtype=np.float64)
-    else:
-        count = table.numbers("count" if kind == "count" else "distance_m")
+    names = {"count": "count", "pulse": "pulse", "distance_m": "distance"}
+    name = next((name for name in names if name in table), "")
+    kind = names.get(name, "pulse")
+    count = table.numbers(name) if name else np.arange(len(table), dtype=np.float64)
     if "direction" in table:
         direction = table.numbers("direction")
         wrong = ~np.isin(direction, (-1.0, 1.0))

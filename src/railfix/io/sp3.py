@@ -13,6 +13,7 @@ from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import PreciseEphemeris
 from railfix.gnss.orbits.ephemerides import POINTS
 from railfix.gnss.plausible_records import plausible_radius
+from railfix.io.file_kind import wrong_kind
 
 #: Time systems that are GPS time up to nanoseconds; SP3-a files name none and are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
@@ -76,7 +77,7 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
     """Read epochs [ns of GPS time], satellites, positions [km] and clocks [us] of a file."""
     lines = read_text_lines(path)
     if not lines or lines[0][:2] not in ("#a", "#b", "#c", "#d"):
-        raise InputFileError(path, "is not an SP3 file: its first line must begin with #a, #b, #c or #d", line=1)
+        raise wrong_kind(path, "a file of precise orbits, SP3 (its first line begins with #a, #b, #c or #d)")
     system = _time_system(path, lines)
     epoch: int | None = None
     states: list[tuple[int, str, list[float]]] = []

@@ -20,9 +20,10 @@ from railfix.core.arrays import Bytes, Indices
 from railfix.core.errors import InputFileError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
+from railfix.io.file_kind import find_kind
 from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import assemble_navigation
-from railfix.io.receiver.framing import SbasFrames, find_frames, is_receiver_log, read_head
+from railfix.io.receiver.framing import SbasFrames, find_frames
 from railfix.io.receiver.log import StreamState, at_station, decode
 from railfix.io.receiver.measurements import Tracking, join_observations
 from railfix.io.rinex import scan_observations
@@ -133,7 +134,7 @@ async def arrivals(
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
     """Yield what a source's data complete, by items, and the breaks of its connection; `place`: see `read_source`."""
     path = source.removeprefix("file:")
-    if source != "-" and is_file(source) and not is_receiver_log(read_head(path)):
+    if source != "-" and is_file(source) and find_kind(path) != "receiver":
         for piece in scan_observations(path, epochs=200):
             for epoch in single_epochs(piece):
                 yield ReceivedData(epochs=(epoch,), after=state)

@@ -29,7 +29,8 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion_signs import MotionFit, MotionInputs, fit_motion
+from railfix.integrity.interference.motion_signs import MotionFit, fit_motion
+from railfix.integrity.interference.range_fits import MotionInputs
 from railfix.pipeline.solution import Solution
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.ranges.corrected import CorrectedRanges
@@ -40,8 +41,10 @@ _CONTRADICTED: Final = int(
 )
 #: Reasons of satellites that are wrong by themselves, where they are few.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
-#: Satellites that are wrong by themselves at most: a spoofer has more of them.
+#: Satellites that are wrong by themselves at most, by residuals, and of one clock by gross errors: a spoofer's signals
+#: that give a position of their own are more.
 _MOST_WRONG: Final = 2
+_MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Statuses of positions that spoofing outranks, and those that jamming does.
 _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
@@ -50,8 +53,9 @@ _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
 ])  # fmt: skip
 #: Statuses of positions that failed a check by their ranges.
 _FAILED: Final = np.isin(np.arange(len(Status)), [
-    Status.OFF_MAP, Status.INCONSISTENT, Status.UNCERTAIN, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
+    Status.OFF_MAP, Status.INCONSISTENT, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
 ])  # fmt: skip
+_IN_DOUBT: Final = _FAILED | (np.arange(len(Status)) == Status.UNCERTAIN)
 #: Statuses that causes give, and those that they outrank.
 _STATUS_BY_CAUSE: Final = (
     (Suspicion.JAMMING_SUSPECTED, np.arange(len(Status)) == Status.OK, Status.JAMMING_SUSPECTED),
@@ -98,27 +102,39 @@ def _motion_inputs(
 ) -> MotionInputs:
     """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
-    consistent, off_line = single.consistent_ecef_m[rows], np.empty(len(rows))
+    consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
     near = np.where(np.isnan(consistent), single.point.ecef_m[rows], consistent)
-    first = 0
+    first, lines = 0, []
     for index, own in antennas.split(rows):
         part = slice(first, first := first + len(own))
+        antenna[part] = len(lines)
+        lines.append(index)
         arc, offset = index.trajectory.nearest(near[part])
         inside = (arc > 0.0) & (arc < index.trajectory.arc_m[-1]) & np.isfinite(consistent[part, 0])
         off_line[part] = np.where(inside, offset, np.nan)
-    wrong = (reason & _WRONG_ALONE) != 0
-    few = (wrong.sum(axis=1) <= _MOST_WRONG)[:, None]
+    usable, named = (reason & ~_CONTRADICTED) == 0, _named_as_wrong(reason, corrected.channels.groups)
     return MotionInputs(
         time=corrected.time[rows], break_before=broken, channel=corrected.channels.names,
         group=corrected.channels.clock_number,
         near_ecef_m=near, sat_ecef_m=corrected.satellites.position_ecef_m[rows],
         sat_velocity_mps=corrected.satellites.velocity_ecef_mps[rows],
-        code_m=np.where((reason & _NOT_ITS_SIGNAL) == 0, code, np.nan),
+        code_m=np.where(((reason & _NOT_ITS_SIGNAL) == 0) & ~named, code, np.nan),
         rate_mps=-SPEED_OF_LIGHT / corrected.frequency_hz * corrected.doppler_hz[rows],
         corrected_code_m=corrected.corrected_code_m[rows], sigma_m=corrected.sigma_m[rows],
-        used=((reason & ~_CONTRADICTED) == 0) & ~(few & wrong), noise_scale=single.noise_scale[rows],
+        used=usable & ~named, named=usable & named, noise_scale=single.noise_scale[rows],
         clock_offset_m=single.ties.offset_m[rows], clock_sigma_m=single.ties.sigma_m[rows], off_line_m=off_line,
+        doubted=corrected.unsure[rows] | _IN_DOUBT[single.status[rows]] | named.any(axis=1), antenna=antenna,
+        lines=tuple(lines),
     )  # fmt: skip
+
+
+def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
+    """Return the satellites that are wrong by themselves, not by a spoofer who moves all of a clock; shape (T, K)."""
+    wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
+    named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
+    for group in groups:
+        named[:, group] |= gross[:, group] & (gross[:, group].sum(axis=1, keepdims=True) <= _MOST_GROSS)
+    return named
 
 
 def _find_interference(
@@ -135,7 +151,8 @@ def _find_interference(
 
     `alarm`: alarms of the receiver since the epoch before, of each; `failed`: their position failed a check.
     """
-    cn0 = np.where(np.isfinite(inputs.code_m), corrected.cn0_dbhz[rows], np.nan)
+    other_signal = (corrected.reason[rows] & _NOT_ITS_SIGNAL) != 0
+    cn0 = np.where(other_signal | np.isnan(corrected.code_m[rows]), np.nan, corrected.cn0_dbhz[rows])
     power, power_state = power_signs(
         inputs.time, inputs.channel, cn0, corrected.observations.front_end_gain[rows], state.power, limits
     )

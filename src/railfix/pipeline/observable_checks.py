@@ -21,8 +21,10 @@ from railfix.ranges.corrected import CorrectedRanges
 
 #: Least range rate of a satellite, against the median one of its constellation, that a factor is taken from [m/s].
 _LEAST_RATE_MPS: Final = 100.0
-#: Satellites that give a factor, and how far most of their factors are from the median one.
+#: Satellites that give a factor, and how far their factors are from the median one: all, or all but one of at least
+#: `_MANY`. Of four satellites one with a cycle slip moves the median rate, and with it the factors of the others.
 _LEAST_SATELLITES: Final = 3
+_MANY: Final = 6
 _SPREAD: Final = 0.3
 #: Factors up to so far from 1 are right: a train's own speed is in them.
 _RIGHT: Final = 0.5
@@ -100,7 +102,8 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
     ratio = np.where(clear, observed, np.nan) / np.where(clear, expected, 1.0)
     factor = masked_median(ratio, clear)
     near = clear & (np.abs(ratio - factor[:, None]) <= _SPREAD)
-    unclear = few | (clear.sum(axis=1) < _LEAST_SATELLITES) | (near.sum(axis=1) < 0.75 * clear.sum(axis=1))
+    count = clear.sum(axis=1)
+    unclear = few | (count < _LEAST_SATELLITES) | (near.sum(axis=1) < count - (count >= _MANY))
     return np.where(unclear, np.nan, factor)
 
 

@@ -64,8 +64,10 @@ def position_stage(
     corrected = reject(corrected, _alone_on_clock(corrected, points.ties), Reason.ALONE_ON_ITS_CLOCK)
     checked, noise = check_ranges(corrected, points.ranges, antennas, fix, config, states)
     corrected, fix, model, scale = checked.corrected, checked.fix, checked.model, checked.scale
-    constrained, off_map = fix.constrained, checked.off_map
-    on_map = np.isfinite(constrained.arc_m) & ~off_map
+    constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
+    # ranges that contradict each other in space contradict every map
+    unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
+    off_map = checked.off_map & ~unresolved
 
     def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
         return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
@@ -92,10 +94,14 @@ def position_stage(
         protection=level, map_offset=offset, off_map=away,
     )  # fmt: skip
     if sigma.phase is not None:
-        off_map = contradict_map(checked.ranges, antennas, fix, sigma.arc_m, config)
+        off_map = contradict_map(checked.ranges, antennas, fix, sigma.arc_m, config) & ~unresolved
     observed = np.asarray(np.isfinite(corrected.code_m).any(axis=1))
+    inconsistent = raim.faulty | unresolved
     solution = copy_with(
-        solution, status=_status(observed, checked.ranges, solution, sigma.judged_m, off_map, open_elsewhere, config)
+        solution,
+        status=_status(
+            observed, checked.ranges, solution, sigma.judged_m, (off_map, inconsistent, open_elsewhere), config
+        ),
     )
     after = [
         copy_with(
@@ -127,20 +133,21 @@ def _consistent(
     """Return ranges and 3-D positions that judge the map: without the `excluded` satellites where all ranges together
     contradict each other, NaN where they still do or nothing tells which one is wrong.
     """
-
-    def contradict(point: SinglePoint, ranges: Ranges) -> Masks:
-        freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
-        return np.asarray(point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2)
-
-    wrong = excluded & (agreeing.weight > 0) & contradict(free, agreeing)[:, None]
+    wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
     if len(changed):
         agreeing = without(agreeing, wrong)
         start = np.where(np.isnan(free.ecef_m), corrected.near_ecef_m, free.ecef_m)[changed]
         solved = point_position(agreeing.take(changed), start, limits=config.single_point)
         free = patch_rows(free, changed, solved)
-    unusable = corrected.unsure | contradict(free, agreeing)
+    unusable = corrected.unsure | _contradict(free, agreeing, scale)
     return agreeing, copy_with(free, ecef_m=np.where(unusable[:, None], np.nan, free.ecef_m))
+
+
+def _contradict(point: SinglePoint, ranges: Ranges, scale: Floats) -> Masks:
+    """Return the epochs whose ranges contradict each other in space, shape (T,)."""
+    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
+    return np.asarray(point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2)
 
 
 class PublishedPositions(NamedTuple):
@@ -215,11 +222,14 @@ def _status(
     ranges: Ranges,
     solution: Solution,
     sigma: Floats,
-    off_map: Masks,
-    open_elsewhere: Masks,
+    failed: tuple[Masks, Masks, Masks],
     config: Config,
 ) -> Codes:
-    """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first."""
+    """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first.
+
+    `failed`: ranges that contradict the map, or each other, and other places that are open; shape (T,) each.
+    """
+    off_map, inconsistent, open_elsewhere = failed
     redundancy, constrained, section = ranges.redundancy, solution.fix.constrained, solution.fix.section
     conditions = [
         (~observed, Status.NO_OBSERVATION),
@@ -228,7 +238,7 @@ def _status(
         (~np.isfinite(solution.arc_m), Status.NO_CONVERGENCE),
         (off_map, Status.OFF_MAP),
         (beyond_threshold(solution.map_offset, config.map_offset), Status.MAP_OFFSET),
-        (solution.raim.faulty, Status.INCONSISTENT),
+        (inconsistent, Status.INCONSISTENT),
         (sigma > config.largest_sigma_m, Status.UNCERTAIN),
         (
             (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,

@@ -40,8 +40,8 @@ _K1, _K2, _RD, _GM, _G = 77.604, 382_000.0, 287.054, 9.784, 9.80665
 SIGMA_VERTICAL_M: Final = 0.12
 _LOWEST_DEG: Final = 2.0
 #: Klobuchar coefficients that GPS broadcast on 2004-01-01, at middling solar activity; RTKLIB too takes them where it
-#: has none. Their vertical delay is 2.8 m RMS over day and latitude; that of the five other days from 2005 to 2024 at
-#: hand differs from it by 0.7 to 1.7 m RMS (`tests/studies/integrity_tables.py coefficients`).
+#: has none. Their vertical delay is 2.8 m RMS over day and latitude; that of the five other available days from 2005 to
+#: 2024 differs from it by 0.7 to 1.7 m RMS (`tests/studies/integrity_tables.py coefficients`).
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
 #: Radius of the Earth over that of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
@@ -82,7 +82,7 @@ def klobuchar_delay_m(
     period = np.maximum(polyval(magnetic, beta), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
-    # Asked this way round, NaN stays NaN and does not become the delay of the night.
+    # With this order of comparison NaN stays NaN and does not become the delay of the night.
     delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
 
@@ -177,7 +177,7 @@ class Delays:
     #: On the channel's own carrier; 0 where a model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: To be added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
+    #: Standard deviation added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
     sigma_m: Floats
     reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
 

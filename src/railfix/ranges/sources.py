@@ -24,7 +24,7 @@ class SourceSatellites(NamedTuple):
     """Satellites of a source, T epochs by K channels."""
 
     states: SatelliteStates  #: At the times of transmission, corrections of the source applied.
-    fast_m: Floats | None  #: Added to the codes beside the satellite clocks, shape (T, K).
+    fast_m: Floats | None  #: Correction of the codes in addition to the satellite clocks, shape (T, K).
     reason: Bits  #: Reasons of those that the source does not correct, shape (T, K).
     fixes: object = None  #: Corrections of the satellites, for the delays of the same source.
 
@@ -33,16 +33,16 @@ class SourceDelays(NamedTuple):
     """Delays and standard deviations of a source, T epochs by K channels."""
 
     delays: Delays  #: Subtracted from the codes.
-    sigma_m: Floats  #: In the weights beside the receiver's noise, shape (T, K).
+    sigma_m: Floats  #: Standard deviation in the weights in addition to the receiver's noise, shape (T, K).
     #: Standard deviation of satellites and atmosphere, and the part of it that is assumed by elevation alone; (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
-    base: BaseDifferences | None = None  #: What a base station subtracts.
+    base: BaseDifferences | None = None  #: Corrections subtracted from a base station.
     floor: Literal["added", "included"] = "added"  #: Whether `sigma_m` includes the error floor of the codes.
 
 
 class CorrectionSource(Protocol):
-    """Where satellite positions, clocks and delays of pseudoranges come from."""
+    """Source of satellite positions, clocks and delays of pseudoranges."""
 
     @property
     def navigation(self) -> Navigation:
@@ -66,8 +66,8 @@ def choose_ionosphere(
 ) -> tuple[Floats | None, float, tuple[str, ...]]:
     """Return Klobuchar coefficients, the sigma that they add to the vertical delay [m], and a note on a substitute.
 
-    Those of GPS, else of QZSS, else typical ones; None where the ionosphere is "off". Coefficients of BeiDou are made
-    for a model of its own.
+    Coefficients of GPS, or of QZSS, or typical ones; None where the ionosphere is "off". BeiDou's coefficients are for
+    a different model.
     """
     if ionosphere == "off":
         return None, 0.0, ()
@@ -89,10 +89,11 @@ class BroadcastSource:
 
     navigation: Navigation
     klobuchar: Floats | None  #: None leaves the ionosphere uncorrected; shape (8,).
-    ionosphere_sigma_m: float = 0.0  #: Of the vertical delay, by coefficients that were not received.
+    #: Standard deviation of the vertical delay with coefficients that were not received.
+    ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
     nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed errors of satellites and atmosphere.
-    notes: tuple[str, ...] = ()  #: Data that were asked for, and the data used in their place.
+    notes: tuple[str, ...] = ()  #: Requested data, and the data used instead.
     second: Literal["none", "optional", "required"] = "optional"
 
     @classmethod

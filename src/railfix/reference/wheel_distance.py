@@ -22,7 +22,7 @@ _FASTEST_MPS: Final = 150.0  #: Highest plausible speed [m/s].
 
 @dataclass(frozen=True, kw_only=True)
 class Wheel:
-    """A tachometer with the distance of one pulse."""
+    """A tachometer with its distance per pulse."""
 
     pulses: Pulses
     pulse_m: float
@@ -54,8 +54,8 @@ def _cumulate(run: Floats, step: Floats) -> Floats:
     known = np.isfinite(step)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
     open_ = np.isnan(run)
-    # An instant between two unknown steps belongs to no stretch; one at the edge of a stretch stays with it, and
-    # the first instant after a hole is given up so that no difference spans it.
+    # An instant between two unknown steps belongs to no stretch; an instant at the edge of a stretch belongs to it. The
+    # first instant after a gap is dropped so that no difference spans the gap.
     open_[1:] |= ~known
     return np.where(open_, np.nan, total)
 

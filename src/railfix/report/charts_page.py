@@ -11,7 +11,7 @@ from functools import partial
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
@@ -27,9 +27,11 @@ from railfix.core.tables import Table, number, plural, share
 from railfix.core.timescale import seconds
 from railfix.report.plots.chart import Cells, Chart, Layer, Points, SkyEpochs
 from railfix.report.plots.network import network_frame, network_plan
-from railfix.track.network import Network
-from railfix.track.network_match import Matched, PlanLog
-from railfix.track.network_read import NetworkQuality
+
+if TYPE_CHECKING:
+    from railfix.track.network import Network
+    from railfix.track.network_match import Matched, PlanLog
+    from railfix.track.network_read import NetworkQuality
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 #: Unknown value of an unsigned 16-bit number.

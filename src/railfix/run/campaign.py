@@ -7,10 +7,12 @@ together are one hive-partitioned data set: ``pl.scan_parquet(out / "runs/**/pos
 from __future__ import annotations
 
 import re
+import signal
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass, replace
+from multiprocessing import parent_process
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -176,7 +178,7 @@ def position_runs(
     began, results, kept = clock.perf_counter(), {}, 0
     (out / "runs").mkdir(parents=True, exist_ok=True)
     first = sorted(range(len(runs)), key=lambda number: not (runs[number].out / "run.json").exists())
-    futures = {executor.submit(position_run, runs[number]): number for number in first}
+    futures = {executor.submit(position_or_end, runs[number]): number for number in first}
     for count, future in enumerate(as_completed(futures), start=1):
         number, is_kept = futures[future], False
         try:
@@ -193,6 +195,17 @@ def position_runs(
     table = pl.DataFrame([results[number] for number in range(len(runs))], infer_schema_length=None)
     write_whole(out / "campaign.csv", table.write_csv(), what="table of the campaign")
     return table
+
+
+def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
+    """Position one run; a worker process that is interrupted meanwhile ends, once the run has removed its folder."""
+    try:
+        return position_run(run)
+    except SystemExit:
+        if parent_process() is None:
+            raise
+        signal.raise_signal(signal.SIGKILL)
+        raise
 
 
 def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import codecs
 import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -14,29 +13,29 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
-from railfix.core.files import LENIENT, ending
-from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.files import LENIENT
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.gnss.observations import Observations
+from railfix.io.file_kind import KIND_WORDS, MAPS, POSITIONS, FileKind, find_kind, has_times
 from railfix.io.logs import read_navigation, scan_observations
-from railfix.io.positions import header_line, position_kind, read_positions
-from railfix.io.receiver.framing import is_receiver_log, read_head
+from railfix.io.mate import mate_table
+from railfix.io.positions import read_positions
+from railfix.io.sp3 import read_sp3
 from railfix.pipeline.config import Config
+from railfix.ranges.sbas.files import read_sbas
 from railfix.run.checks import RECORD_REACH, Span, navigation_span, spans_apart
+from railfix.track.network_read import connect_network, is_route
 from railfix.track.quality import check_track, error_note
-from railfix.track.read import read_track
+from railfix.track.read import read_segments
+from railfix.track.route import NO_HEIGHTS, MapReading, check_order, join
 from railfix.track.track import ANOTHER_PLACE_M
-from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
 from railfix.track.vehicle import read_vehicle
 
 _SECOND: Final = np.timedelta64(1, "s")
 _MOST_NOTES: Final = 5  #: Notes on one file that are shown.
-#: Endings of track maps in other forms than tables.
-MAP_ENDINGS: Final = (*VECTOR_ENDINGS, ".geojson", ".json", ".ifc", ".xml", ".landxml", ".railml")
-
-#: Words in the header of a table of positions that one of a track map has not.
-_OF_POSITIONS: Final = ("time", "unix", "tow", "quality", "sigma_north", "antenna")
-
-Kind = Literal["observations", "navigation", "track", "vehicle", "settings", "positions", "unknown"]
+Kind = Literal[
+    "observations", "navigation", "orbits", "sbas", "track", "vehicle", "settings", "positions", "unknown"
+]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +97,8 @@ def examine_files(paths: Sequence[Path]) -> Diagnosis:
 
 def _examine(path: Path) -> FileFinding:
     """Return what a file is: its content decides the kind, and the reader of that kind says what is wrong with it."""
-    kinds = _find_kinds(path)
     errors: list[str] = []
+    kinds = _find_kinds(path)
     for kind in kinds:
         try:
             return _READERS[kind](path)
@@ -107,30 +106,22 @@ def _examine(path: Path) -> FileFinding:
             errors.append(str(error))
             if "--date" in str(error):  # the kind is known, the date is not
                 return FileFinding(path=path, kind=kind, facts=(), problems=(errors[-1],))
-    if len(kinds) == 1:
-        return FileFinding(path=path, kind=kinds[0], facts=(), problems=(errors[0],))
-    return FileFinding(path=path, kind="unknown", facts=tuple(errors))
+    kind = "unknown" if len(kinds) > 1 else kinds[0]
+    return FileFinding(path=path, kind=kind, facts=(), problems=(errors[0],))
 
 
-def _find_kinds(path: Path) -> list[Kind]:
-    """Return the kinds that a file can be of by its first bytes and its ending, the likely one first."""
-    if path.suffix.lower() == ".toml":
-        return ["vehicle", "settings"]
-    if ending(path) in MAP_ENDINGS:
-        return ["positions", "track"] if ending(path) == ".gpx" else ["track"]
-    head = read_head(path).removeprefix(codecs.BOM_UTF8)
-    first = head.decode("latin-1").split("\n")[0]
-    if first[60:80].strip() == "RINEX VERSION / TYPE":
-        return ["observations" if first[20:21].upper() == "O" else "navigation"]
-    if is_receiver_log(head):
-        return ["observations", "navigation", "positions"]
-    kind = position_kind(path)
-    if kind in ("nmea", "novatel", "rtklib"):
-        return ["positions"]
-    if kind == "csv":
-        names = header_line(head).lower()
-        return ["positions"] if any(word in names for word in _OF_POSITIONS) else ["track"]
-    return [*_READERS]
+def _find_kinds(path: Path) -> tuple[Kind, ...]:
+    """Return the kinds that a file can be of, the likely one first."""
+    kind = find_kind(path)
+    if kind == "table":
+        return ("positions",) if has_times(path) else ("track",)
+    if kind == "mate":
+        return ("observations",) if mate_table(path) == "S_GNSS_SAT" else ("track",)
+    return _KINDS.get(kind, ("unknown",))
+
+
+def _unknown(path: Path) -> FileFinding:
+    raise InputFileError(path, f"not recognised: it is {KIND_WORDS[find_kind(path)]}, and no command reads it")
 
 
 def _observations(path: Path) -> FileFinding:
@@ -194,7 +185,7 @@ def _needs_lenient(path: Path) -> bool:
 
 def _own_ephemerides(path: Path) -> tuple[int, Span] | None:
     """Return the number and the reference times of the ephemerides in a receiver's log; None without any."""
-    if not is_receiver_log(read_head(path)):
+    if find_kind(path) != "receiver":
         return None
     try:
         navigation = read_navigation([path])
@@ -220,31 +211,49 @@ def _navigation(path: Path) -> FileFinding:
 
 
 def _track(path: Path) -> FileFinding:
+    """Return what a track map is: one route, or a network of which a run finds the route; without heights, too."""
     options: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     try:
-        track = read_track([path])
+        segments = read_segments(path, MapReading())
     except (InputFileError, SettingsError) as error:
         if "--height-datum" not in str(error) and "height datum" not in str(error):
             raise
-        track = read_track([path], height_datum="ellipsoidal")
+        segments = read_segments(path, MapReading(height_datum="ellipsoidal"))
         options = ("--height-datum", "ellipsoidal")
         problems = (
             f"{path}: does not say above what its heights are; give --height-datum ellipsoidal, as in the command, "
             "or orthometric with --geoid",
         )
-    problems += tuple(f"{path}: {note}" for note in error_note(check_track(track)))
-    length = float(track.chainage_m[-1] - track.chainage_m[0])
-    low, high = float(np.min(track.height_m)), float(np.max(track.height_m))
-    facts = (
-        f"{len(track.height_m):,} points, {length:,.0f} m",
-        f"ellipsoidal heights from {low:.1f} to {high:.1f} m, given as {track.provenance.height_datum_used}",
-        f"frame {track.provenance.frame}",
-    )
-    place = track.ecef_m[len(track.ecef_m) // 2]
+    facts = []
+    if any(segment.height_datum == NO_HEIGHTS for segment in segments):
+        options = (*options, "--heights", "log")
+        facts.append("without heights: those of the log's own positions are taken (--heights log)")
+        segments = [replace(segment, height_m=np.zeros(len(segment.height_m))) for segment in segments]
+    else:
+        heights = np.concatenate([segment.height_m for segment in segments])
+        datum = ", ".join(dict.fromkeys(segment.height_datum for segment in segments))
+        facts.append(f"ellipsoidal heights from {heights.min():.1f} to {heights.max():.1f} m, given as {datum}")
+    try:
+        check_order(segments)
+    except InputFileError as error:
+        problems += (str(error),)
+    if is_route(segments):
+        track = join(segments)
+        points, length = len(track), float(track.chainage_m[-1] - track.chainage_m[0])
+        problems += tuple(f"{path}: {note}" for note in error_note(check_track(track)))
+    else:
+        network = connect_network(segments, [path])
+        points, length = sum(len(part.height_m) for part in segments), float(network.length_m.sum())
+        facts.append(f"a network of {len(network.tracks)} tracks, of which a run finds the route")
+    middle = segments[len(segments) // 2]
+    row = len(middle.height_m) // 2
+    place = ecef_from_geodetic(middle.latitude_deg[row], middle.longitude_deg[row], middle.height_m[row])
+    facts = [f"{points:,} points, {length:,.0f} m", *facts, f"frame {middle.frame}"]
+    notes = [f"note: {note}" for note in dict.fromkeys(note for part in segments for note in part.notes)]
     return FileFinding(
-        path=path, kind="track", facts=(*facts, *_place_facts(place)), place_ecef_m=place, options=options,
-        problems=problems,
+        path=path, kind="track", facts=(*facts, *_place_facts(place), *notes[:_MOST_NOTES]), place_ecef_m=place,
+        options=options, problems=problems,
     )  # fmt: skip
 
 
@@ -279,12 +288,38 @@ def _settings(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="settings", facts=(f"changed: {', '.join(changed) or 'nothing'}",))
 
 
-#: What reads each kind of file, in the order in which a file is tried.
+def _orbits(path: Path) -> FileFinding:
+    orbits = read_sp3(path)
+    step = float(np.median(np.diff(orbits.time)) / _SECOND)
+    facts = (
+        f"{len(orbits.satellite)} satellites, one position every {step:g} s",
+        *(f"note: {n}" for n in orbits.notes),
+    )
+    return FileFinding(path=path, kind="orbits", facts=facts, span=(orbits.time[0], orbits.time[-1]))
+
+
+def _sbas(path: Path) -> FileFinding:
+    messages = read_sbas(path, broken_lines="count")
+    facts = (f"{len(messages):,} messages of PRN {', '.join(map(str, np.unique(messages.prn)))}",)
+    return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
+
+
+#: What a file of each kind can be for railfix.
+_KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
+    "observations": ("observations",), "navigation": ("navigation",), "sp3": ("orbits",), "sbas": ("sbas",),
+    "receiver": ("observations", "navigation", "positions"), "gpx": ("positions", "track"),
+    "toml": ("vehicle", "settings"), **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
+    **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
+}  # fmt: skip
+#: What reads each kind of file.
 _READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
     "positions": _positions,
     "track": _track,
+    "orbits": _orbits,
+    "sbas": _sbas,
+    "unknown": _unknown,
     "vehicle": _vehicle,
     "settings": _settings,
 }
@@ -294,7 +329,7 @@ def _place_facts(ecef_m: Floats) -> tuple[str, ...]:
     if not np.isfinite(ecef_m).all():
         return ()
     latitude, longitude, height = (float(value) for value in geodetic_from_ecef(ecef_m))
-    return (f"near latitude {latitude:.4f}, longitude {longitude:.4f}, height {height:.0f} m",)
+    return (f"near latitude {latitude:.4f}, longitude {longitude:.4f}, height {round(height)} m",)
 
 
 def _filter(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
@@ -304,10 +339,6 @@ def _filter(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
 def _problems(findings: Sequence[FileFinding]) -> list[str]:
     """Return what does not fit together, and what is missing for a run, a sentence each."""
     problems = [problem for finding in findings for problem in finding.problems]
-    problems += [
-        f"{finding.path}: not recognised: {finding.facts[0] if finding.facts else 'no reader takes it'}"
-        for finding in _filter(findings, "unknown")
-    ]
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     readable = [log for log in logs if log.span is not None]
     navigation = [finding for finding in findings if finding.ephemerides is not None or finding.kind == "navigation"]
@@ -356,8 +387,11 @@ def _command(findings: Sequence[FileFinding]) -> str:
         words += [option, str(log.path)]
     words += [word for finding in navigation for word in ("--nav", str(finding.path))]
     words += [word for finding in tracks for word in ("--track", str(finding.path))]
-    options: dict[Kind, str] = {"vehicle": "--vehicle", "settings": "--config"}
-    for kind, option in options.items():
-        words += [word for finding in _filter(findings, kind)[:1] for word in (option, str(finding.path))]
+    options: dict[Kind, tuple[str, int]] = {
+        "orbits": ("--sp3", len(findings)), "sbas": ("--sbas", len(findings)), "vehicle": ("--vehicle", 1),
+        "settings": ("--config", 1),
+    }  # fmt: skip
+    for kind, (option, most) in options.items():
+        words += [word for finding in _filter(findings, kind)[:most] for word in (option, str(finding.path))]
     words += list(dict.fromkeys(word for finding in findings for word in finding.options))
     return shlex.join([*words, "--out", "results"])

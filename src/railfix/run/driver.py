@@ -128,7 +128,7 @@ def run_files(
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
         verdict = judge_run(record)
-        if not any(antenna.leading.positions for antenna in verdict.antennas):
+        if not any(antenna.is_usable for antenna in verdict.antennas):
             of_map = [note for note in notes if ": the map " in note]
             raise NoPositionError(f"not one position is promised: {'; '.join([*verdict.lines(), *of_map])}")
         folder.write_json("run.json", record)

@@ -15,8 +15,8 @@ from pydantic import Field, field_validator, model_validator
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import BrokenLines, Reader, fingerprint
 from railfix.core.settings import INPUTS, Settings, option
+from railfix.io.file_kind import find_kind
 from railfix.io.position_log import column_names
-from railfix.io.receiver.framing import is_receiver_log, read_head
 from railfix.pipeline.config import Config
 from railfix.run.mate_folder import find_inputs
 from railfix.run.output import Overwrite
@@ -67,7 +67,7 @@ class InputFiles(Settings):
         if not cls.own_navigation or not isinstance(values, dict) or values.get("nav"):
             return values
         logs = [Path(path) for name in cls.own_navigation for path in values.get(name) or ()]
-        own = tuple(path for path in logs if path.is_file() and is_receiver_log(read_head(path)))
+        own = tuple(path for path in logs if path.is_file() and find_kind(path) == "receiver")
         if logs and not own:
             raise ValueError("--nav is missing; name the navigation file, which RINEX observations need")
         return {**values, "nav": own}
@@ -197,7 +197,7 @@ class RunInputs(InputFiles):
         """
         if config.sbas != "stream":
             return config
-        logs = tuple(path for paths in self.logs.values() for path in paths if is_receiver_log(read_head(path)))
+        logs = tuple(path for paths in self.logs.values() for path in paths if find_kind(path) == "receiver")
         if not logs:
             raise SettingsError("sbas = stream: RINEX logs carry no SBAS messages; name a log of them (--sbas FILE)")
         return config.replaced(sbas=logs)

@@ -18,9 +18,9 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
+from railfix.io.file_kind import POSITIONS, find_kind, wrong_kind
 from railfix.io.logs import read_navigation
-from railfix.io.positions import position_kind, read_positions
-from railfix.io.receiver.framing import is_receiver_log, read_head
+from railfix.io.positions import read_positions
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
@@ -231,14 +231,16 @@ def survey_files(
     of_nav: Navigation | None = None
     for path in paths:
         try:
-            kind = position_kind(path)
-            if kind not in ("", "receiver"):
-                of_file = columns if kind == "csv" else None
+            kind = find_kind(path)
+            if kind in POSITIONS and kind != "receiver":
+                of_file = columns if kind == "table" else None
                 log = read_positions(path, columns=of_file, **reading.arguments)
                 notes += log.notes
                 runs.append(run_of_log(log, limits))
                 continue
-            own = not nav and is_receiver_log(read_head(path))
+            if kind not in ("observations", "receiver", "mate"):
+                raise wrong_kind(path, "a log of positions or observations")
+            own = not nav and kind == "receiver"
             if not nav and not own:
                 message = "is a log of observations, which needs navigation files: give --nav"
                 raise InputFileError(path, message)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Strings, join_rows
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import read_bytes
 from railfix.core.tables import reading_table
 from railfix.io.mate import mate_table
 from railfix.motion.samples import GroundUnits, ListedBalises, Samples, SensorSamples
@@ -241,7 +242,7 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
             table = pl.read_parquet(path)
         else:
             table = pl.read_csv(
-                path,
+                read_bytes(path),
                 schema_overrides={"time_gpst": pl.Datetime("ns"), **dict.fromkeys(_NAMES, pl.String())},
                 infer_schema_length=None,
                 comment_prefix="#",

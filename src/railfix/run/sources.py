@@ -28,6 +28,7 @@ from railfix.run.route import RouteOfLog
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
 from railfix.track.read import check_heights, read_segments, track_of_segments
+from railfix.track.route import check_order
 from railfix.track.track import HEIGHTS_M
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
@@ -169,6 +170,7 @@ def _read_line(
         "geoid": reading.geoid, "height_datum": reading.height_datum, "sigma_height_m": reading.height_sigma
     }  # fmt: skip
     check_heights(segments, heights, **options)
+    check_order(segments)
     route = None
     if len(track) == 1 and len(segments) > 1:
         from railfix.track.network_read import connect_network, is_route

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
+#: Causes that leave the question whether the map is right.
+_MAP_IN_QUESTION: Final = (Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.CONTRADICTED)
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
 
@@ -166,14 +168,19 @@ class AntennaTally:
             self.tag_error_s = float(np.fmin(low, error.min())), float(np.fmax(high, error.max()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
-        """Keep the window that contradicts the map most."""
-        offset = result.map_offset
+        """Keep the window that contradicts the map most, where nothing else explains it (`suspicion`)."""
+        offset, interference = result.map_offset, result.interference
         if not np.isfinite(offset.statistic).any():
             return
         least, largest = np.nanmin(offset.detectable_m, axis=0), np.nanmax(offset.detectable_m, axis=0)
         known = self.map_detectable_m
         self.map_detectable_m = np.stack([np.fmin(known[0], least), np.fmax(known[1], largest)])
-        worst = int(np.nanargmax(offset.statistic))
+        own = np.full(len(result.time), True)
+        if interference is not None:
+            own = np.isin(interference.suspicion, _MAP_IN_QUESTION)
+        if not np.isfinite(offset.statistic[own]).any():
+            return
+        worst = int(np.nanargmax(np.where(own, offset.statistic, np.nan)))
         if self.map_offset is None or offset.statistic[worst] > self.map_offset.statistic:
             names = ("across_m", "up_m", "across_sigma_m", "up_sigma_m", "statistic")
             values = {name: float(getattr(offset, name)[worst]) for name in names}

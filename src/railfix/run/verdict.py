@@ -53,6 +53,12 @@ class AntennaVerdict:
         """Return the figures that stand first: those of the filter, or of single epochs without it."""
         return self.filter or self.single_epochs
 
+    @property
+    def is_usable(self) -> bool:
+        """Return whether any position lies on the map."""
+        off_map = 0 if self.filter is not None else self.leading.statuses.get(Status.OFF_MAP.text, 0)
+        return self.leading.positions > off_map
+
     def figures(self) -> Iterator[tuple[str, str, str]]:
         """Yield the name of each figure, its leading value, and that of single epochs where the filter leads."""
         texts: dict[str, Callable[[PositionFigures], str]] = {

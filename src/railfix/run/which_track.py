@@ -272,15 +272,17 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     if options.base_place is not None:
         base = _observations(inputs.base, options), parse_position(options.base_place, "--base-place")
     codes: list[StandstillCodes] = []
+    notes = [*navigation.notes]
     for paths in (inputs.front, inputs.rear):
         if paths:
+            observations = _observations(paths, options)
+            notes += observations.problems
             origin = codes[0].origin_ecef_m if codes else None
-            codes.append(
-                standstill_codes(_observations(paths, options), navigation, config, base=base, origin_ecef_m=origin)
-            )
+            codes.append(standstill_codes(observations, navigation, config, base=base, origin_ecef_m=origin))
     reading = options.reading
     network = read_network(inputs.map, replace(reading.of_map, height_datum=reading.height_datum or "ellipsoidal"))
-    origin, notes = codes[0].origin_ecef_m, list(network.notes)
+    origin = codes[0].origin_ecef_m
+    notes += network.notes
     if options.same_frame == "no":
         place, shift = in_map_frame(
             origin[None], network.frame, codes[0].time[0], **reading.motion,

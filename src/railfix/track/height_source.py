@@ -14,6 +14,7 @@ from railfix.core.arrays import Floats, places_in_groups
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.io.file_kind import find_kind
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
@@ -72,7 +73,7 @@ def with_heights(
         return _from_positions(track, source, sigma_m, reach_m=np.inf)
     if ending(source) in RASTERS:
         return _from_raster(track, source, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
-    if ending(source) == ".csv":
+    if find_kind(source) == "table":
         table = read_named_columns(source)
         by_place = {"chainage_m", "kilometrage_m"} & set(table.cells)
         if by_place and not {"latitude_deg", "x_m"} & set(table.cells):

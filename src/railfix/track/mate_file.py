@@ -20,7 +20,7 @@ import polars as pl
 
 from railfix.core.arrays import cheapest_path
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, text_lines
+from railfix.core.files import FilePath
 from railfix.io.mate import mate_table, read_mate
 from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import choose_crs
@@ -35,9 +35,9 @@ _POINT: Final = ("TRACK_EDGE_ID", "POSITION", *_NUMBERS[:3])
 
 
 def read_edges(path: Path, reading: MapReading) -> list[Segment]:
-    """Read the edges of S_DM_TRACKPOINT, or S_DM_TRACK_SEGMENT_POSITION in Parquet, by default in ETRS89."""
+    """Read the edges of S_DM_TRACKPOINT, by default in ETRS89, or those of S_DM_TRACK_SEGMENT_POSITION."""
     if mate_table(path) != "S_DM_TRACKPOINT":
-        return read_mate_segments(path, reading)
+        return _read_segments(path, reading)
     table = read_mate(path, _POINT).sort("TRACK_EDGE_ID", "POSITION", maintain_order=True)
     edges = table.group_by("TRACK_EDGE_ID", maintain_order=True)
     return [_segment_of_points(path, str(key[0]), rows, reading) for key, rows in edges]
@@ -75,13 +75,7 @@ _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
 
-def is_mate(path: FilePath) -> bool:
-    """Return whether a CSV is a table of positions of track segments, by its header."""
-    head = next(iter(text_lines(path)), "").upper()
-    return "TRACK_EDGE_ID" in head and "TRACK_SEGMENT_TYPE" in head
-
-
-def read_mate_segments(path: FilePath, reading: MapReading) -> list[Segment]:
+def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the edges of the tables as segments, in the order of the file; InputFileError where they do not meet."""
     gradients, cants = (_rows(path, name) for name in (_GRADIENT, _CANT))
     found = []

@@ -14,13 +14,13 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending, read_text
+from railfix.core.files import FilePath, read_text
+from railfix.io.file_kind import find_kind
 from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
 from railfix.track.read import read_segments
-from railfix.track.route import MapReading, Segment, first_gap, orient
+from railfix.track.route import MapReading, Segment, check_order, first_gap, orient
 from railfix.track.vector_file import CROSSING, read_layers
-from railfix.track.xml_files import FORMATS as RDF_FORMATS
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
 TOLERANCE_M: Final = 0.5  #: Ends nearer than this are one point, where the file states no connection [m].
@@ -34,6 +34,7 @@ def read_network(
     """Read a network from map files, connected as they state, else where ends, or an end and a track, meet."""
     of_file = replace(reading or MapReading(), duplicates="keep")
     tracks = [track for path in paths for track in read_segments(path, of_file)]
+    check_order(tracks)
     return connect_network(tracks, paths, tolerance_m=tolerance_m)
 
 
@@ -84,13 +85,12 @@ def _of_nodes(tracks: list[Segment]) -> Network:
 
 def _relations(path: FilePath) -> list[Relation]:
     """Return connections that a file states, empty where it states none."""
-    if ending(path) in (".xml", ".railml"):
+    kind = find_kind(path)
+    if kind == "xml":
         return read_railml_relations(path)
-    if ending(path) in RDF_FORMATS:
+    if kind == "rdf":
         return read_rinf_relations(path)
-    if ending(path) not in (".geojson", ".json", ".gpkg", ".fgb"):
-        return []
-    if "json" in ending(path) and RELATION not in read_text(path):
+    if kind not in ("geojson", "gpkg", "fgb") or (kind == "geojson" and RELATION not in read_text(path)):
         return []
     relations = []
     for _, rows, _ in read_layers(path, geometry="none"):

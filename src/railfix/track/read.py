@@ -12,16 +12,14 @@ import numpy as np
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending
-from railfix.io.mate import mate_table
+from railfix.io.file_kind import GDAL, find_kind, wrong_kind
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum
 from railfix.track.point_files import read_csv_segment, read_geojson_segments
 from railfix.track.route import MAX_GAP_M, NO_HEIGHTS, MapOptions, MapReading, Segment, join
 from railfix.track.track import SIGMA_PLAN_M, Track
-from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
 from railfix.track.vector_file import SIGMA_M as OSM_SIGMA_M
 from railfix.track.vector_file import read_vector_segments
-from railfix.track.xml_files import FORMATS as RDF_FORMATS
 from railfix.track.xml_files import read_rinf_segments
 
 
@@ -174,31 +172,29 @@ def _with_accuracy(segment: Segment, sigma_m: float, *notes: str) -> Segment:
 
 
 def _read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
-    if mate_table(file) and (mate_table(file) == "S_DM_TRACKPOINT" or ending(file) == ".parquet"):
+    kind = find_kind(file)
+    if kind == "mate":
         from railfix.track.mate_file import read_edges
 
         return read_edges(Path(file), reading)
-    kind = ending(file)
-    if kind == ".csv":
-        from railfix.track.mate_file import is_mate, read_mate_segments
-
-        return read_mate_segments(file, reading) if is_mate(file) else [read_csv_segment(file, reading)]
-    if kind in RDF_FORMATS:
+    if kind == "table":
+        return [read_csv_segment(file, reading)]
+    if kind == "rdf":
         return read_rinf_segments(file, reading)
-    if kind in (".geojson", ".json"):
+    if kind == "geojson":
         return read_geojson_segments(file, reading)
-    if kind in VECTOR_ENDINGS:
+    if kind in ("kml", "gpx", "osm", *GDAL):
         return read_vector_segments(file, reading)
-    if kind == ".ifc":
+    if kind == "ifc":
         from railfix.track.ifc_file import read_ifc_segments
 
         return read_ifc_segments(file, reading)
-    if kind in (".xml", ".landxml", ".railml"):
+    if kind == "xml":
         from railfix.track.xml_files import read_xml_segments
 
         return read_xml_segments(file, reading)
-    raise InputFileError(
+    raise wrong_kind(
         file,
-        "a track map ends in .csv, .geojson or .json, .ifc, .xml, .landxml, .railml, "
-        + ", ".join((*VECTOR_ENDINGS, *RDF_FORMATS)),
+        "a track map (a table, GeoJSON, KML, GPX, OpenStreetMap, LandXML, railML, IFC, RDF of RINF, GeoPackage, "
+        "Shapefile, FlatGeobuf, GML or DXF)",
     )

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypedDict
+from typing import Any, Final, TypedDict
 
 import numpy as np
 
@@ -118,6 +118,24 @@ def _ends(segments: Sequence[Segment]) -> Floats:
     columns = ("latitude_deg", "longitude_deg", "height_m")
     ends = np.array([[getattr(s, name)[[0, -1]] for name in columns] for s in segments])
     return ecef_from_geodetic(ends[:, 0], ends[:, 1], np.nan_to_num(ends[:, 2]))
+
+
+#: Fraction of the points at which a line of trains may turn back, as it does where they reverse.
+_MOST_BACK: Final = 0.05
+
+
+def check_order(segments: Iterable[Segment]) -> None:
+    """Raise InputFileError where the points of a segment are not in their order along a line."""
+    for segment in segments:
+        points = ecef_from_geodetic(segment.latitude_deg, segment.longitude_deg, np.zeros(len(segment.latitude_deg)))
+        steps = np.diff(points, axis=0)
+        back = int(np.count_nonzero(np.einsum("ij,ij->i", steps[1:], steps[:-1]) < 0.0))
+        if back > max(_MOST_BACK * len(points), 3):
+            raise InputFileError(
+                segment.source,
+                f"the direction turns by more than 90 degrees at {back} of {len(points)} points, which are not in the "
+                "order of the line; sort them (railfix map check shows where)",
+            )
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:

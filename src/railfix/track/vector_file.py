@@ -21,7 +21,9 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending, open_stream, unpacked_file
+from railfix.core.files import FilePath, open_stream, unpacked_file
+from railfix.io.file_kind import KIND_WORDS, find_kind
+from railfix.io.xml_lines import read_gpx_lines, read_kml_lines
 from railfix.track.crs import choose_crs, unit_of_heights
 from railfix.track.georeference import georeference
 from railfix.track.heights import check_height_datum, heights_of_file
@@ -218,10 +220,7 @@ def _ways(
     return [*found, *short]
 
 
-#: Endings of files that are read here.
-ENDINGS: Final = (".gpkg", ".shp", ".fgb", ".gml", ".gpx", ".kml", ".dxf", ".osm", ".pbf")
 INSTALL: Final = "install it with: pip install 'railfix[maps]'"
-_LOOKED_AT: Final = 1 << 20  #: Bytes of a text file that are looked at before GDAL reads it.
 _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns that name a line, in this order.
 
 
@@ -231,8 +230,8 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
         import pyogrio
         import shapely
     except ImportError:
-        raise InputFileError(path, f"reading {ending(path)} maps needs pyogrio and shapely; {INSTALL}") from None
-    _check_text(path)
+        what = KIND_WORDS[find_kind(path)]
+        raise InputFileError(path, f"is {what}, which pyogrio and shapely read; {INSTALL}") from None
     layers = []
     try:
         with warnings.catch_warnings():
@@ -256,21 +255,6 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
     except (pyogrio.errors.DataSourceError, pyogrio.errors.FeatureError) as error:
         raise InputFileError(path, f"GDAL cannot read this file ({str(error).splitlines()[0]})") from None
     return layers
-
-
-def _check_text(path: FilePath) -> None:
-    """Reject coordinates that GDAL reads as others: decimal commas, heights above the ground."""
-    kind = ending(path)
-    if kind not in (".gpx", ".kml"):
-        return
-    with open_stream(path, content="bytes") as stream:
-        text = stream.read(_LOOKED_AT)
-    if comma := re.search(rb"""\bl(?:at|on)\s*=\s*["'][-+\d]+,\d*""", text):
-        raise InputFileError(path, f"{comma[0].decode()}: has a comma in a number; a point was expected")
-    if mode := re.search(rb"<altitudeMode>\s*(relativeTo\w+|clampTo\w+)\s*<", text):
-        raise InputFileError(
-            path, f"its altitudeMode is {mode[1].decode()}, no height of the track; write absolute heights or none"
-        )
 
 
 def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
@@ -297,10 +281,14 @@ def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 def _features(
     path: FilePath,
 ) -> Iterator[tuple[str | None, list[dict[str, Any]], list[list[Floats]], list[tuple[str, ...]]]]:
-    """Yield CRS, columns, lines and ids of nodes of the features of each layer; of OSM XML without GDAL, which needs
-    sorted nodes.
-    """
-    if ending(path) == ".osm":
+    """Yield CRS, columns, lines and ids of nodes of the features of each layer; KML, GPX, OSM XML without GDAL."""
+    kind = find_kind(path)
+    if kind in ("kml", "gpx"):
+        found = read_kml_lines(path) if kind == "kml" else read_gpx_lines(path)
+        points = [line.points if np.isfinite(line.points[:, 2]).any() else line.points[:, :2] for line in found]
+        yield "EPSG:4326", [line.fields for line in found], [[own] for own in points], [()] * len(points)
+        return
+    if kind == "osm":
         ways = read_osm_xml(path)
         yield "EPSG:4326", [way.row for way in ways], [[way.points_deg] for way in ways], [way.nodes for way in ways]
         return

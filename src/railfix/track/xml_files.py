@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, ending, file_sha256, read_bytes
+from railfix.core.files import FilePath, file_sha256, read_bytes
 from railfix.track.crs import choose_crs
 from railfix.track.landxml_file import finite_number, read_landxml_segments
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
@@ -123,8 +123,6 @@ def read_railml_relations(path: FilePath) -> list[Relation]:
     return relations
 
 
-#: Endings of RDF, and the format of each.
-FORMATS: Final = {".ttl": "turtle", ".rdf": "xml", ".nt": "nt", ".jsonld": "json-ld"}
 _ERA: Final = "http://data.europa.eu/949/"
 _GEO: Final = "http://www.opengis.net/ont/geosparql#"
 _LABEL: Final = "http://www.w3.org/2000/01/rdf-schema#label"
@@ -193,12 +191,15 @@ def _parse(path: str, _: str) -> Graph:
     except ImportError:
         raise InputFileError(path, f"reading RDF needs rdflib; {INSTALL}") from None
     data = read_bytes(path)
+    begin = data.lstrip()[:5]
+    # N-Triples is a part of Turtle
+    name = "json-ld" if begin[:1] in (b"{", b"[") else "turtle" if begin[:1] != b"<" or begin == b"<http" else "xml"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of rdflib's own classes
-            return Graph().parse(data=data, format=FORMATS[ending(path)])
+            return Graph().parse(data=data, format=name)
     except Exception as error:  # noqa: BLE001 - each of rdflib's parsers has its own
-        raise InputFileError(path, f"this is no {FORMATS[ending(path)]} ({str(error).splitlines()[0]})") from None
+        raise InputFileError(path, f"this is no {name} ({str(error).splitlines()[0]})") from None
 
 
 def _all(graph: Graph, kind: str) -> list[Any]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from railfix.core.arrays import copy_with
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking import layout
 from railfix.tracking.chunk import Chunk, finish_chunk, prepare_chunk
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
@@ -74,7 +75,7 @@ class Recursion:
         """
         last = len(self.chunk.time) if trace is None else first + 1
         parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
-        done = self._run(state, first, last, layout.WHOLE, parents, trace)
+        done = self._run(state, first, last, ix.WHOLE, parents, trace)
         return done, done < last
 
     def search(self, state: TrackState, epoch: int, trace: list[Step] | None) -> None:
@@ -82,7 +83,7 @@ class Recursion:
         chunk = self.chunk
         if state.hypotheses:
             packed = pack_state(state, chunk.time[0], self.limits, levels=self.levels)
-            self.kernel(self.given, packed, self.results, _new_trace(0, 0, 0), (epoch, epoch + 1), layout.PREDICTION)
+            self.kernel(self.given, packed, self.results, _new_trace(0, 0, 0), (epoch, epoch + 1), ix.PREDICTION)
             unpack_state(state, packed, chunk.time[0])
         else:
             state.code_bias = np.where(chunk.fresh[epoch], 0.0, state.code_bias)
@@ -94,7 +95,7 @@ class Recursion:
             return
         if found.lost:
             state.bank = None
-        self._run(state, epoch, epoch + 1, layout.REST_LOST if found.lost else layout.REST, found, trace)
+        self._run(state, epoch, epoch + 1, ix.REST_LOST if found.lost else ix.REST, found, trace)
 
     def _run(self, state: TrackState, first: int, last: int, part: int, found: Sought, trace: list[Step] | None) -> int:
         """Run the recursion over epochs, change the state, and return the first epoch that is not done."""

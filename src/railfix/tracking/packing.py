@@ -10,6 +10,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.timescale import seconds, timedelta
 from railfix.kernels.tracking import constants, layout
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Records
 from railfix.tracking import bank
 from railfix.tracking.epochs import SensorEpochs
@@ -38,10 +39,10 @@ def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
 def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
     """Return wheel, radar, force, place, balises and ranges by column, `layout.SENSOR`; shape (T, C)."""
     ranges = sensors.ranges
-    columns = layout.RANGE_COLUMN + (0 if ranges is None else ranges.range_m.shape[1])
+    columns = ix.RANGE_COLUMN + (0 if ranges is None else ranges.range_m.shape[1])
     packed = np.zeros((len(time), columns), dtype=layout.SENSOR)
     packed["value"], packed["sigma"] = np.nan, 1.0
-    packed["unsigned"][:, layout.WHEEL_COLUMN] = sensors.wheel_sign == "unknown"
+    packed["unsigned"][:, ix.WHEEL_COLUMN] = sensors.wheel_sign == "unknown"
     for column, (value, sigma) in enumerate((
         (sensors.wheel_m, sensors.wheel_sigma_m),
         (sensors.radar_m, sensors.radar_sigma_m),
@@ -51,11 +52,11 @@ def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
         if value is not None and sigma is not None:
             packed["value"][:, column], packed["sigma"][:, column] = value, sigma
     if sensors.balises is not None:
-        balises, own = sensors.balises, packed[:, layout.PLACE_COLUMN + 1 : layout.RANGE_COLUMN]
+        balises, own = sensors.balises, packed[:, ix.PLACE_COLUMN + 1 : ix.RANGE_COLUMN]
         own["value"], own["sigma"] = balises.place_m, balises.sigma_m
         own["age_s"] = np.where(np.isfinite(balises.place_m), seconds(time[:, None] - balises.time), 0.0)
     if ranges is not None:
-        own = packed[:, layout.RANGE_COLUMN :]
+        own = packed[:, ix.RANGE_COLUMN :]
         own["value"], own["sigma"], own["age_s"] = ranges.range_m, ranges.sigma_m, ranges.age_s
         own["unit_ecef_m"], own["lever_m"] = ranges.unit_ecef_m, ranges.lever_m
     return packed

@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import CODE
+from railfix.kernels.tracking.index import CODE
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line

@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
-from railfix.kernels.tracking.layout import CLOCKS, OFFSETS, SATELLITES, StateIndex, record_of
+from railfix.kernels.tracking.index import CLOCKS, OFFSETS, SATELLITES, StateIndex
+from railfix.kernels.tracking.layout import record_of
 from railfix.tracking.epochs import Previous
 
 __all__ = [

@@ -8,57 +8,19 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from railfix import kernels
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array, masked_median
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kernel_array
 from railfix.core.channel_state import join_channels
-from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS, SPEED_OF_LIGHT
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.integrity.interference.limits import InterferenceLimits
+from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
+from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_time_tags, median_tag_error
 
-_TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Steps of receiver clocks by whole milliseconds are none of interference [m].
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
 _LEAST_FREEDOM: Final = 3  #: Redundant ranges or Dopplers that their noise is taken from: fewer can agree by chance.
 _LEAST_MPS: Final = 0.05  #: Least noise of Dopplers [m/s].
-_RIDGE: Final = 1e-9  #: Weight of the unknowns by themselves, for what a satellite is missing for.
-_RATE_MPS: Final = 500.0  #: Range rate of a satellite, by its order: unit of the column of the time tags [m/s].
-#: The error of the time tags is a median over so many epochs at most and at least, none older than the window.
-_TAG_EPOCHS: Final = 10
-_TAG_LEAST: Final = 3
-_TAG_WINDOW: Final = np.timedelta64(60, "s")
-_TAG_STEPS: Final = 4  #: Steps of the fit of the time tags.
-_TAG_LINEAR_S: Final = 0.05  #: Errors up to this need one step [s].
-_FITS_WELL: Final = 3.0  #: Residuals up to so many times the median one have their full weight.
-_ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])
 _SIZE: Final = 4  #: Unknowns that two constellations give by themselves: position and clock.
-
-
-class MotionInputs(NamedTuple):
-    """Ranges of one antenna: T epochs by K channels."""
-
-    time: Datetimes  #: Shape (T,).
-    break_before: Masks  #: Shape (T,).
-    channel: Strings  #: Shape (K,).
-    group: Indices  #: Receiver clock of each channel, shape (K,).
-    near_ecef_m: Floats  #: Position, right to some kilometres; NaN without one; shape (T, 3).
-    #: Shape (T, K, 3).
-    sat_ecef_m: Floats
-    sat_velocity_mps: Floats
-    code_m: Floats  #: As observed, shape (T, K).
-    rate_mps: Floats  #: ``-lambda D``, shape (T, K).
-    #: Shape (T, K).
-    corrected_code_m: Floats
-    sigma_m: Floats
-    used: Masks  #: Channels without a reason against them, shape (T, K).
-    noise_scale: Floats  #: Shape (T,).
-    #: Known offsets between the receiver clocks, and their sigmas; shape (T, G).
-    clock_offset_m: Floats
-    clock_sigma_m: Floats
-    off_line_m: Floats  #: Distance of the 3-D position from the line across it; NaN beyond an end; shape (T,).
-
-    def take(self, rows: slice | Indices) -> MotionInputs:
-        """Return those of some epochs."""
-        own = {n: values if n in ("channel", "group") else values[rows] for n, values in self._asdict().items()}
-        return MotionInputs(**own)
 
 
 class Fix(NamedTuple):
@@ -74,18 +36,6 @@ class Fix(NamedTuple):
         """Return those of some epochs."""
         time, ecef, sigma, velocity, velocity_sigma = self
         return Fix(time[rows], ecef[rows], sigma[rows], velocity[rows], velocity_sigma[rows])
-
-
-class TagErrors(NamedTuple):
-    """Errors of the time tags at single epochs and their standard deviations, shape (N,) each."""
-
-    time: Datetimes
-    error_s: Floats
-    sigma_s: Floats
-
-
-def _no_tags() -> TagErrors:
-    return TagErrors(np.zeros(0, dtype="datetime64[ns]"), np.zeros(0), np.zeros(0))
 
 
 def _no_fix() -> Fix:
@@ -111,7 +61,7 @@ class MotionSignState:
     position: Fix = field(default_factory=_no_fix)
     velocity: Fix = field(default_factory=_no_fix)
     on_map: bool = False  #: A position has been on the map.
-    tags: TagErrors = field(default_factory=_no_tags)  #: Of the last epochs.
+    tags: TagErrors = NO_TAGS  #: Of the last epochs.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +102,9 @@ class MotionFit(NamedTuple):
 
 def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
     """Return positions and velocities, and how far constellations are apart."""
-    linear = _misfit(inputs)
+    linear = misfit_at(inputs)
     parts = _parts(inputs, linear, limits.least_satellites - 1)
-    return MotionFit(fit_motion_fixes(inputs, linear), parts, *fit_time_tags(inputs, linear))
+    return MotionFit(fit_motion_fixes(inputs, linear), parts, *fit_time_tags(inputs))
 
 
 def motion_signs(
@@ -165,7 +115,7 @@ def motion_signs(
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
     fixes, part_sigmas, tag_error, tag_sigma = fitted or fit_motion(inputs, limits)
     tags = TagErrors(inputs.time, tag_error, tag_sigma)
-    median, sigmas, last_tags = _median_tag_error(tags, state.tags)
+    median, sigmas, last_tags = median_tag_error(tags, state.tags)
     position, last_position = _before(fixes, state.position, fixes.sigma_m <= limits.largest_sigma_m)
     velocity, last_velocity = _before(fixes, state.velocity, fixes.velocity_sigma_mps <= limits.largest_speed_sigma_mps)
     speed, speed_sigmas, drift, drift_sigmas = _speed_jump(fixes, velocity, limits)
@@ -192,17 +142,16 @@ def motion_signs(
 def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> Fix:
     """Return positions and velocities by least squares from all ranges together, no satellite excluded."""
     near, sight, misfit = linear
-    groups = np.arange(inputs.group.max(initial=-1) + 1)
-    clocks = (inputs.group[:, None] == groups).astype(np.float64)
+    clocks = clock_columns(inputs)
     design = np.concatenate([-sight, np.broadcast_to(clocks, (len(near), *clocks.shape))], axis=2)
     weight = np.where(inputs.used, 1.0 / inputs.sigma_m**2, 0.0)
-    step, covariance, scale = _fit(design, misfit, weight, least=_LEAST_FREEDOM)
+    step, covariance, scale = fit_epochs(design, misfit, weight, least=_LEAST_FREEDOM)
     scale = np.maximum(scale, inputs.noise_scale)
     moving = (sight * inputs.sat_velocity_mps).sum(axis=2)
     rate = inputs.rate_mps - moving
     known = inputs.used & np.isfinite(rate)
     ones = np.ones((*sight.shape[:2], 1))
-    velocity, of_velocity, noise = _fit(
+    velocity, of_velocity, noise = fit_epochs(
         np.concatenate([-sight, ones], axis=2), rate, known.astype(np.float64), least=_LEAST_FREEDOM
     )
     return Fix(
@@ -211,106 +160,9 @@ def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]
     )  # fmt: skip
 
 
-def fit_time_tags(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats]:
-    """Return the common error of the time tags, + where they are late, and its standard deviation, shape (T,) [s].
-
-    Satellites were where they are not at the tags: position, clocks and the error are fitted together, the column of
-    the error being the range rate of the satellites with its sign changed. Ranges that fit badly count less.
-    """
-    groups = np.arange(inputs.group.max(initial=-1) + 1)
-    clocks = (inputs.group[:, None] == groups).astype(np.float64)
-    error, sigma = np.full(len(inputs.time), np.nan), np.full(len(inputs.time), np.nan)
-    rows, late, moved = np.arange(len(inputs.time)), np.zeros(len(inputs.time)), inputs
-    for _ in range(_TAG_STEPS):
-        near, sight, misfit = linear
-        rate = (sight * moved.sat_velocity_mps).sum(axis=2)
-        columns = -sight, -rate[..., None] / _RATE_MPS, np.broadcast_to(clocks, (len(near), *clocks.shape))
-        design = np.concatenate(columns, axis=2)
-        weight = np.where(moved.used, 1.0 / moved.sigma_m**2, 0.0)
-        for _ in range(2):
-            step, covariance, scale = _fit(design, misfit, weight, least=1)
-            left = np.abs(misfit - (design @ step[..., None])[..., 0]) * np.sqrt(weight)
-            typical = masked_median(left, weight > 0)[:, None]
-            weight = weight / np.maximum(left / (_FITS_WELL * typical), 1.0) ** 2
-        late = late + step[:, 3] / _RATE_MPS
-        error[rows], sigma[rows] = late, np.maximum(scale, 1.0) * np.sqrt(covariance[:, 3, 3]) / _RATE_MPS
-        again = np.abs(step[:, 3]) > _TAG_LINEAR_S * _RATE_MPS
-        if not again.any():
-            break
-        rows, late = rows[again], late[again]
-        own = inputs.take(rows)
-        moved = _move_satellites(own, late)._replace(near_ecef_m=near[again] + step[again, :3])
-        linear = _misfit(moved)
-    return error, sigma
-
-
-def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
-    """Return the ranges with the satellites where they were `late_s` before, shape (T,)."""
-    place, velocity, before = inputs.sat_ecef_m, inputs.sat_velocity_mps, -late_s[:, None, None]
-    gravity = -GM_GPS / np.linalg.norm(place, axis=2, keepdims=True) ** 3 + EARTH_ROTATION_RATE**2 * _ACROSS_AXIS
-    coriolis = 2.0 * EARTH_ROTATION_RATE * np.stack([velocity[..., 1], -velocity[..., 0], 0.0 * velocity[..., 0]], 2)
-    acceleration = gravity * place + coriolis
-    return inputs._replace(
-        sat_ecef_m=place + velocity * before + 0.5 * acceleration * before**2,
-        sat_velocity_mps=velocity + acceleration * before,
-    )
-
-
-def _misfit(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
-    """Return positions (T, 3), unit vectors to the satellites (T, K, 3) and codes less ranges (T, K)."""
-    near = inputs.near_ecef_m
-    to_satellite = inputs.sat_ecef_m - near[:, None, :]
-    distance = np.linalg.norm(to_satellite, axis=2)
-    turn = inputs.sat_ecef_m[..., 0] * near[:, None, 1] - inputs.sat_ecef_m[..., 1] * near[:, None, 0]
-    return near, to_satellite / distance[..., None], inputs.corrected_code_m - distance - _TURN * turn
-
-
-def _fit(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[Floats, Floats, Floats]:
-    """Return solutions, covariances and noise scales of weighted least squares; NaN below `least` redundant."""
-    has = (weight > 0) & np.isfinite(value) & np.isfinite(design).all(axis=2)
-    rows = np.where(has[..., None], design, 0.0)
-    y, w = np.where(has, value, 0.0), np.where(has, weight, 0.0)
-    weighted = rows * w[..., None]
-    normal = rows.swapaxes(1, 2) @ weighted
-    unknown = np.diagonal(normal, axis1=1, axis2=2) > 0.0
-    size = design.shape[2]
-    ridge = np.where(unknown, _RIDGE, 1.0)
-    covariance = np.linalg.inv(normal + ridge[:, :, None] * np.eye(size))
-    solution = (covariance @ (weighted * y[..., None]).sum(axis=1)[..., None])[..., 0]
-    left = y - (rows @ solution[..., None])[..., 0]
-    freedom = has.sum(axis=1) - unknown.sum(axis=1)
-    redundant = (freedom >= least) & unknown[:, :3].all(axis=1)
-    scale = np.sqrt((w * left**2).sum(axis=1) / np.maximum(freedom, 1))
-    return np.where(redundant[:, None], solution, np.nan), covariance, np.where(redundant, scale, np.nan)
-
-
 def _length(covariance: Floats) -> Floats:
     """Return the square root of the first three variances together, shape (T,)."""
     return np.asarray(np.sqrt(covariance[:, :3, :3].trace(axis1=1, axis2=2)))
-
-
-def _median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
-    """Return the median error of the time tags over the last epochs, also in standard deviations, and those to keep.
-
-    The standard deviation is the median one of the epochs, or that of their spread where it is larger. NaN for fewer
-    than `_TAG_LEAST` epochs.
-    """
-    tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
-    lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))
-    time, error, sigma = (
-        np.lib.stride_tricks.sliding_window_view(np.concatenate([a, b]), _TAG_EPOCHS)[len(before.time) :]
-        for a, b in zip(lead, tags, strict=True)
-    )
-    known = (now.time[:, None] - time <= _TAG_WINDOW) & np.isfinite(error)
-    known &= known.sum(axis=1, keepdims=True) >= _TAG_LEAST
-    median = masked_median(error, known)
-    spread = 1.4826 * masked_median(np.abs(error - median[:, None]), known)
-    typical = masked_median(sigma, known)
-    return (
-        median,
-        np.abs(median) / np.maximum(typical, spread),
-        TagErrors._make(each[1 - _TAG_EPOCHS :] for each in tags),
-    )
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
@@ -377,7 +229,7 @@ def _parts(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats], least: i
     weight = np.where(used & enough[..., None], 1.0 / inputs.sigma_m**2, 0.0)
     weight = weight.reshape(clocks * epochs, used.shape[2])
     rows = np.tile(np.arange(epochs), clocks)
-    step, covariance, scale = _fit(design[rows], misfit[rows], weight, least=1)
+    step, covariance, scale = fit_epochs(design[rows], misfit[rows], weight, least=1)
     covariance = covariance * (np.maximum(scale, inputs.noise_scale[rows]) ** 2)[:, None, None]
     step[:, 3] -= inputs.clock_offset_m.T.ravel()
     covariance[:, 3, 3] += inputs.clock_sigma_m.T.ravel() ** 2

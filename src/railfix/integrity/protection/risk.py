@@ -27,11 +27,6 @@ from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 
-K_H_PA: Final = 6.0  #: RTCA DO-229D appendix J, horizontal, precision approach: one dimension, 2e-9 an approach.
-#: RTCA DO-229D appendix J, horizontal, en route to non-precision approach: two dimensions (Rayleigh), 5e-9 a sample.
-K_H_NPA: Final = 6.18
-K_V: Final = 5.33  #: RTCA DO-229D appendix J, vertical: one dimension, two-sided 1e-7.
-
 #: Probability that a satellite is faulty at a time: 1e-5 an hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
 #: Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the Galileo service definition after it); the
 #: others as Galileo, for want of a commitment that is as old.

@@ -14,6 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, ByteStream, FilePath
 from railfix.gnss.observations import ObservationHeader
+from railfix.io.file_kind import wrong_kind
 from railfix.io.rinex.observations_epochs import FaultLog
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_columns
 
@@ -26,17 +27,6 @@ _MAX_HEADER_BYTES: Final = 4 << 20
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
 #: Names of time systems that programs write otherwise.
 _OTHER_NAMES: Final = {"GPST": "GPS", "BDS": "BDT", "GLONASS": "GLO", "GALILEO": "GAL", "QZSS": "QZS"}
-_FILE_TYPES: Final = {
-    "N": "a RINEX navigation file; give it with --nav",
-    "G": "a RINEX navigation file (GLONASS); give it with --nav",
-    "H": "a RINEX navigation file (SBAS); give it with --nav",
-    "L": "a RINEX navigation file (Galileo); give it with --nav",
-    "J": "a RINEX navigation file (QZSS); give it with --nav",
-    "E": "a RINEX navigation file (Galileo); give it with --nav",
-    "B": "a RINEX file of SBAS broadcast data",
-    "M": "a RINEX meteorological file",
-    "C": "a RINEX clock file",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +65,9 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
         block = stream.read(1 << 16)
         data += block
         if len(data) >= 80 or not block:
-            _check_kind(stream.path, data[:200].decode("latin-1").split("\n")[0].rstrip("\r"))
+            first = data[:200].decode("latin-1").split("\n")[0]
+            if first[60:].strip() != VERSION or first[20:21].upper() != "O":
+                raise wrong_kind(stream.path, "a RINEX observation file")
         found = data.find(b"END OF HEADER")
         if found < 0 and (not block or len(data) > _MAX_HEADER_BYTES):
             message = "the header has no END OF HEADER; the file is cut short or is no RINEX observation file"
@@ -84,23 +76,6 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
     end = len(data) if end < 0 else end + 1
     lines = [line.rstrip("\r") for line in data[:end].decode("latin-1").removesuffix("\n").split("\n")]
     return lines, data[end:]
-
-
-def _check_kind(path: str, line: str) -> None:
-    if line[60:].strip() != VERSION:
-        if re.match(r"#[a-d][PV]", line):
-            raise InputFileError(path, "is an SP3 orbit file, a RINEX observation file was expected", line=1)
-        if line.startswith(("$G", "$P", "%")):
-            what = "an NMEA log" if line.startswith("$") else "a position log"
-            raise InputFileError(path, f"looks like {what}, a RINEX observation file was expected", line=1)
-        if re.match(r"# ?$|# Header Description|Raw,", line):
-            what = "looks like a log of Android's GnssLogger; give the RINEX file that GnssLogger writes beside it"
-            raise InputFileError(path, what, line=1)
-        raise InputFileError(path, "is not a RINEX file (its first line has no RINEX VERSION / TYPE)", line=1)
-    kind = line[20:21].upper()
-    if kind != "O":
-        what = _FILE_TYPES.get(kind, f"a RINEX file of unknown type '{kind}'")
-        raise InputFileError(path, f"is {what} (an observation file was expected)", line=1)
 
 
 def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: int = 1) -> RinexHeader:

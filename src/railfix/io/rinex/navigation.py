@@ -15,7 +15,8 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, BrokenLines, FilePath, Paths, path_names, read_text_lines
 from railfix.gnss.navigation import Navigation
-from railfix.io.rinex.header import read_version
+from railfix.io.file_kind import wrong_kind
+from railfix.io.rinex.header import VERSION, read_version
 from railfix.io.rinex.navigation_records import (
     RawRecord,
     first_fault,
@@ -94,16 +95,10 @@ def read_header(path: FilePath, lines: list[str], content: NavigationContent) ->
 
 
 def _version(path: FilePath, first: str) -> tuple[float, str]:
-    if first[60:80].strip() != "RINEX VERSION / TYPE":
-        raise InputFileError(path, "is not a RINEX file: its first line lacks 'RINEX VERSION / TYPE'", line=1)
-    version, kind = read_version(path, first), first[20:21].upper()
-    if kind == "O":
-        raise InputFileError(
-            path, "is a RINEX observation file; give it with --front or --rear (a navigation file was expected)", line=1
-        )
-    if kind not in _FILE_SYSTEMS:
-        raise InputFileError(path, f"is RINEX of type {kind!r}, a navigation file (N) was expected", line=1)
-    return version, kind
+    kind = first[20:21].upper()
+    if first[60:80].strip() != VERSION or kind not in _FILE_SYSTEMS:
+        raise wrong_kind(path, "a RINEX navigation file")
+    return read_version(path, first), kind
 
 
 def _header_line(line: str, label: str, content: NavigationContent) -> None:

@@ -15,7 +15,8 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import FORCE_COLUMN, Given, Record, Rows, State
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Given, Record, Rows, State
 from railfix.kernels.tracking.update import Equations, Fit, mean_weights
 
 
@@ -46,7 +47,7 @@ def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
         monitors.weak_motion_s = max(monitors.weak_motion_s - constants.MOTION_LEAK * dt, 0.0)
     misfit = 0.0 if math.isnan(motion) else 1.0 - motion
     for j in range(rows.sensor.start, rows.sensor.stop):
-        misfit = 0.0 if rows.channel[j] < FORCE_COLUMN else misfit  # a sensor measures the speed
+        misfit = 0.0 if rows.channel[j] < ix.FORCE_COLUMN else misfit  # a sensor measures the speed
     monitors.motion_misfit += (1.0 - math.exp(-dt / constants.MOTION_FIT_S)) * (misfit - monitors.motion_misfit)
     if rows.code_s > 0.0:
         if code < constants.LOST_CODE_WEIGHT:

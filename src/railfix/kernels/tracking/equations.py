@@ -27,60 +27,25 @@ from railfix.core.constants import GRAVITY_MPS2, SPEED_OF_LIGHT
 from railfix.kernels.compiling import inner
 from railfix.kernels.sight import TURN, sight
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import (
-    ACCELERATION,
-    ARC,
-    CLOCK_TERM,
-    CODE,
-    CODE_CLOCK,
-    DOPPLER,
-    DOPPLER_SPEED,
-    DRIFT,
-    FORCE_COLUMN,
-    FORCE_OFFSET,
-    M_CLOCK,
-    M_DISTANCE,
-    M_DRIFT,
-    M_RIGHT,
-    M_SPEED,
-    M_UP,
-    MAP_LENGTH_ERROR,
-    MAP_RIGHT,
-    MAP_UP,
-    MOTION,
-    OFFSETS,
-    PHASE,
-    PHASE_CLOCK,
-    PREVIOUS_ARC,
-    PREVIOUS_SPEED,
-    RADAR,
-    RADAR_COLUMN,
-    RANGE_COLUMN,
-    SATELLITES,
-    SLOW_CODE,
-    SPEED,
-    STEP_RIGHT,
-    STEP_UP,
-    TERMS,
-    WHEEL,
-    WHEEL_COLUMN,
-    Given,
-    Rows,
-)
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Given, Rows
 from railfix.kernels.tracking.line import gradient_at, nearest_arc, wrap_arc, write_point
 from railfix.kernels.tracking.update import Equations
 
 #: Unknowns of the distance run since the epoch before: s - s' + q_a.
-DISTANCE = (ARC, PREVIOUS_ARC, MAP_LENGTH_ERROR)
+DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
 
 
 @inner
 def new_equations(rows: Rows) -> Equations:
     """Return equations of an epoch's measurements, to be written."""
-    size = rows.code.stop + MOTION + rows.sensor.stop - rows.sensor.start
+    size = rows.code.stop + ix.MOTION + rows.sensor.stop - rows.sensor.start
     count = rows.sensor.stop
     return Equations(
-        np.zeros((size, TERMS), dtype=np.intp), np.zeros((size, TERMS)), np.zeros((count, MOTION)), np.zeros(count)
+        np.zeros((size, ix.TERMS), dtype=np.intp),
+        np.zeros((size, ix.TERMS)),
+        np.zeros((count, ix.MOTION)),
+        np.zeros(count),
     )
 
 
@@ -98,7 +63,7 @@ def linearise(
     write_point(vertex, line, at[0], point, axes)
     write_point(vertex, line, at[1], before, unused)
     seen = _compute_sights(given, t, point, axes)
-    _write_codes(given, t, rows, x, seen, x[ARC] - at[0], equations)
+    _write_codes(given, t, rows, x, seen, x[ix.ARC] - at[0], equations)
     motion = _write_motion_quantities(rows.code.stop, x, at, equations)
     _write_phases(given, t, rows, motion, seen, before, _compute_chord(point, before, axes, at), equations)
     _write_dopplers(given, t, rows, motion, seen, point, axes, equations)
@@ -116,7 +81,7 @@ def _compute_sights(given: Given, t: int, point: Floats, axes: Floats) -> Floats
     seen = np.empty((channels, 7))
     for k in range(channels):
         channel = given.channel[t, k]
-        if channel.has[CODE] or channel.has[PHASE] or channel.has[DOPPLER]:
+        if channel.has[ix.CODE] or channel.has[ix.PHASE] or channel.has[ix.DOPPLER]:
             sat = channel.sat_ecef_m
             distance, ux, uy, uz = sight(sat[0], sat[1], sat[2], point[0], point[1], point[2])
             seen[k, 0], seen[k, 1], seen[k, 2], seen[k, 3] = distance, ux, uy, uz
@@ -143,13 +108,18 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
     Of the distance it is what the mean is away from the points at the arc lengths `at`. The error of a length of the
     map belongs to it: phases measure the distance run, not that on the map.
     """
-    unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(MOTION)
-    unknown[first + M_DISTANCE, :3], coefficient[first + M_DISTANCE, :3] = DISTANCE, (1.0, -1.0, 1.0)
-    unknown[first + M_SPEED, :2], coefficient[first + M_SPEED, :2] = (SPEED, DOPPLER_SPEED), (1.0, 1.0)
-    for q, i in ((M_CLOCK, PHASE_CLOCK), (M_RIGHT, STEP_RIGHT), (M_UP, STEP_UP), (M_DRIFT, DRIFT)):
+    unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(ix.MOTION)
+    unknown[first + ix.M_DISTANCE, :3], coefficient[first + ix.M_DISTANCE, :3] = DISTANCE, (1.0, -1.0, 1.0)
+    unknown[first + ix.M_SPEED, :2], coefficient[first + ix.M_SPEED, :2] = (ix.SPEED, ix.DOPPLER_SPEED), (1.0, 1.0)
+    for q, i in (
+        (ix.M_CLOCK, ix.PHASE_CLOCK),
+        (ix.M_RIGHT, ix.STEP_RIGHT),
+        (ix.M_UP, ix.STEP_UP),
+        (ix.M_DRIFT, ix.DRIFT),
+    ):
         unknown[first + q, 0], coefficient[first + q, 0], motion[q] = i, 1.0, x[i]
-    motion[M_DISTANCE] = x[ARC] - at[0] - (x[PREVIOUS_ARC] - at[1]) + x[MAP_LENGTH_ERROR]
-    motion[M_SPEED] = x[SPEED] + x[DOPPLER_SPEED]
+    motion[ix.M_DISTANCE] = x[ix.ARC] - at[0] - (x[ix.PREVIOUS_ARC] - at[1]) + x[ix.MAP_LENGTH_ERROR]
+    motion[ix.M_SPEED] = x[ix.SPEED] + x[ix.DOPPLER_SPEED]
     return motion
 
 
@@ -164,23 +134,23 @@ def _write_codes(given: Given, t: int, rows: Rows, x: Floats, seen: Floats, move
         k = rows.channel[j]
         channel = given.channel[t, k]
         along, right, up, sigma = -seen[k, 4], -seen[k, 5], -seen[k, 6], channel.code_sigma_m
-        offset, satellite = OFFSETS + channel.clock, SATELLITES + channel.satellite
-        unknown[j, 0], coefficient[j, 0] = ARC, along
-        unknown[j, 1], coefficient[j, 1] = SLOW_CODE, along
-        unknown[j, 2], coefficient[j, 2] = MAP_RIGHT, right
-        unknown[j, 3], coefficient[j, 3] = MAP_UP, up
+        offset, satellite = ix.OFFSETS + channel.clock, ix.SATELLITES + channel.satellite
+        unknown[j, 0], coefficient[j, 0] = ix.ARC, along
+        unknown[j, 1], coefficient[j, 1] = ix.SLOW_CODE, along
+        unknown[j, 2], coefficient[j, 2] = ix.MAP_RIGHT, right
+        unknown[j, 3], coefficient[j, 3] = ix.MAP_UP, up
         unknown[j, 4], coefficient[j, 4] = offset, 1.0
         unknown[j, 5], coefficient[j, 5] = satellite, sigma
-        unknown[j, CLOCK_TERM], coefficient[j, CLOCK_TERM] = CODE_CLOCK, 1.0
-        predicted = along * (moved + x[SLOW_CODE]) + right * x[MAP_RIGHT] + up * x[MAP_UP]
-        predicted += x[offset] + x[CODE_CLOCK] + sigma * x[satellite]
-        equations.value[j] = channel.measured[CODE] - seen[k, 0] - predicted
+        unknown[j, ix.CLOCK_TERM], coefficient[j, ix.CLOCK_TERM] = ix.CODE_CLOCK, 1.0
+        predicted = along * (moved + x[ix.SLOW_CODE]) + right * x[ix.MAP_RIGHT] + up * x[ix.MAP_UP]
+        predicted += x[offset] + x[ix.CODE_CLOCK] + sigma * x[satellite]
+        equations.value[j] = channel.measured[ix.CODE] - seen[k, 0] - predicted
 
 
 @inner
 def _write_motion_value(value: float, j: int, motion: Floats, equations: Equations) -> None:
     """Write the innovation of a phase or Doppler: a value less what the motion of the mean explains."""
-    for a in range(MOTION):
+    for a in range(ix.MOTION):
         value -= equations.design[j, a] * motion[a]
     equations.value[j] = value
 
@@ -208,9 +178,9 @@ def _write_phases(
         sat = channel.before_ecef_m
         distance = sight(sat[0], sat[1], sat[2], before[0], before[1], before[2])[0]
         gradient = -(seen[k, 1] * cx + seen[k, 2] * cy + seen[k, 3] * cz)
-        design[j, M_DISTANCE], design[j, M_CLOCK] = gradient, 1.0
-        design[j, M_RIGHT], design[j, M_UP] = -seen[k, 5], -seen[k, 6]
-        _write_motion_value(channel.measured[PHASE] - (seen[k, 0] - distance), j, motion, equations)
+        design[j, ix.M_DISTANCE], design[j, ix.M_CLOCK] = gradient, 1.0
+        design[j, ix.M_RIGHT], design[j, ix.M_UP] = -seen[k, 5], -seen[k, 6]
+        _write_motion_value(channel.measured[ix.PHASE] - (seen[k, 0] - distance), j, motion, equations)
 
 
 @inner
@@ -227,9 +197,9 @@ def _write_dopplers(
         moving += TURN * (velocity[0] * point[1] - velocity[1] * point[0])
         stretch = 1.0 + moving / SPEED_OF_LIGHT
         slope = (-seen[k, 4] + TURN * (sat[0] * axes[0, 1] - sat[1] * axes[0, 0])) / stretch
-        design[j, M_RIGHT], design[j, M_UP] = -seen[k, 5] / dt, -seen[k, 6] / dt
-        design[j, M_SPEED], design[j, M_DRIFT] = slope, 1.0
-        _write_motion_value(channel.measured[DOPPLER] - moving / stretch, j, motion, equations)
+        design[j, ix.M_RIGHT], design[j, ix.M_UP] = -seen[k, 5] / dt, -seen[k, 6] / dt
+        design[j, ix.M_SPEED], design[j, ix.M_DRIFT] = slope, 1.0
+        _write_motion_value(channel.measured[ix.DOPPLER] - moving / stretch, j, motion, equations)
 
 
 @inner
@@ -237,24 +207,24 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, direction: float
     """Write the sensors."""
     dt, vertex, line, value = given.epoch[t].interval_s, given.vertex, given.line[0], equations.value
     for j in range(rows.sensor.start, rows.sensor.stop):
-        column, q = rows.channel[j], rows.code.stop + MOTION + j - rows.sensor.start
+        column, q = rows.channel[j], rows.code.stop + ix.MOTION + j - rows.sensor.start
         sensor, unknown, coefficient = given.sensor[t, column], equations.unknown[q], equations.coefficient[q]
         measured, age = sensor.value, sensor.age_s
-        if column in (WHEEL_COLUMN, RADAR_COLUMN):
+        if column in (ix.WHEEL_COLUMN, ix.RADAR_COLUMN):
             if sensor.unsigned:
-                measured *= math.copysign(1.0, x[SPEED]) if abs(x[SPEED]) > constants.DIRECTION_MPS else direction
+                measured *= math.copysign(1.0, x[ix.SPEED]) if abs(x[ix.SPEED]) > constants.DIRECTION_MPS else direction
             unknown[:3], coefficient[:3] = DISTANCE, (1.0, -1.0, 1.0)
-            unknown[3], coefficient[3] = WHEEL if column == WHEEL_COLUMN else RADAR, -measured
-            value[j] = measured * (1.0 + x[unknown[3]]) - (x[ARC] - x[PREVIOUS_ARC] + x[MAP_LENGTH_ERROR])
-        elif column == FORCE_COLUMN:
-            slope = gradient_at(vertex, line, 0.5 * (x[ARC] + x[PREVIOUS_ARC]))
+            unknown[3], coefficient[3] = ix.WHEEL if column == ix.WHEEL_COLUMN else ix.RADAR, -measured
+            value[j] = measured * (1.0 + x[unknown[3]]) - (x[ix.ARC] - x[ix.PREVIOUS_ARC] + x[ix.MAP_LENGTH_ERROR])
+        elif column == ix.FORCE_COLUMN:
+            slope = gradient_at(vertex, line, 0.5 * (x[ix.ARC] + x[ix.PREVIOUS_ARC]))
             gravity = GRAVITY_MPS2 * slope / math.sqrt(1.0 + slope**2)
-            unknown[:3], coefficient[:3] = (SPEED, PREVIOUS_SPEED, FORCE_OFFSET), (1.0 / dt, -1.0 / dt, 1.0)
-            value[j] = measured - (x[SPEED] - x[PREVIOUS_SPEED]) / dt - gravity - x[FORCE_OFFSET]
-        elif column < RANGE_COLUMN:
-            unknown[:3], coefficient[:3] = (ARC, SPEED, ACCELERATION), (1.0, -age, 0.5 * age**2)
-            there = nearest_arc(vertex, line, wrap_arc(vertex, line, measured), x[ARC])
-            value[j] = there - x[ARC] + age * x[SPEED] - 0.5 * age**2 * x[ACCELERATION]
+            unknown[:3], coefficient[:3] = (ix.SPEED, ix.PREVIOUS_SPEED, ix.FORCE_OFFSET), (1.0 / dt, -1.0 / dt, 1.0)
+            value[j] = measured - (x[ix.SPEED] - x[ix.PREVIOUS_SPEED]) / dt - gravity - x[ix.FORCE_OFFSET]
+        elif column < ix.RANGE_COLUMN:
+            unknown[:3], coefficient[:3] = (ix.ARC, ix.SPEED, ix.ACCELERATION), (1.0, -age, 0.5 * age**2)
+            there = nearest_arc(vertex, line, wrap_arc(vertex, line, measured), x[ix.ARC])
+            value[j] = there - x[ix.ARC] + age * x[ix.SPEED] - 0.5 * age**2 * x[ix.ACCELERATION]
         else:
             value[j] = measured - _write_range(given, t, column, x, q, equations)
 
@@ -264,8 +234,8 @@ def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations
     """Write the terms of a range to a ground unit; return the range at the mean [m]."""
     sensor, point, axes = given.sensor[t, column], np.empty(3), np.empty((3, 3))
     age, lever = sensor.age_s, sensor.lever_m
-    write_point(given.vertex, given.line[0], x[ARC] - age * x[SPEED] + lever[0], point, axes)
-    across, above, square = x[MAP_RIGHT] + lever[1], x[MAP_UP] + lever[2], 0.0
+    write_point(given.vertex, given.line[0], x[ix.ARC] - age * x[ix.SPEED] + lever[0], point, axes)
+    across, above, square = x[ix.MAP_RIGHT] + lever[1], x[ix.MAP_UP] + lever[2], 0.0
     along = right = up = 0.0
     for c in range(3):
         away = sensor.unit_ecef_m[c] - point[c] - across * axes[1, c] - above * axes[2, c]
@@ -274,7 +244,7 @@ def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations
         right -= away * axes[1, c]
         up -= away * axes[2, c]
     distance = math.sqrt(square)
-    equations.unknown[q, :4] = ARC, SPEED, MAP_RIGHT, MAP_UP
+    equations.unknown[q, :4] = ix.ARC, ix.SPEED, ix.MAP_RIGHT, ix.MAP_UP
     equations.coefficient[q, :4] = along / distance, -age * along / distance, right / distance, up / distance
     return distance
 
@@ -283,9 +253,9 @@ def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations
 def shift_sensors(rows: Rows, x: Floats, other_x: Floats, other: Equations, equations: Equations) -> None:
     """Take over the equations of the sensors, made about another mean."""
     for j in range(rows.sensor.start, rows.sensor.stop):
-        q = rows.code.stop + MOTION + j - rows.sensor.start
+        q = rows.code.stop + ix.MOTION + j - rows.sensor.start
         value = other.value[j]
-        for k in range(TERMS):
+        for k in range(ix.TERMS):
             unknown, coefficient = other.unknown[q, k], other.coefficient[q, k]
             equations.unknown[q, k], equations.coefficient[q, k] = unknown, coefficient
             value -= coefficient * (x[unknown] - other_x[unknown])

@@ -7,7 +7,8 @@ import math
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import ARC, SPEED, TERMS, Rows
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Rows
 from railfix.kernels.tracking.update import (
     Correction,
     Equations,
@@ -41,7 +42,7 @@ def compute_evidence(rows: Rows, degrees: tuple[float, float], rounds: int, one:
 def _find_coefficient(equations: Equations, q: int, unknown: int) -> float:
     """Return the coefficient of an unknown in a quantity."""
     total = 0.0
-    for k in range(TERMS):
+    for k in range(ix.TERMS):
         if equations.unknown[q, k] == unknown:
             total += equations.coefficient[q, k]
     return total
@@ -51,7 +52,7 @@ def _find_coefficient(equations: Equations, q: int, unknown: int) -> float:
 def _inflate(one: Correction) -> tuple[Floats, Floats]:
     """Return the covariance of the quantities, and its diagonal without clocks, with place and speed set free."""
     covariance, without_clock = one.covariance.copy(), one.without_clock.copy()
-    for unknown, variance in ((ARC, constants.FREEDOM_PLACE_M2), (SPEED, constants.FREEDOM_SPEED_M2PS2)):
+    for unknown, variance in ((ix.ARC, constants.FREEDOM_PLACE_M2), (ix.SPEED, constants.FREEDOM_SPEED_M2PS2)):
         for i in range(len(covariance)):
             own = variance * _find_coefficient(one.equations, i, unknown)
             if own != 0.0:

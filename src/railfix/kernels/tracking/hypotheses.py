@@ -9,7 +9,8 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import ARC, Record, Records, State
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Record, Records, State
 
 
 @inner
@@ -115,7 +116,7 @@ def prune(parameters: Record, state: State) -> Indices:
     kept, log_probability = _merge_twins(state, _rank(state.hypothesis, state.monitors[0].hypotheses))
     size = min(len(kept), parameters.most_hypotheses)
     kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
-    if abs(state.x[kept[0], ARC] - state.hypothesis[kept[0]].origin_m) >= constants.DECIDED_TRAVEL_M:
+    if abs(state.x[kept[0], ix.ARC] - state.hypothesis[kept[0]].origin_m) >= constants.DECIDED_TRAVEL_M:
         size = 0
         for j in range(len(kept)):
             if log_probability[j] > math.log(constants.LEAST_PROBABILITY):
@@ -157,10 +158,10 @@ def _merge_twins(state: State, ranked: Indices) -> tuple[Indices, Floats]:
     """Return the hypotheses without those within the standard deviations of a more probable one, and probabilities."""
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     for k in ranked:
-        twin, sigma = -1, math.sqrt(state.P[k, ARC, ARC])
+        twin, sigma = -1, math.sqrt(state.P[k, ix.ARC, ix.ARC])
         for j in range(size):
-            reach = max(2.0, sigma + math.sqrt(state.P[kept[j], ARC, ARC]))
-            if abs(state.x[k, ARC] - state.x[kept[j], ARC]) < reach:
+            reach = max(2.0, sigma + math.sqrt(state.P[kept[j], ix.ARC, ix.ARC]))
+            if abs(state.x[k, ix.ARC] - state.x[kept[j], ix.ARC]) < reach:
                 twin = j
                 break
         own = state.hypothesis[k].log_probability

@@ -22,18 +22,8 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import (
-    ALL_IN_VIEW,
-    ARC,
-    CODES_AHEAD,
-    CODES_BEHIND,
-    MAP_RIGHT,
-    SPEED,
-    WRONG_MAP,
-    Given,
-    Record,
-    State,
-)
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Given, Record, State
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.subfilters import find_others
 
@@ -54,12 +44,12 @@ def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
     along, straight = np.empty(count - 1), np.empty(count - 1)
     sigma, probability = np.empty(count - 1), np.empty(count - 1)
     here, there, axes = np.empty(3), np.empty(3), np.empty((3, 3))
-    write_point(given.vertex, given.line[0], state.x[0, ARC], here, axes)
+    write_point(given.vertex, given.line[0], state.x[0, ix.ARC], here, axes)
     for h in range(1, count):
-        write_point(given.vertex, given.line[0], state.x[h, ARC], there, axes)
-        along[h - 1] = abs(state.x[h, ARC] - state.x[0, ARC])
+        write_point(given.vertex, given.line[0], state.x[h, ix.ARC], there, axes)
+        along[h - 1] = abs(state.x[h, ix.ARC] - state.x[0, ix.ARC])
         straight[h - 1] = math.sqrt(((there - here) ** 2).sum())
-        sigma[h - 1] = math.sqrt(state.P[h, ARC, ARC])
+        sigma[h - 1] = math.sqrt(state.P[h, ix.ARC, ix.ARC])
         probability[h - 1] = math.exp(state.hypothesis[h].log_probability)
         if along[h - 1] > given.parameters[0].start_separation_m:
             far += probability[h - 1]
@@ -71,12 +61,12 @@ def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
 def _find_subfilters(state: State) -> Alternatives:
     """Return the running sub-filters."""
     first, size = len(state.hypothesis), 0
-    most = find_others(state) + ALL_IN_VIEW
+    most = find_others(state) + ix.ALL_IN_VIEW
     away, sigma, probability = np.empty(most), np.empty(most), np.empty(most)
     for b in range(most):
         if state.source[b].running:
-            away[size] = abs(state.x[first + b, ARC] - state.x[0, ARC])
-            sigma[size], probability[size] = math.sqrt(state.P[first + b, ARC, ARC]), state.source[b].prior
+            away[size] = abs(state.x[first + b, ix.ARC] - state.x[0, ix.ARC])
+            sigma[size], probability[size] = math.sqrt(state.P[first + b, ix.ARC, ix.ARC]), state.source[b].prior
             size += 1
     return Alternatives(away[:size], away[:size], sigma[:size], probability[:size])
 
@@ -98,12 +88,12 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
     information, shift = np.zeros(satellites), np.zeros(satellites)
     for k in range(satellites):
         if source[k].running:
-            information[k] = 1.0 / state.P[first + k, ARC, ARC]
-            shift[k] = information[k] * (state.x[first + k, ARC] - state.x[0, ARC])
-    whole, whole_shift, in_view = 1.0 / state.P[0, ARC, ARC], 0.0, find_others(state) + ALL_IN_VIEW
+            information[k] = 1.0 / state.P[first + k, ix.ARC, ix.ARC]
+            shift[k] = information[k] * (state.x[first + k, ix.ARC] - state.x[0, ix.ARC])
+    whole, whole_shift, in_view = 1.0 / state.P[0, ix.ARC, ix.ARC], 0.0, find_others(state) + ix.ALL_IN_VIEW
     if source[in_view].running:
-        whole = 1.0 / state.P[first + in_view, ARC, ARC]
-        whole_shift = whole * (state.x[first + in_view, ARC] - state.x[0, ARC])
+        whole = 1.0 / state.P[first + in_view, ix.ARC, ix.ARC]
+        whole_shift = whole * (state.x[first + in_view, ix.ARC] - state.x[0, ix.ARC])
     for one in range(satellites):
         if not (source[one].running and source[one].prior > 0.0):
             continue
@@ -135,16 +125,16 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
     reach, is more probable than the risk; the straight distance is bounded with all branches and a map that lies aside.
     """
     parameters, source, first, others = given.parameters[0], state.source, len(state.hypothesis), find_others(state)
-    sigma = math.sqrt(state.P[0, ARC, ARC])
+    sigma = math.sqrt(state.P[0, ix.ARC, ix.ARC])
     noise, apart = parameters.level_k * sigma, math.nan
     start, contradicted = noise, False
-    for b in range(others + ALL_IN_VIEW):
+    for b in range(others + ix.ALL_IN_VIEW):
         if source[b].running:
             contradicted = contradicted or source[b].contradicted_s > constants.LEVEL_DOUBT_S
-            away = abs(state.x[first + b, ARC] - state.x[0, ARC])
-            if b < others + CODES_AHEAD or b > others + CODES_BEHIND:  # without half of the codes: apart by noise
+            away = abs(state.x[first + b, ix.ARC] - state.x[0, ix.ARC])
+            if b < others + ix.CODES_AHEAD or b > others + ix.CODES_BEHIND:  # without half of the codes: apart by noise
                 apart = away if math.isnan(apart) else max(apart, away)
-            start = max(start, away + source[b].k * math.sqrt(state.P[first + b, ARC, ARC]))
+            start = max(start, away + source[b].k * math.sqrt(state.P[first + b, ix.ARC, ix.ARC]))
     result.level_noise_m, result.separation_m = noise, apart
     result.level_m = result.ground_level_m = math.inf
     if math.isnan(apart) or contradicted:
@@ -159,9 +149,9 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
         result.level_m = result.ground_level_m
     elif far <= risk:
         result.level_m = solve_level(sigma, alternatives.along_m, alternatives, risk, start)
-    if source[others + WRONG_MAP].running:
-        row = first + others + WRONG_MAP
-        aside = abs(state.x[row, MAP_RIGHT]) + 2.0 * math.sqrt(state.P[row, MAP_RIGHT, MAP_RIGHT])
+    if source[others + ix.WRONG_MAP].running:
+        row = first + others + ix.WRONG_MAP
+        aside = abs(state.x[row, ix.MAP_RIGHT]) + 2.0 * math.sqrt(state.P[row, ix.MAP_RIGHT, ix.MAP_RIGHT])
         result.ground_level_m = math.hypot(result.ground_level_m, aside)
 
 
@@ -217,8 +207,8 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
 def bound_speed(parameters: Record, state: State, sigma: float) -> float:
     """Return the bound of the error of the speed: what carries the level over the epochs until the next one."""
     bound, first = parameters.level_k_speed * sigma, len(state.hypothesis)
-    for b in range(find_others(state) + ALL_IN_VIEW):
+    for b in range(find_others(state) + ix.ALL_IN_VIEW):
         if state.source[b].running:
-            away = abs(state.x[first + b, SPEED] - state.x[0, SPEED])
-            bound = max(bound, away + state.source[b].k_speed * math.sqrt(state.P[first + b, SPEED, SPEED]))
+            away = abs(state.x[first + b, ix.SPEED] - state.x[0, ix.SPEED])
+            bound = max(bound, away + state.source[b].k_speed * math.sqrt(state.P[first + b, ix.SPEED, ix.SPEED]))
     return float(bound)

@@ -9,23 +9,9 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.adaptation import is_faulty
-from railfix.kernels.tracking.layout import (
-    CLOCK_COUNT,
-    CODE,
-    CODE_CLOCK,
-    DOPPLER,
-    DRIFT,
-    OFFSETS,
-    PHASE,
-    PHASE_CLOCK,
-    RANGE_COLUMN,
-    SPEED,
-    WHEEL_COLUMN,
-    Given,
-    Rows,
-    State,
-)
+from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.model import restart
 from railfix.kernels.tracking.update import Equations, median
 
@@ -42,7 +28,7 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
     epoch, period = given.epoch[t], given.parameters[0].code_period_s
     dt, since, coded = epoch.interval_s, epoch.time_s - state.monitors[0].coded_s, False
     for k in range(given.channel.shape[1]):
-        coded = coded or given.channel[t, k].has[CODE]
+        coded = coded or given.channel[t, k].has[ix.CODE]
     if not coded:
         return float(dt)
     if epoch.motion_measured and since < period - 0.5 * dt - TIE_S:
@@ -54,10 +40,12 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
 def _is_sensor_used(given: Given, t: int, column: int, state: State) -> bool:
     """Return whether a sensor has measured; a wheel without a sign needs a direction, a range to a unit a speed."""
     sensor, monitors = given.sensor[t, column], state.monitors[0]
-    used = math.isfinite(sensor.value) and (column < RANGE_COLUMN or abs(state.x[0, SPEED]) >= constants.STILL_MPS)
-    if column == WHEEL_COLUMN and sensor.unsigned and monitors.direction == 0.0:
+    used = math.isfinite(sensor.value) and (
+        column < ix.RANGE_COLUMN or abs(state.x[0, ix.SPEED]) >= constants.STILL_MPS
+    )
+    if column == ix.WHEEL_COLUMN and sensor.unsigned and monitors.direction == 0.0:
         for h in range(monitors.hypotheses):
-            used = used and abs(state.x[h, SPEED]) > constants.DIRECTION_MPS
+            used = used and abs(state.x[h, ix.SPEED]) > constants.DIRECTION_MPS
     return used
 
 
@@ -71,16 +59,16 @@ def choose_measurements(given: Given, t: int, state: State) -> Rows:
     code_s = _code_interval_s(given, t, state)
     for kind in range(3):
         scale = 1.0
-        if kind == PHASE:
+        if kind == ix.PHASE:
             scale = math.exp(monitors.log_phase_scale)
-        elif kind == DOPPLER:
+        elif kind == ix.DOPPLER:
             scale = math.exp(monitors.log_doppler_scale)
         for k in range(channels):
             record = given.channel[t, k]
-            if not record.has[kind] or (kind == CODE and code_s == 0.0):
+            if not record.has[kind] or (kind == ix.CODE and code_s == 0.0):
                 continue
             channel[size], variance[size] = k, record.variance[kind] * scale
-            if kind == CODE:
+            if kind == ix.CODE:
                 variance[size] /= min(code_s, 1.0)
                 known = not given.fresh[t, record.satellite]
                 if known and is_faulty(state.code_bias[record.satellite]):
@@ -110,11 +98,11 @@ def start_clocks(
     restarted[:] = False
     if rows.code.stop > 0:
         restarted[2] = _start_code_clocks(given, t, rows, offset_known, x, P, equations)
-    for kind in (PHASE, DOPPLER):
-        own = rows.phase if kind == PHASE else rows.doppler
+    for kind in (ix.PHASE, ix.DOPPLER):
+        own = rows.phase if kind == ix.PHASE else rows.doppler
         if own.stop == own.start:
             continue
-        away, unknown = median(equations.value[own]), PHASE_CLOCK if kind == PHASE else DRIFT
+        away, unknown = median(equations.value[own]), ix.PHASE_CLOCK if kind == ix.PHASE else ix.DRIFT
         variance = P[unknown, unknown]
         if variance > constants.UNKNOWN_CLOCK**2 or abs(away) > constants.STEPPED * math.sqrt(variance + 0.25):
             x[unknown] += away
@@ -137,21 +125,21 @@ def _start_code_clocks(
         clock_of[j] = given.channel[t, rows.channel[j]].clock
         some = some or known[clock_of[j]]
     first, begins = clock_of[0], True
-    for g in range(CLOCK_COUNT):
+    for g in range(ix.CLOCK_COUNT):
         begins = begins and not known[g]
     if begins:
-        P[OFFSETS + first, OFFSETS + first] = constants.FIRST_OFFSET_M2
-    settled = np.empty(CLOCK_COUNT, dtype=np.bool_)
-    for g in range(CLOCK_COUNT):
+        P[ix.OFFSETS + first, ix.OFFSETS + first] = constants.FIRST_OFFSET_M2
+    settled = np.empty(ix.CLOCK_COUNT, dtype=np.bool_)
+    for g in range(ix.CLOCK_COUNT):
         settled[g] = known[g] if some else g == first
     clock = _median_of_clocks(value, clock_of, settled)
-    x[CODE_CLOCK] += clock
-    for g in range(CLOCK_COUNT):
-        own, away = np.zeros(CLOCK_COUNT, dtype=np.bool_), clock
+    x[ix.CODE_CLOCK] += clock
+    for g in range(ix.CLOCK_COUNT):
+        own, away = np.zeros(ix.CLOCK_COUNT, dtype=np.bool_), clock
         own[g] = True
         if not settled[g]:
             away = _median_of_clocks(value, clock_of, own)
-            x[OFFSETS + g] += 0.0 if math.isnan(away) else away - clock
+            x[ix.OFFSETS + g] += 0.0 if math.isnan(away) else away - clock
         for j in range(codes):
             if clock_of[j] == g:
                 value[j] -= away

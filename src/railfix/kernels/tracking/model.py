@@ -28,31 +28,8 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import (
-    ARC,
-    CODE_CLOCK,
-    DOPPLER_SPEED,
-    DRIFT,
-    FORCE_OFFSET,
-    MAP_LENGTH_ERROR,
-    MAP_RIGHT,
-    MAP_UP,
-    OFFSETS,
-    PER_EPOCH,
-    PHASE_CLOCK,
-    PREVIOUS_ARC,
-    PREVIOUS_SPEED,
-    RADAR,
-    SATELLITES,
-    SLOW_CODE,
-    SPEED,
-    STEP_RIGHT,
-    STEP_UP,
-    WHEEL,
-    Given,
-    Record,
-    Rows,
-)
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Given, Record, Rows
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.update import add_row
 
@@ -78,15 +55,15 @@ def compute_transition(speed: float, epoch: Record, unknowns: int) -> Transition
     for i in range(3):
         for k in range(3):
             unknown[i, k], coefficient[i, k] = k, epoch.step[i, k]
-    unknown[PREVIOUS_ARC, 0], unknown[PREVIOUS_SPEED, 0] = ARC, SPEED
-    unknown[PHASE_CLOCK, 0], coefficient[PHASE_CLOCK, 0] = DRIFT, dt
-    for i in PER_EPOCH:
+    unknown[ix.PREVIOUS_ARC, 0], unknown[ix.PREVIOUS_SPEED, 0] = ix.ARC, ix.SPEED
+    unknown[ix.PHASE_CLOCK, 0], coefficient[ix.PHASE_CLOCK, 0] = ix.DRIFT, dt
+    for i in ix.PER_EPOCH:
         coefficient[i, 0] = 0.0
-    coefficient[MAP_RIGHT, 0] = coefficient[MAP_UP, 0] = math.exp(-travel / constants.MAP_ABSOLUTE_M)
-    coefficient[DOPPLER_SPEED, 0] = math.exp(-dt / constants.DOPPLER_CORRELATION_S)
-    coefficient[SLOW_CODE, 0] = math.exp(-dt / constants.SLOW_CODE_S)
+    coefficient[ix.MAP_RIGHT, 0] = coefficient[ix.MAP_UP, 0] = math.exp(-travel / constants.MAP_ABSOLUTE_M)
+    coefficient[ix.DOPPLER_SPEED, 0] = math.exp(-dt / constants.DOPPLER_CORRELATION_S)
+    coefficient[ix.SLOW_CODE, 0] = math.exp(-dt / constants.SLOW_CODE_S)
     kept = math.exp(-dt / constants.CODE_CORRELATION_S - travel / constants.CODE_CORRELATION_M)
-    for i in range(SATELLITES, unknowns):
+    for i in range(ix.SATELLITES, unknowns):
         coefficient[i, 0] = kept
     return Transition(unknown, coefficient)
 
@@ -113,7 +90,7 @@ def predict(
     `map_log_variance` is that of `Monitors`, `wrong_map_m` a standard deviation of the map beside the line's own [m];
     `scratch`, shape (N, N), is overwritten.
     """
-    epoch, speed, before = given.epoch[t], x[SPEED], x.copy()
+    epoch, speed, before = given.epoch[t], x[ix.SPEED], x.copy()
     F = compute_transition(speed, epoch, len(x))
     for i in range(len(x)):
         x[i] = 0.0
@@ -139,40 +116,40 @@ def _add_noise(
     for i in range(3):
         for j in range(3):
             P[i, j] += epoch.noise[i, j]
-    P[ARC, ARC] += constants.LEAST_STEP_M2
-    P[SPEED, SPEED] += constants.LEAST_STEP_M2
+    P[ix.ARC, ix.ARC] += constants.LEAST_STEP_M2
+    P[ix.SPEED, ix.SPEED] += constants.LEAST_STEP_M2
     walk = constants.CLOCK_WALK_MPS**2  # of the drift; the phases' clock is its integral
-    P[DRIFT, DRIFT] += walk * dt
-    P[PHASE_CLOCK, PHASE_CLOCK] += walk * dt**3 / 3.0 + _LEAST_CLOCK_M2
-    P[PHASE_CLOCK, DRIFT] += walk * dt**2 / 2.0
-    P[DRIFT, PHASE_CLOCK] += walk * dt**2 / 2.0
-    P[CODE_CLOCK, CODE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
+    P[ix.DRIFT, ix.DRIFT] += walk * dt
+    P[ix.PHASE_CLOCK, ix.PHASE_CLOCK] += walk * dt**3 / 3.0 + _LEAST_CLOCK_M2
+    P[ix.PHASE_CLOCK, ix.DRIFT] += walk * dt**2 / 2.0
+    P[ix.DRIFT, ix.PHASE_CLOCK] += walk * dt**2 / 2.0
+    P[ix.CODE_CLOCK, ix.CODE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
     # Gauss-Markov: sigma^2 (1 - kept^2)
-    changed = 1.0 - F.coefficient[MAP_RIGHT, 0] ** 2
-    P[MAP_RIGHT, MAP_RIGHT] += (line.sigma_plan_m**2 + wrong_map_m**2) * changed
-    P[MAP_UP, MAP_UP] += (line.sigma_height_m**2 + wrong_map_m**2) * changed
-    P[SLOW_CODE, SLOW_CODE] += parameters.slow_code_m**2 * (1.0 - F.coefficient[SLOW_CODE, 0] ** 2)
+    changed = 1.0 - F.coefficient[ix.MAP_RIGHT, 0] ** 2
+    P[ix.MAP_RIGHT, ix.MAP_RIGHT] += (line.sigma_plan_m**2 + wrong_map_m**2) * changed
+    P[ix.MAP_UP, ix.MAP_UP] += (line.sigma_height_m**2 + wrong_map_m**2) * changed
+    P[ix.SLOW_CODE, ix.SLOW_CODE] += parameters.slow_code_m**2 * (1.0 - F.coefficient[ix.SLOW_CODE, 0] ** 2)
     doppler_mps = constants.DOPPLER_ERROR_MPS + constants.DOPPLER_ERROR_SHARE * abs(speed)
-    P[DOPPLER_SPEED, DOPPLER_SPEED] += doppler_mps**2 * (1.0 - F.coefficient[DOPPLER_SPEED, 0] ** 2)
-    for i in range(SATELLITES, len(P)):
+    P[ix.DOPPLER_SPEED, ix.DOPPLER_SPEED] += doppler_mps**2 * (1.0 - F.coefficient[ix.DOPPLER_SPEED, 0] ** 2)
+    for i in range(ix.SATELLITES, len(P)):
         P[i, i] += 1.0 - F.coefficient[i, 0] ** 2
     # random walks
-    P[WHEEL, WHEEL] += constants.WHEEL_WALK**2 * dt
-    P[FORCE_OFFSET, FORCE_OFFSET] += constants.FORCE_WALK_MPS2**2 * dt
-    P[RADAR, RADAR] += constants.RADAR_WALK**2 * dt
-    for i in range(OFFSETS, SATELLITES):
+    P[ix.WHEEL, ix.WHEEL] += constants.WHEEL_WALK**2 * dt
+    P[ix.FORCE_OFFSET, ix.FORCE_OFFSET] += constants.FORCE_WALK_MPS2**2 * dt
+    P[ix.RADAR, ix.RADAR] += constants.RADAR_WALK**2 * dt
+    for i in range(ix.OFFSETS, ix.SATELLITES):
         P[i, i] += constants.OFFSET_WALK_M**2 * dt
     # displacement of the map
     changed = 2.0 * (1.0 - math.exp(-travel / constants.MAP_CORRELATION_M))
     across = max(constants.MAP_ROUGHNESS_M, line.sigma_plan_m)
     above = max(constants.MAP_ROUGHNESS_M, constants.HEIGHT_ROUGHNESS * line.sigma_height_m)
-    P[STEP_RIGHT, STEP_RIGHT] = across**2 * changed + _LEAST_M2
-    P[STEP_UP, STEP_UP] = above**2 * changed + _LEAST_M2
+    P[ix.STEP_RIGHT, ix.STEP_RIGHT] = across**2 * changed + _LEAST_M2
+    P[ix.STEP_UP, ix.STEP_UP] = above**2 * changed + _LEAST_M2
     # The distance on the map is the distance run less the error of the length: codes see it, phases do not.
     length = constants.MAP_SCALE_M**2 * math.exp(map_log_variance) * travel + constants.PHASE_WALK_M**2 * dt
-    P[ARC, ARC] += length
-    P[MAP_LENGTH_ERROR, MAP_LENGTH_ERROR] = length + _LEAST_M2
-    P[ARC, MAP_LENGTH_ERROR] = P[MAP_LENGTH_ERROR, ARC] = -length
+    P[ix.ARC, ix.ARC] += length
+    P[ix.MAP_LENGTH_ERROR, ix.MAP_LENGTH_ERROR] = length + _LEAST_M2
+    P[ix.ARC, ix.MAP_LENGTH_ERROR] = P[ix.MAP_LENGTH_ERROR, ix.ARC] = -length
 
 
 @inner
@@ -184,15 +161,15 @@ def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     write_point(given.vertex, given.line[0], at[0], point, axes)
     write_point(given.vertex, given.line[0], at[1], point, before)
-    length = P[MAP_LENGTH_ERROR, MAP_LENGTH_ERROR] - _LEAST_M2
-    position_variance = min(P[ARC, ARC] - length, constants.START_SIGMA_M**2)
+    length = P[ix.MAP_LENGTH_ERROR, ix.MAP_LENGTH_ERROR] - _LEAST_M2
+    position_variance = min(P[ix.ARC, ix.ARC] - length, constants.START_SIGMA_M**2)
     right = up = 0.0
     for c in range(3):
         change = axes[0, c] - before[0, c]
         right += change * axes[1, c]
         up += change * axes[2, c]
-    P[STEP_RIGHT, STEP_RIGHT] += position_variance * right**2
-    P[STEP_UP, STEP_UP] += position_variance * up**2
+    P[ix.STEP_RIGHT, ix.STEP_RIGHT] += position_variance * right**2
+    P[ix.STEP_UP, ix.STEP_UP] += position_variance * up**2
 
 
 @inner

@@ -12,7 +12,8 @@ import numpy as np
 
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import ACCELERATION, ARC, MAP_RIGHT, SPEED, WRONG_MAP, Given, Record, State
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Given, Record, State
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.subfilters import find_others
 
@@ -27,15 +28,15 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
     velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance
     if not math.isfinite(velocity[0]):
         return math.nan
-    reach = max(constants.REACH_M, constants.REACH_SIGMAS * math.sqrt(P[ARC, ARC]))
-    speed = x[SPEED] - epoch.velocity_age_s * x[ACCELERATION]
+    reach = max(constants.REACH_M, constants.REACH_SIGMAS * math.sqrt(P[ix.ARC, ix.ARC]))
+    speed = x[ix.SPEED] - epoch.velocity_age_s * x[ix.ACCELERATION]
     square, least, point, axes = 0.0, math.inf, np.empty(3), np.empty((3, 3))
     for c in range(3):
         square += velocity[c] * velocity[c]
     direction = max(constants.DIRECTION_SHARE, math.sqrt(2.0) * line.sigma_plan_m / constants.MAP_CORRELATION_M)
     floor = constants.VELOCITY_FLOOR_MPS**2 + direction**2 * square
     for turn in (-1.0, 0.0, 1.0):
-        write_point(given.vertex, line, x[ARC] - epoch.velocity_age_s * speed + turn * reach, point, axes)
+        write_point(given.vertex, line, x[ix.ARC] - epoch.velocity_age_s * speed + turn * reach, point, axes)
         total = 0.0
         for k in range(2):
             away, variance = -speed if k == 0 else 0.0, floor
@@ -44,7 +45,7 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
                 for e in range(3):
                     variance += axes[k, c] * covariance[c, e] * axes[k, e]
             if k == 0:
-                variance += P[SPEED, SPEED]
+                variance += P[ix.SPEED, ix.SPEED]
             total += away * away / variance
         least = min(least, total)
     return least
@@ -101,9 +102,9 @@ def _is_contradicted_by_subfilter(state: State) -> bool:
     for b in range(len(state.source)):
         if state.source[b].running and state.source[b].contradicted_s > constants.LEVEL_DOUBT_S:
             return True
-    wrong = find_others(state) + WRONG_MAP
+    wrong = find_others(state) + ix.WRONG_MAP
     if wrong < 0 or not state.source[wrong].running:
         return False
     row = len(state.hypothesis) + wrong
-    reach = constants.BESIDE_SIGMAS * math.sqrt(state.P[row, MAP_RIGHT, MAP_RIGHT])
-    return bool(abs(state.x[row, MAP_RIGHT]) > max(constants.BESIDE_M, reach))
+    reach = constants.BESIDE_SIGMAS * math.sqrt(state.P[row, ix.MAP_RIGHT, ix.MAP_RIGHT])
+    return bool(abs(state.x[row, ix.MAP_RIGHT]) > max(constants.BESIDE_M, reach))

@@ -13,37 +13,12 @@ import numpy as np
 
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.tracking import constants
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
 from railfix.kernels.tracking.equations import linearise, new_equations
 from railfix.kernels.tracking.evidence import compute_evidence, refit_inflated_prior
 from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
-from railfix.kernels.tracking.layout import (
-    ACCELERATION,
-    ARC,
-    CODE,
-    DRIFT,
-    FORCE_OFFSET,
-    MOTION,
-    OFFSETS,
-    PHASE_CLOCK,
-    PREDICTION,
-    PREVIOUS_ARC,
-    RADAR,
-    RANGE_COLUMN,
-    REST,
-    REST_LOST,
-    SATELLITES,
-    SPEED,
-    TERMS,
-    WHEEL,
-    WHOLE,
-    WRONG_MAP,
-    Given,
-    Results,
-    Rows,
-    State,
-    Trace,
-)
+from railfix.kernels.tracking.layout import Given, Results, Rows, State, Trace
 from railfix.kernels.tracking.level import bound_speed, find_branches, write_level
 from railfix.kernels.tracking.line import excess_beyond_end, wrap_arc, write_point
 from railfix.kernels.tracking.measurements import choose_measurements, start_clocks
@@ -72,7 +47,7 @@ def _needs_search(given: Given, t: int, state: State) -> bool:
     doubtful = doubtful and monitors.measured_s > epoch.time_s - 1.5 * epoch.interval_s
     coded = False
     for k in range(given.channel.shape[1]):
-        coded = coded or given.channel[t, k].has[CODE]
+        coded = coded or given.channel[t, k].has[ix.CODE]
     gap = coded and epoch.time_s - monitors.measured_s > constants.GAP_S
     return bool(lost or gap or (doubtful and monitors.hypotheses <= parameters.most_hypotheses // 2))
 
@@ -84,20 +59,20 @@ def _reset_code_errors(given: Given, t: int, state: State) -> None:
         if given.fresh[t, i]:
             state.code_bias[i] = 0.0
             for row in range(len(state.x)):
-                state.x[row, SATELLITES + i] = 0.0
-                restart(state.P[row], SATELLITES + i, 1.0)
+                state.x[row, ix.SATELLITES + i] = 0.0
+                restart(state.P[row], ix.SATELLITES + i, 1.0)
 
 
 @inner
 def _wrap_closed_line(given: Given, state: State) -> None:
     """Let places beyond an end of a closed line go on where it closes."""
     for h in range(state.monitors[0].hypotheses):
-        back = wrap_arc(given.vertex, given.line[0], state.x[h, ARC]) - state.x[h, ARC]
+        back = wrap_arc(given.vertex, given.line[0], state.x[h, ix.ARC]) - state.x[h, ix.ARC]
         if back != 0.0:
-            state.x[h, ARC] += back
+            state.x[h, ix.ARC] += back
             state.hypothesis[h].origin_m += back
             if h == 0:
-                state.x[len(state.hypothesis) :, ARC] += back
+                state.x[len(state.hypothesis) :, ix.ARC] += back
 
 
 @inner
@@ -108,7 +83,7 @@ def _predict_all(given: Given, t: int, state: State) -> None:
         predict(given, t, state.x[h], state.P[h], monitors.map_log_variance, 0.0, scratch)
     for b in range(len(state.source)):
         if state.source[b].running:
-            wrong_m = given.parameters[0].level_map_m if b == find_others(state) + WRONG_MAP else 0.0
+            wrong_m = given.parameters[0].level_map_m if b == find_others(state) + ix.WRONG_MAP else 0.0
             predict(given, t, state.x[first + b], state.P[first + b], monitors.map_log_variance, wrong_m, scratch)
 
 
@@ -116,8 +91,8 @@ def _predict_all(given: Given, t: int, state: State) -> None:
 def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) -> Correction:
     """Return the correction of a predicted hypothesis up to its innovations."""
     x, P, equations, restarted = state.x[h].copy(), state.P[h].copy(), new_equations(rows), np.zeros(3, dtype=np.bool_)
-    linearise(given, t, rows, x, (x[ARC], x[PREVIOUS_ARC]), state.monitors[0].direction, equations)
-    add_bend(given, (x[ARC], x[PREVIOUS_ARC]), P)
+    linearise(given, t, rows, x, (x[ix.ARC], x[ix.PREVIOUS_ARC]), state.monitors[0].direction, equations)
+    add_bend(given, (x[ix.ARC], x[ix.PREVIOUS_ARC]), P)
     start_clocks(given, t, rows, state.offset_known, x, P, equations, restarted)
     covariance, without_clock = predict_quantities(P, equations)
     return Correction(
@@ -149,7 +124,7 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
         if doubtful:
             refit_inflated_prior(rows, degrees, rounds, one)
         correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
-        furthest = max(furthest, abs(one.x[ARC] - one.x_prior[ARC]))
+        furthest = max(furthest, abs(one.x[ix.ARC] - one.x_prior[ix.ARC]))
     for _ in range(constants.RELINEARISED):
         if furthest < constants.MOVED_M:
             break
@@ -162,15 +137,15 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
 @inner
 def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction) -> float:
     """Correct a hypothesis again with equations about the corrected place; return how far it moves from there [m]."""
-    parameters, arc = given.parameters[0], one.x[ARC]
+    parameters, arc = given.parameters[0], one.x[ix.ARC]
     degrees = parameters.degrees_of_freedom, parameters.late_degrees_of_freedom
-    linearise(given, t, rows, one.x_prior, (arc, one.x[PREVIOUS_ARC]), state.monitors[0].direction, one.equations)
+    linearise(given, t, rows, one.x_prior, (arc, one.x[ix.PREVIOUS_ARC]), state.monitors[0].direction, one.equations)
     covariance, without_clock = predict_quantities(one.P_prior, one.equations)
     one.covariance[:], one.without_clock[:] = covariance, without_clock
     reweight(rows, one.equations, covariance, rows.variance, degrees, constants.PASSES, one.fit)
     one.x[:], one.P[:] = one.x_prior, one.P_prior
     correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
-    return float(abs(one.x[ARC] - arc))
+    return float(abs(one.x[ix.ARC] - arc))
 
 
 @inner
@@ -182,7 +157,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
     points, axes = np.empty((count, 3)), np.empty((3, 3))
     for h in range(count):
         motion[h], code[h] = compute_evidence(rows, degrees, constants.PASSES, corrections[h])
-        arc[h] = corrections[h].x[ARC]
+        arc[h] = corrections[h].x[ix.ARC]
         write_point(given.vertex, given.line[0], arc[h], points[h], axes)
     reweigh(parameters, state, motion, code, points, arc, given.epoch[t].interval_s)
 
@@ -205,9 +180,9 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leads)
     if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have led the place so far
-        state.P[:, ARC, ARC] += constants.INFLATED_M**2
+        state.P[:, ix.ARC, ix.ARC] += constants.INFLATED_M**2
     square = compute_contradiction(given, t, state, leads)
-    beyond_m = excess_beyond_end(given.line[0], best.x[ARC], math.sqrt(best.P[ARC, ARC]))
+    beyond_m = excess_beyond_end(given.line[0], best.x[ix.ARC], math.sqrt(best.P[ix.ARC, ix.ARC]))
     update_monitors(state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
     return leads
 
@@ -228,7 +203,7 @@ def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, res
             if rows.left_out[j]:
                 channel.faulty = True
     for j in range(rows.sensor.start, rows.sensor.stop):
-        kind = min(rows.channel[j], RANGE_COLUMN)
+        kind = min(rows.channel[j], ix.RANGE_COLUMN)
         result.used[3 + kind] += factor * weight[j] > 0.5
         result.sensed[kind] = one.innovation[j]
 
@@ -244,22 +219,22 @@ def _write_trace(given: Given, t: int, rows: Rows, corrections: list[Correction]
             trace.variance[h, j] = rows.variance[j] / one.fit.weight[j]
             for q in range(len(unknown)):
                 if codes <= j < rows.sensor.start:
-                    factor = one.equations.design[j, q - codes] if codes <= q < codes + MOTION else 0.0
+                    factor = one.equations.design[j, q - codes] if codes <= q < codes + ix.MOTION else 0.0
                 else:
-                    factor = 1.0 if q == (j if j < codes else j - rows.sensor.start + codes + MOTION) else 0.0
+                    factor = 1.0 if q == (j if j < codes else j - rows.sensor.start + codes + ix.MOTION) else 0.0
                 if factor != 0.0:
-                    for k in range(TERMS):
+                    for k in range(ix.TERMS):
                         trace.row[h, j, unknown[q, k]] += factor * coefficient[q, k]
-        trace.restarted[h, PHASE_CLOCK], trace.restarted[h, DRIFT] = one.restarted[0], one.restarted[1]
+        trace.restarted[h, ix.PHASE_CLOCK], trace.restarted[h, ix.DRIFT] = one.restarted[0], one.restarted[1]
         if codes:
-            trace.restarted[h, OFFSETS + given.channel[t, rows.channel[0]].clock] = one.restarted[2]
+            trace.restarted[h, ix.OFFSETS + given.channel[t, rows.channel[0]].clock] = one.restarted[2]
 
 
 @inner
 def _finish(given: Given, t: int, leads: int, state: State, trace: Trace) -> None:
     """Count direction, time and distance on the branches, and prune the hypotheses."""
     monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
-    speed = state.x[leads, SPEED]
+    speed = state.x[leads, ix.SPEED]
     if abs(speed) > constants.DIRECTION_MPS:
         monitors.direction = math.copysign(1.0, speed)
     monitors.branch_s += dt
@@ -281,7 +256,7 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
     """Write place, speed, level and status; `status` is that of an epoch without doubt and other branches."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
-    sigma = math.sqrt(P[ARC, ARC])
+    sigma = math.sqrt(P[ix.ARC, ix.ARC])
     result.hypotheses, result.probability = monitors.hypotheses, math.exp(state.hypothesis[0].log_probability)
     if not sigma <= constants.EXPIRED_SIGMA_M:
         result.status = constants.EXPIRED
@@ -291,10 +266,10 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
     for a in range(len(branches.sigma_m)):
         own = branches.straight_m[a] ** 2 + branches.sigma_m[a] ** 2
         spread += branches.probability[a] * (own - sigma * sigma)
-    result.arc_m, result.sigma_m = x[ARC], math.sqrt(spread)
-    result.speed_mps, result.speed_sigma_mps = x[SPEED], math.sqrt(P[SPEED, SPEED])
-    result.acceleration_mps2 = x[ACCELERATION]
-    result.wheel_scale, result.force_offset_mps2, result.radar_scale = x[WHEEL], x[FORCE_OFFSET], x[RADAR]
+    result.arc_m, result.sigma_m = x[ix.ARC], math.sqrt(spread)
+    result.speed_mps, result.speed_sigma_mps = x[ix.SPEED], math.sqrt(P[ix.SPEED, ix.SPEED])
+    result.acceleration_mps2 = x[ix.ACCELERATION]
+    result.wheel_scale, result.force_offset_mps2, result.radar_scale = x[ix.WHEEL], x[ix.FORCE_OFFSET], x[ix.RADAR]
     result.map_scale = math.exp(0.5 * monitors.map_log_variance)
     if far > parameters.level_risk:
         monitors.ambiguity_hold_s = constants.LEVEL_HOLD_S
@@ -326,8 +301,8 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
         if len(corrections) > 1:
             _reweigh_hypotheses(given, t, state, rows, corrections)
         first = corrections[0]
-        sigma = math.sqrt(first.P[SPEED, SPEED])
-        believed = narrow_speed_range(given.parameters[0], monitors, rows, first.x[SPEED], sigma, dt)
+        sigma = math.sqrt(first.P[ix.SPEED, ix.SPEED])
+        believed = narrow_speed_range(given.parameters[0], monitors, rows, first.x[ix.SPEED], sigma, dt)
         if believed:
             leads = _commit_update(given, t, state, rows, corrections, shift)
             if len(trace.prior):
@@ -340,7 +315,7 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
     if not believed:  # the prediction goes on
         leads = find_leading(state.hypothesis, monitors.hypotheses)
         monitors.level_hold_s = max(monitors.level_hold_s - dt, 0.0)
-    monitors.distance_since_code_m += abs(state.x[leads, SPEED]) * dt
+    monitors.distance_since_code_m += abs(state.x[leads, ix.SPEED]) * dt
     if believed and rows.code.stop > 0:
         monitors.distance_since_code_m = 0.0
     _finish(given, t, leads, state, trace)
@@ -352,18 +327,18 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
 def advance(given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], part: int) -> int:
     """Do the epochs of a span; return the first before which places have to be sought, or the end of the span.
 
-    `part` says what of an epoch is done: `layout.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
+    `part` says what of an epoch is done: `index.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
     """
     for t in range(span[0], span[1]):
-        if part < REST:
-            if given.epoch[t].begins or (part == WHOLE and _needs_search(given, t, state)):
+        if part < ix.REST:
+            if given.epoch[t].begins or (part == ix.WHOLE and _needs_search(given, t, state)):
                 return t
             _reset_code_errors(given, t, state)
             _wrap_closed_line(given, state)
             _predict_all(given, t, state)
-            if part == PREDICTION:
+            if part == ix.PREDICTION:
                 return t
-        _advance_epoch(given, t, state, results, trace, part == REST_LOST)
-        if not math.isfinite(state.x[0, ARC]):
+        _advance_epoch(given, t, state, results, trace, part == ix.REST_LOST)
+        if not math.isfinite(state.x[0, ix.ARC]):
             return t + 1
     return span[1]

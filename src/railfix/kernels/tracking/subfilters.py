@@ -14,30 +14,9 @@ import numpy as np
 from railfix.core.arrays import Floats, Masks
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.equations import linearise, new_equations, shift_sensors
-from railfix.kernels.tracking.layout import (
-    ALL_DOPPLERS,
-    ALL_IN_VIEW,
-    ALL_PHASES,
-    ARC,
-    CLOCK_COUNT,
-    CODE_CLOCK,
-    CODES_AHEAD,
-    CODES_BEHIND,
-    DRIFT,
-    MAP_LENGTH_ERROR,
-    MAP_RIGHT,
-    MAP_UP,
-    OFFSETS,
-    OTHERS,
-    PHASE_CLOCK,
-    PREVIOUS_ARC,
-    RANGE_COLUMN,
-    WRONG_MAP,
-    Given,
-    Rows,
-    State,
-)
+from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.model import add_bend, restart
 from railfix.kernels.tracking.update import (
@@ -57,7 +36,7 @@ from railfix.kernels.tracking.update import (
 @inner
 def find_others(state: State) -> int:
     """Return the index of the first source after the sensors, negative where levels are off."""
-    return len(state.source) - OTHERS
+    return len(state.source) - ix.OTHERS
 
 
 @inner
@@ -70,14 +49,14 @@ def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
         constellations += not needed[clock]
         needed[clock] = True
     if constellations < 2:
-        needed[satellites : satellites + CLOCK_COUNT] = False
+        needed[satellites : satellites + ix.CLOCK_COUNT] = False
     for j in range(rows.code.start, rows.doppler.stop):
         needed[given.channel[t, rows.channel[j]].satellite] = True
     for j in range(rows.sensor.start, rows.sensor.stop):
-        needed[satellites + CLOCK_COUNT + min(rows.channel[j], RANGE_COLUMN)] = True
-    needed[others + ALL_DOPPLERS] = rows.doppler.stop > rows.doppler.start
-    needed[others + ALL_PHASES] = rows.phase.stop > rows.phase.start
-    for b in (CODES_AHEAD, CODES_BEHIND, WRONG_MAP):
+        needed[satellites + ix.CLOCK_COUNT + min(rows.channel[j], ix.RANGE_COLUMN)] = True
+    needed[others + ix.ALL_DOPPLERS] = rows.doppler.stop > rows.doppler.start
+    needed[others + ix.ALL_PHASES] = rows.phase.stop > rows.phase.start
+    for b in (ix.CODES_AHEAD, ix.CODES_BEHIND, ix.WRONG_MAP):
         needed[others + b] = rows.code.stop > 0
     return needed
 
@@ -92,7 +71,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     has become the filter: pairs are compared with it.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
-    all_in_view = find_others(state) + ALL_IN_VIEW
+    all_in_view = find_others(state) + ix.ALL_IN_VIEW
     before = False
     for b in range(len(source)):
         before = before or (source[b].running and leads == 0)
@@ -117,8 +96,8 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
             x[:], P[:] = state.x[first + all_in_view], state.P[first + all_in_view]
             one.running, one.contradicted_s = True, 0.0
         if one.running:
-            at = x[ARC], x[PREVIOUS_ARC]
-            if b == all_in_view - ALL_IN_VIEW + WRONG_MAP:
+            at = x[ix.ARC], x[ix.PREVIOUS_ARC]
+            if b == all_in_view - ix.ALL_IN_VIEW + ix.WRONG_MAP:
                 rotate_map_error(given, x, P)
             add_bend(given, at, P)
             if (satellite or b == all_in_view) and not needed[b] and _has_joined(x, P, best):
@@ -136,9 +115,9 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
 @inner
 def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
     """Return whether a sub-filter has become the filter: place and sigma within `JOINED`."""
-    sigma = math.sqrt(P[ARC, ARC])
-    near = abs(x[ARC] - best.x_prior[ARC]) < constants.JOINED * sigma
-    return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ARC, ARC])
+    sigma = math.sqrt(P[ix.ARC, ix.ARC])
+    near = abs(x[ix.ARC] - best.x_prior[ix.ARC]) < constants.JOINED * sigma
+    return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ix.ARC, ix.ARC])
 
 
 @inner
@@ -151,12 +130,12 @@ def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -
         x[:], P[:] = best.x_prior, best.P_prior
     else:
         x[:], P[:] = 0.0, 0.0
-        x[ARC] = x[PREVIOUS_ARC] = best.x_prior[ARC]
+        x[ix.ARC] = x[ix.PREVIOUS_ARC] = best.x_prior[ix.ARC]
         for c in range(len(x)):
             P[c, c] = given.start_variance[c]
-    if b == find_others(state) + WRONG_MAP:
-        P[MAP_RIGHT, MAP_RIGHT] += given.parameters[0].level_map_m ** 2
-        P[MAP_UP, MAP_UP] += given.parameters[0].level_map_m ** 2
+    if b == find_others(state) + ix.WRONG_MAP:
+        P[ix.MAP_RIGHT, ix.MAP_RIGHT] += given.parameters[0].level_map_m ** 2
+        P[ix.MAP_UP, ix.MAP_UP] += given.parameters[0].level_map_m ** 2
 
 
 @inner
@@ -166,24 +145,24 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
     It is in the distance on the map, not in that of the phases. What was along before is not known.
     """
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    write_point(given.vertex, given.line[0], x[ARC], point, axes)
-    write_point(given.vertex, given.line[0], x[PREVIOUS_ARC], point, before)
+    write_point(given.vertex, given.line[0], x[ix.ARC], point, axes)
+    write_point(given.vertex, given.line[0], x[ix.PREVIOUS_ARC], point, before)
     along = right = 0.0
     for c in range(3):
         along += before[1, c] * axes[0, c]
         right += before[1, c] * axes[1, c]
-    x[ARC] += along * x[MAP_RIGHT]
-    x[MAP_LENGTH_ERROR] -= along * x[MAP_RIGHT]
-    x[MAP_RIGHT] *= right
+    x[ix.ARC] += along * x[ix.MAP_RIGHT]
+    x[ix.MAP_LENGTH_ERROR] -= along * x[ix.MAP_RIGHT]
+    x[ix.MAP_RIGHT] *= right
     for c in range(len(x)):
-        P[ARC, c] += along * P[MAP_RIGHT, c]
-        P[MAP_LENGTH_ERROR, c] -= along * P[MAP_RIGHT, c]
-        P[MAP_RIGHT, c] *= right
+        P[ix.ARC, c] += along * P[ix.MAP_RIGHT, c]
+        P[ix.MAP_LENGTH_ERROR, c] -= along * P[ix.MAP_RIGHT, c]
+        P[ix.MAP_RIGHT, c] *= right
     for c in range(len(x)):
-        P[c, ARC] += along * P[c, MAP_RIGHT]
-        P[c, MAP_LENGTH_ERROR] -= along * P[c, MAP_RIGHT]
-        P[c, MAP_RIGHT] *= right
-    P[MAP_RIGHT, MAP_RIGHT] += (along * given.parameters[0].level_map_m) ** 2
+        P[c, ix.ARC] += along * P[c, ix.MAP_RIGHT]
+        P[c, ix.MAP_LENGTH_ERROR] -= along * P[c, ix.MAP_RIGHT]
+        P[c, ix.MAP_RIGHT] *= right
+    P[ix.MAP_RIGHT, ix.MAP_RIGHT] += (along * given.parameters[0].level_map_m) ** 2
 
 
 @inner
@@ -194,21 +173,21 @@ def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equa
     leading hypothesis; their coefficients of the arc length tell which satellites are ahead.
     """
     satellites, others, variance = len(state.code_bias), find_others(state), rows.variance.copy()
-    if b < satellites + CLOCK_COUNT:
+    if b < satellites + ix.CLOCK_COUNT:
         for j in range(rows.code.start, rows.doppler.stop):
             channel = given.channel[t, rows.channel[j]]
             if b in (channel.satellite, satellites + channel.clock):
                 variance[j] = math.inf
     elif b < others:
         for j in range(rows.sensor.start, rows.sensor.stop):
-            if b == satellites + CLOCK_COUNT + min(rows.channel[j], RANGE_COLUMN):
+            if b == satellites + ix.CLOCK_COUNT + min(rows.channel[j], ix.RANGE_COLUMN):
                 variance[j] = math.inf
-    elif b == others + ALL_DOPPLERS:
+    elif b == others + ix.ALL_DOPPLERS:
         variance[rows.doppler] = math.inf
-    elif b == others + ALL_PHASES:
+    elif b == others + ix.ALL_PHASES:
         variance[rows.phase] = math.inf
-    elif b in (others + CODES_AHEAD, others + CODES_BEHIND):
-        side = 1.0 if b == others + CODES_AHEAD else -1.0
+    elif b in (others + ix.CODES_AHEAD, others + ix.CODES_BEHIND):
+        side = 1.0 if b == others + ix.CODES_AHEAD else -1.0
         for j in range(rows.code.start, rows.code.stop):
             if side * equations.coefficient[j, 0] < -constants.AHEAD:  # moving ahead shortens its range
                 variance[j] = math.inf
@@ -230,13 +209,13 @@ def _correct(
     x, P = gaussian
     for k in range(3):
         if best.restarted[k]:
-            unknown = PHASE_CLOCK if k == 0 else DRIFT
+            unknown = ix.PHASE_CLOCK if k == 0 else ix.DRIFT
             if k == 2:
-                unknown = OFFSETS + given.channel[t, rows.channel[0]].clock
+                unknown = ix.OFFSETS + given.channel[t, rows.channel[0]].clock
             x[unknown] = best.x_prior[unknown]
             restart(P, unknown, best.P_prior[unknown, unknown])
-    x[CODE_CLOCK] = best.x_prior[CODE_CLOCK]
-    linearise(given, t, rows, x, (x[ARC], x[PREVIOUS_ARC]), 1.0, equations)
+    x[ix.CODE_CLOCK] = best.x_prior[ix.CODE_CLOCK]
+    linearise(given, t, rows, x, (x[ix.ARC], x[ix.PREVIOUS_ARC]), 1.0, equations)
     shift_sensors(rows, x, best.x_prior, best.equations, equations)
     covariance, without_clock = predict_quantities(P, equations)
     degrees = given.parameters[0].degrees_of_freedom, given.parameters[0].late_degrees_of_freedom
@@ -256,5 +235,5 @@ def _update_contradiction(given: Given, t: int, rows: Rows, state: State, b: int
         one.contradicted_s += given.epoch[t].interval_s
     elif rows.code.stop > 0:
         one.contradicted_s = 0.0
-    if not math.isfinite(state.x[len(state.hypothesis) + b, ARC]):  # it restarts, and bounds nothing before
+    if not math.isfinite(state.x[len(state.hypothesis) + b, ix.ARC]):  # it restarts, and bounds nothing before
         one.contradicted_s = constants.LOST_MOTION_S + constants.LEVEL_DOUBT_S

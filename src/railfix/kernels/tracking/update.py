@@ -25,7 +25,8 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import CLOCK_TERM, M_CLOCK, M_DRIFT, MOTION, TERMS, Rows
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Rows
 
 
 class Equations(NamedTuple):
@@ -115,18 +116,18 @@ def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))
     for j in range(size):
         g[:] = 0.0
-        for k in range(CLOCK_TERM):
+        for k in range(ix.CLOCK_TERM):
             if coefficient[j, k] != 0.0:
                 add_row(g, coefficient[j, k], P, unknown[j, k])
         total = 0.0
-        for k in range(CLOCK_TERM):
+        for k in range(ix.CLOCK_TERM):
             total += coefficient[j, k] * g[unknown[j, k]]
         without_clock[j] = total
-        if coefficient[j, CLOCK_TERM] != 0.0:
-            add_row(g, coefficient[j, CLOCK_TERM], P, unknown[j, CLOCK_TERM])
+        if coefficient[j, ix.CLOCK_TERM] != 0.0:
+            add_row(g, coefficient[j, ix.CLOCK_TERM], P, unknown[j, ix.CLOCK_TERM])
         for i in range(j + 1):
             total = 0.0
-            for k in range(TERMS):
+            for k in range(ix.TERMS):
                 total += coefficient[i, k] * g[unknown[i, k]]
             covariance[i, j] = covariance[j, i] = total
     return covariance, without_clock
@@ -140,29 +141,29 @@ def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats,
     is 0.
     """
     design, value = equations.design, equations.value
-    diagonal = np.empty(MOTION)
+    diagonal = np.empty(ix.MOTION)
     T[:], z[:] = 0.0, 0.0
     for j in range(rows.phase.start, rows.doppler.stop):
         information = weight[j] / variance[j]
-        for a in range(MOTION):
+        for a in range(ix.MOTION):
             f = information * design[j, a]
             if f != 0.0:
                 z[a] += f * value[j]
-                for b in range(a, MOTION):
+                for b in range(a, ix.MOTION):
                     T[a, b] += f * design[j, b]
-    for a in range(MOTION):
+    for a in range(ix.MOTION):
         diagonal[a] = T[a, a]
-    for a in range(MOTION):
+    for a in range(ix.MOTION):
         if T[a, a] <= constants.LEAST_PIVOT * diagonal[a]:
             z[a], T[a] = 0.0, 0.0
             continue
         scale = 1.0 / math.sqrt(T[a, a])
         z[a] *= scale
-        for b in range(a, MOTION):
+        for b in range(a, ix.MOTION):
             T[a, b] *= scale
-        for c in range(a + 1, MOTION):
+        for c in range(a + 1, ix.MOTION):
             z[c] -= T[a, c] * z[a]
-            for b in range(c, MOTION):
+            for b in range(c, ix.MOTION):
                 T[c, b] -= T[a, c] * T[a, b]
 
 
@@ -206,11 +207,11 @@ def write_first_weights(
     design, value, codes = equations.design, equations.value, rows.code.stop
     for kind in range(2):
         own = rows.phase if kind == 0 else rows.doppler
-        clock, middle = M_CLOCK if kind == 0 else M_DRIFT, median(value[own])
+        clock, middle = ix.M_CLOCK if kind == 0 else ix.M_DRIFT, median(value[own])
         for j in range(own.start, own.stop):
             spread = 0.0
-            for a in range(MOTION):
-                for b in range(MOTION):
+            for a in range(ix.MOTION):
+                for b in range(ix.MOTION):
                     if a != clock and b != clock:
                         spread += design[j, a] * design[j, b] * covariance[codes + a, codes + b]
             away = value[j] - middle
@@ -220,7 +221,7 @@ def write_first_weights(
         away = value[j] - middle
         weight[j] = compute_weight(away * away / (without_clock[j] + variance[j]), away > 0.0, degrees)
     for j in range(rows.sensor.start, rows.sensor.stop):
-        spread = without_clock[codes + MOTION + j - rows.sensor.start]
+        spread = without_clock[codes + ix.MOTION + j - rows.sensor.start]
         weight[j] = compute_weight(value[j] * value[j] / (spread + variance[j]), False, degrees)
 
 
@@ -229,22 +230,22 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
     """Correct the quantities, ``N(0, covariance)``, at the weights of `found`; write the rest of it."""
     size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
     mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
-    T, z = np.empty((MOTION, MOTION)), np.empty(MOTION)
+    T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
     compress(rows, equations, variance, weight, T, z)
     log_determinant = square = 0.0
     for q in range(size):
-        if codes <= q < codes + MOTION:
+        if codes <= q < codes + ix.MOTION:
             r = q - codes
             if T[r, r] == 0.0:
                 continue
             g[:], y, S, noise = 0.0, z[r], 1.0, 1.0
-            for c in range(r, MOTION):
+            for c in range(r, ix.MOTION):
                 add_row(g, T[r, c], C, codes + c)
                 y -= T[r, c] * mean[codes + c]
-            for c in range(r, MOTION):
+            for c in range(r, ix.MOTION):
                 S += T[r, c] * g[codes + c]
         else:
-            j = q if q < codes else q - codes - MOTION + rows.sensor.start
+            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
             if variance[j] == math.inf:
                 continue
             g[:], noise = C[q], variance[j] / weight[j]
@@ -252,9 +253,9 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
         correct(mean, C, g, y, S, gain)
         log_determinant += math.log(S / noise)
         square += y * y / S
-    for r in range(MOTION):
+    for r in range(ix.MOTION):
         rest = z[r]
-        for c in range(r, MOTION):
+        for c in range(r, ix.MOTION):
             rest -= T[r, c] * mean[codes + c]
         square -= rest * rest
     square -= _write_residuals(rows, equations, mean, C, variance, found)
@@ -268,12 +269,12 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
     for j in range(rows.sensor.stop):
         residual, fitted = value[j], 0.0
         if codes <= j < rows.sensor.start:
-            for a in range(MOTION):
+            for a in range(ix.MOTION):
                 residual -= design[j, a] * mean[codes + a]
-                for b in range(MOTION):
+                for b in range(ix.MOTION):
                     fitted += design[j, a] * design[j, b] * C[codes + a, codes + b]
         else:
-            q = j if j < codes else j - rows.sensor.start + codes + MOTION
+            q = j if j < codes else j - rows.sensor.start + codes + ix.MOTION
             residual, fitted = residual - mean[q], C[q, q]
             if variance[j] < math.inf:
                 square += found.weight[j] * residual * residual / variance[j]
@@ -315,21 +316,21 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
     """Correct the state by all measurements of finite variance at their weights, one after the other."""
     codes, size, value = rows.code.stop, len(equations.unknown), equations.value
     change, g, gain = np.zeros(len(x)), np.empty(len(x)), np.empty(len(x))
-    T, z = np.empty((MOTION, MOTION)), np.empty(MOTION)
+    T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
     compress(rows, equations, variance, weight, T, z)
     for q in range(size):
         g[:] = 0.0
-        if codes <= q < codes + MOTION:
+        if codes <= q < codes + ix.MOTION:
             r = q - codes
             if T[r, r] == 0.0:
                 continue
             y, S = z[r], 1.0
-            for c in range(r, MOTION):
+            for c in range(r, ix.MOTION):
                 y -= _add_quantity(equations, codes + c, T[r, c], P, change, g)
-            for c in range(r, MOTION):
+            for c in range(r, ix.MOTION):
                 S += T[r, c] * _project(equations, codes + c, g)
         else:
-            j = q if q < codes else q - codes - MOTION + rows.sensor.start
+            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
             if variance[j] == math.inf:
                 continue
             y = value[j] - _add_quantity(equations, q, 1.0, P, change, g)
@@ -343,7 +344,7 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
 def _project(equations: Equations, q: int, vector: Floats) -> float:
     """Return ``h' vector`` of a quantity h."""
     total = 0.0
-    for k in range(TERMS):
+    for k in range(ix.TERMS):
         total += equations.coefficient[q, k] * vector[equations.unknown[q, k]]
     return total
 
@@ -352,7 +353,7 @@ def _project(equations: Equations, q: int, vector: Floats) -> float:
 def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, change: Floats, g: Floats) -> float:
     """Add a multiple of ``P h`` of a quantity h to g; return the same multiple of ``h' change``."""
     total = 0.0
-    for k in range(TERMS):
+    for k in range(ix.TERMS):
         f = factor * equations.coefficient[q, k]
         if f != 0.0:
             total += f * change[equations.unknown[q, k]]

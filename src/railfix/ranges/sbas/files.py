@@ -16,7 +16,8 @@ from railfix.core.arrays import Bytes, Integers
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
-from railfix.io.receiver.framing import SbasFrames, is_receiver_log, read_head
+from railfix.io.file_kind import find_kind, wrong_kind
+from railfix.io.receiver.framing import SbasFrames
 from railfix.io.receiver.log import scan_pieces
 from railfix.ranges.sbas.messages import (
     PREAMBLES,
@@ -58,9 +59,7 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
         if text[60:80].startswith("RINEX VERSION / TYPE"):
             if text[20:21] == "B":
                 return "rinex"
-            raise InputFileError(
-                path, f"is RINEX of type {text[20:21]!r}, type B (broadcast data) was expected", line=1
-            )
+            raise wrong_kind(path, "a log of SBAS messages, or RINEX of type B,")
         if _RTKLIB.fullmatch(line):
             return "rtklib"
         if _EMS.fullmatch(line):
@@ -207,17 +206,17 @@ def read_sbas(
         RXM-SFRBX of SBAS, SBF with GEORawL1 or GEORawL5), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
         A line that is no message stops the reading, or is counted under "line" in `rejected` and
-        named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
-        left out and counted in either case.
+        named in `notes`. A message with a wrong parity or preamble was damaged: it is left out and counted in either
+        case.
 
     band : {"L1", "L5"}
-        Frequency of the messages; those of the other have another preamble, and are left out as such.
+        Frequency of the messages; messages of the other band have another preamble, and are left out for that reason.
 
     Returns
     -------
     SbasMessages
-        In the order of reception. Times of RTKLIB and EMS files are taken as the ends of the
-        messages, those of RINEX, which are of the first bit, become so by adding 1 s.
+        In the order of reception. Times of RTKLIB and EMS files are used as the ends of the messages; times of RINEX,
+        which are of the first bit, are increased by 1 s.
 
     Raises
     ------
@@ -263,7 +262,7 @@ def _gather_frames(frames: SbasFrames, number: int, gathered: _Gathered, band: B
 
 
 def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gathered, band: Band) -> None:
-    if is_receiver_log(read_head(path)):
+    if find_kind(path) == "receiver":
         for piece in scan_pieces(path):
             _gather_frames(piece.sbas, number, gathered, band)
         return

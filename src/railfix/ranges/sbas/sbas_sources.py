@@ -85,7 +85,7 @@ class DfmcSource:
         return SourceDelays(delays, delays.sigma_m, delays.sigma_m, np.zeros(delays.sigma_m.shape))
 
 
-SBAS_SIGNAL: Final = "1C"  #: The signal that corrections are made for: GPS L1 C/A, as RINEX 3 calls it.
+SBAS_SIGNAL: Final = "1C"  #: Signal that the corrections are for: GPS L1 C/A, as RINEX 3 calls it.
 
 _REASON_OF: Final = {
     **dict.fromkeys(SatelliteState, Reason.SBAS_NO_CORRECTION),
@@ -109,7 +109,7 @@ _DFMC_REASON_OF: Final = {
     DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
     DfmcState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
 }
-#: The same of SBAS on L5.
+#: Reasons of the states of SBAS on L5.
 DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(DfmcState)], dtype=np.int64)
 
 
@@ -141,7 +141,7 @@ def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelle
 
 
 def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
-    """Satellites with long-term corrections applied to the records they are for, and reasons of the others (T, K)."""
+    """Satellites with long-term corrections applied to their records, and reasons of the others (T, K)."""
     moved = states.position_ecef_m + np.nan_to_num(fixes.position_m)
     clock = states.clock_m + SPEED_OF_LIGHT * np.nan_to_num(fixes.clock_s)
     return replace(states, position_ecef_m=moved, clock_m=clock), REASONS[fixes.state]

@@ -11,16 +11,16 @@ from railfix.core.arrays import Floats, Indices
 from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Curve, Layer, Marks, Points
 from railfix.report.plots.draw import draw_figure, save_figure
 from railfix.report.plots.line import LocalFrame
-from railfix.run.locate import Surveyed
-from railfix.track import TrackQuality
 from railfix.track.network import Network, end_points
-from railfix.track.network_match import Matched, PlanLog
-from railfix.track.network_read import NetworkQuality
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from railfix.run.locate import Surveyed
     from railfix.run.which_track import TrackDecision
+    from railfix.track import TrackQuality
+    from railfix.track.network_match import Matched, PlanLog
+    from railfix.track.network_read import NetworkQuality
 
 #: Points of tracks that are drawn at most; of larger networks every n-th one and the ends.
 _DRAWN: Final = 200_000

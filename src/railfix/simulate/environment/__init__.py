@@ -1,7 +1,7 @@
 """Multipath and blockage by structures along the line: masts, beams, buildings, slopes, roofs, tunnels.
 
 `EnvironmentSettings` describes the structures; `Environment` draws them from a seed and is a source
-of disturbances for `Scenario.multipath`. docs/simulator-multipath.md has the physics.
+of disturbances for `Scenario.multipath`. docs/simulator.md has the physics.
 """
 
 from railfix.simulate.environment.model import Environment

@@ -1,0 +1,93 @@
+"""Ranges of epochs that the signs of interference are looked for in, and least-squares fits of them."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.positioning.search_index import SearchIndex
+
+_TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
+_RIDGE: Final = 1e-9  #: Weight of the unknowns by themselves, for what a satellite is missing for.
+
+
+class MotionInputs(NamedTuple):
+    """Ranges of one antenna: T epochs by K channels."""
+
+    time: Datetimes  #: Shape (T,).
+    break_before: Masks  #: Shape (T,).
+    channel: Strings  #: Shape (K,).
+    group: Indices  #: Receiver clock of each channel, shape (K,).
+    near_ecef_m: Floats  #: Position, right to some kilometres; NaN without one; shape (T, 3).
+    #: Shape (T, K, 3).
+    sat_ecef_m: Floats
+    sat_velocity_mps: Floats
+    code_m: Floats  #: As observed, shape (T, K).
+    rate_mps: Floats  #: ``-lambda D``, shape (T, K).
+    #: Shape (T, K).
+    corrected_code_m: Floats
+    sigma_m: Floats
+    used: Masks  #: Channels without a reason against them, shape (T, K).
+    named: Masks  #: Channels that are wrong by themselves, and would be used otherwise; shape (T, K).
+    noise_scale: Floats  #: Shape (T,).
+    #: Known offsets between the receiver clocks, and their sigmas; shape (T, G).
+    clock_offset_m: Floats
+    clock_sigma_m: Floats
+    off_line_m: Floats  #: Distance of the 3-D position from the line across it; NaN beyond an end; shape (T,).
+    #: Codes are grossly wrong or named so, or the position failed a check; shape (T,).
+    doubted: Masks
+    antenna: Indices  #: Number of the antenna among `lines`, shape (T,).
+    lines: tuple[SearchIndex, ...]  #: Line of each antenna.
+
+    def take(self, rows: slice | Indices) -> MotionInputs:
+        """Return those of some epochs."""
+        own = {
+            n: values if n in ("channel", "group", "lines") else values[rows] for n, values in self._asdict().items()
+        }
+        return MotionInputs(**own)
+
+    def nearest_on_lines(self) -> tuple[Floats, Floats]:
+        """Return the nearest vertices of the lines to `near_ecef_m`, (T, 3), and axes across and up, (T, 2, 3)."""
+        point, axes = np.full(self.near_ecef_m.shape, np.nan), np.full((len(self.time), 2, 3), np.nan)
+        for number, line in enumerate(self.lines):
+            rows = np.flatnonzero((self.antenna == number) & np.isfinite(self.near_ecef_m[:, 0]))
+            vertex = np.asarray(line.tree.query(self.near_ecef_m[rows])[1], dtype=np.intp)
+            path = line.trajectory
+            point[rows], axes[rows] = path.ecef_m[vertex], path.get_axes(np.minimum(vertex, len(path) - 2))[:, 1:]
+        return point, axes
+
+
+def clock_columns(inputs: MotionInputs) -> Floats:
+    """Return the columns of the receiver clocks, shape (K, G)."""
+    return np.asarray(inputs.group[:, None] == np.arange(inputs.group.max(initial=-1) + 1), dtype=np.float64)
+
+
+def misfit_at(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
+    """Return positions (T, 3), unit vectors to the satellites (T, K, 3) and codes less ranges (T, K)."""
+    near = inputs.near_ecef_m
+    to_satellite = inputs.sat_ecef_m - near[:, None, :]
+    distance = np.linalg.norm(to_satellite, axis=2)
+    turn = inputs.sat_ecef_m[..., 0] * near[:, None, 1] - inputs.sat_ecef_m[..., 1] * near[:, None, 0]
+    return near, to_satellite / distance[..., None], inputs.corrected_code_m - distance - _TURN * turn
+
+
+def fit_epochs(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[Floats, Floats, Floats]:
+    """Return solutions, covariances and noise scales of weighted least squares; NaN below `least` redundant."""
+    has = (weight > 0) & np.isfinite(value) & np.isfinite(design).all(axis=2)
+    rows = np.where(has[..., None], design, 0.0)
+    y, w = np.where(has, value, 0.0), np.where(has, weight, 0.0)
+    weighted = rows * w[..., None]
+    normal = rows.swapaxes(1, 2) @ weighted
+    unknown = np.diagonal(normal, axis1=1, axis2=2) > 0.0
+    size = design.shape[2]
+    ridge = np.where(unknown, _RIDGE, 1.0)
+    covariance = np.linalg.inv(normal + ridge[:, :, None] * np.eye(size))
+    solution = (covariance @ (weighted * y[..., None]).sum(axis=1)[..., None])[..., 0]
+    left = y - (rows @ solution[..., None])[..., 0]
+    freedom = has.sum(axis=1) - unknown.sum(axis=1)
+    redundant = (freedom >= least) & unknown[:, :3].all(axis=1)
+    scale = np.sqrt((w * left**2).sum(axis=1) / np.maximum(freedom, 1))
+    return np.where(redundant[:, None], solution, np.nan), covariance, np.where(redundant, scale, np.nan)

@@ -1,0 +1,172 @@
+"""A common error of the time tags as a hypothesis: position, receiver clocks and the error fitted together.
+
+Satellites were where they are not at the tags, so that the column of the error is the range rate of the satellites with
+its sign changed. Bad codes and a train off its map are the other hypotheses: the error has to explain clearly more.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Masks, masked_median
+from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
+from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
+
+_RATE_MPS: Final = 500.0  #: Range rate of a satellite, by its order: unit of the column of the error [m/s].
+#: The error is a median over so many epochs at most and at least, none older than the window.
+_TAG_EPOCHS: Final = 10
+_TAG_LEAST: Final = 3
+_TAG_WINDOW: Final = np.timedelta64(60, "s")
+_STEPS: Final = 6  #: Steps of a fit at most; and up to which error [s] and position [m] a step is the last.
+_SETTLED_S: Final = 0.05
+_SETTLED_M: Final = 100.0
+_ROUNDS: Final = 2  #: Fits of each step, with the weights by the residuals before.
+_FITS_WELL: Final = 3.0  #: Residuals up to so many times the median one have their full weight.
+_SHOWN: Final = 3.0  #: Errors from so many standard deviations on are tested against the other hypotheses.
+_NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's position across and above its line.
+_LEAST_FREEDOM: Final = 2  #: Redundant ranges that agree on an error at least.
+#: Residuals up to so many standard deviations agree; larger ones cost no more. An error of the time tags takes one bad
+#: code in by itself, so that it has to cost less by more than one of these squared.
+_AGREES: Final = 5.0
+_CLEARLY_LESS: Final = 36.0
+_NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
+_ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])
+
+
+class TagErrors(NamedTuple):
+    """Errors of the time tags at single epochs and their standard deviations, shape (N,) each."""
+
+    time: Datetimes
+    error_s: Floats
+    sigma_s: Floats
+
+
+NO_TAGS: Final = TagErrors(np.zeros(0, dtype="datetime64[ns]"), np.zeros(0), np.zeros(0))
+
+
+class _TagFit(NamedTuple):
+    """Positions with an error of the time tags, T epochs."""
+
+    error_s: Floats  # (T,), + where the tags are late
+    sigma_s: Floats  # (T,)
+    place_ecef_m: Floats  # (T, 3)
+    residual: Floats  # (T, K + 2) over their standard deviations, those of the line last
+
+
+def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
+    """Return the common error of the time tags, + where they are late, and its standard deviation, shape (T,) [s].
+
+    Satellites that are named as wrong are fitted too, since an error of the tags makes them look wrong. Where the error
+    shows, or a position is in doubt, the line takes part; the standard deviation is infinite unless redundant rows
+    agree, and the residuals cost clearly less than those without an error and without the named satellites: of both
+    the squares of all codes and of the line, each of `_AGREES` at most.
+    """
+    every, start = inputs.used | inputs.named, _TagFit(np.zeros(len(inputs.time)), *[inputs.near_ecef_m] * 3)
+    error, sigma, place, _ = _fit(inputs, every, start, tags=True, line=False)
+    shown = np.flatnonzero(np.isfinite(error) & (inputs.doubted | (np.abs(error) > _SHOWN * sigma)))
+    if not len(shown):
+        return error, sigma
+    part, every, start = (
+        inputs.take(shown),
+        every[shown],
+        start._replace(error_s=error[shown], place_ecef_m=place[shown]),
+    )
+    found = _fit(part, every, start, tags=True, line=True)
+    other = start._replace(error_s=np.zeros(len(shown)), place_ecef_m=part.near_ecef_m)
+    without = _fit(part, part.used, other, tags=False, line=True).residual
+    # without a redundant range those that are left fit, and those that are named do not
+    without = np.where(np.isnan(without), np.where(_with_line(part.named, False), np.inf, 0.0), without)
+    rows = _with_line(every, True)
+    # of this fit, not that of the receiver, which an error of the tags takes for noise
+    noise = np.maximum(masked_median(found.residual, rows) / _NORMAL_MEDIAN, 1.0)[:, None]
+    costs = [np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, found.residual)]
+    unknowns = 4 + (clock_columns(part) * every[..., None]).any(axis=1).sum(axis=1)
+    proven = (rows & (costs[1] < _AGREES**2)).sum(axis=1) - unknowns >= _LEAST_FREEDOM
+    proven &= costs[0].sum(axis=1) - costs[1].sum(axis=1) > _CLEARLY_LESS
+    error[shown], sigma[shown] = found.error_s, np.where(proven, found.sigma_s, np.inf)
+    return error, sigma
+
+
+def _fit(inputs: MotionInputs, counted: Masks, start: _TagFit, *, tags: bool, line: bool) -> _TagFit:
+    """Return positions by the codes that are `counted` (T, K), with an error of the `tags`, and near the `line`."""
+    rows, place, late = np.arange(len(inputs.time)), start.place_ecef_m.copy(), start.error_s.copy()
+    sigma, residual = np.full(len(rows), np.nan), np.full((len(rows), counted.shape[1] + 2), np.nan)
+    for _ in range(_STEPS):
+        moved = _move_satellites(inputs.take(rows), late[rows])._replace(near_ecef_m=place[rows])
+        near, sight, misfit = misfit_at(moved)
+        clocks = clock_columns(moved)
+        rate = -(sight * moved.sat_velocity_mps).sum(axis=2, keepdims=True) / _RATE_MPS
+        columns = -sight, rate * tags, np.broadcast_to(clocks, (len(near), *clocks.shape))
+        point, axes = moved.nearest_on_lines() if line else (near, np.zeros((len(near), 2, 3)))
+        of_line = np.zeros((len(near), 2, 4 + clocks.shape[1]))
+        of_line[..., :3] = axes
+        step, of_error, left = _fit_robustly(
+            np.concatenate([np.concatenate(columns, axis=2), of_line], axis=1),
+            np.concatenate([misfit, np.einsum("tij,tj->ti", axes, point - near)], axis=1),
+            np.concatenate([1.0 / moved.sigma_m**2, np.full((len(near), 2), _NEAR_LINE_M**-2)], axis=1),
+            _with_line(counted[rows], line),
+        )  # fmt: skip
+        late[rows], place[rows] = late[rows] + step[:, 3] / _RATE_MPS, near + step[:, :3]
+        sigma[rows], residual[rows] = of_error / _RATE_MPS, left
+        again = (np.abs(step[:, 3]) > _SETTLED_S * _RATE_MPS) | (np.linalg.norm(step[:, :3], axis=1) > _SETTLED_M)
+        rows = rows[again]
+        if not len(rows):
+            break
+    return _TagFit(late, sigma, place, residual)
+
+
+def _with_line(channels: Masks, line: bool) -> Masks:
+    """Return a mask of channels, shape (T, K), and of the two rows of the line, shape (T, K + 2)."""
+    return np.concatenate([channels, np.full((len(channels), 2), line)], axis=1)
+
+
+def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks) -> tuple[Floats, Floats, Floats]:
+    """Return solutions, standard deviations of the fourth unknown, and residuals over their standard deviations.
+
+    Rows that are `counted` are fitted, those that fit badly with less weight; of others there are residuals alone.
+    """
+    now = full = np.where(counted, weight, 0.0)
+    for _ in range(_ROUNDS):
+        step, covariance, scale = fit_epochs(design, value, now, least=0)
+        left = np.abs(value - (design @ step[..., None])[..., 0]) * np.sqrt(weight)
+        typical = masked_median(left, full > 0)[:, None]
+        now = full / np.maximum(left / np.maximum(_FITS_WELL * typical, 1.0), 1.0) ** 2
+    return step, np.maximum(scale, 1.0) * np.sqrt(covariance[:, 3, 3]), left
+
+
+def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
+    """Return the ranges with the satellites where they were `late_s` before, shape (T,)."""
+    place, velocity, before = inputs.sat_ecef_m, inputs.sat_velocity_mps, -late_s[:, None, None]
+    gravity = -GM_GPS / np.linalg.norm(place, axis=2, keepdims=True) ** 3 + EARTH_ROTATION_RATE**2 * _ACROSS_AXIS
+    coriolis = 2.0 * EARTH_ROTATION_RATE * np.stack([velocity[..., 1], -velocity[..., 0], 0.0 * velocity[..., 0]], 2)
+    acceleration = gravity * place + coriolis
+    return inputs._replace(
+        sat_ecef_m=place + velocity * before + 0.5 * acceleration * before**2,
+        sat_velocity_mps=velocity + acceleration * before,
+    )
+
+
+def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
+    """Return the median error of the time tags over the last epochs, also in standard deviations, and those to keep.
+
+    The standard deviation is the median one of the epochs, or that of their spread where it is larger. NaN for fewer
+    than `_TAG_LEAST` epochs.
+    """
+    tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
+    lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))
+    time, error, sigma = (
+        np.lib.stride_tricks.sliding_window_view(np.concatenate([a, b]), _TAG_EPOCHS)[len(before.time) :]
+        for a, b in zip(lead, tags, strict=True)
+    )
+    known = (now.time[:, None] - time <= _TAG_WINDOW) & np.isfinite(error)
+    known &= known.sum(axis=1, keepdims=True) >= _TAG_LEAST
+    median = masked_median(error, known)
+    spread = 1.4826 * masked_median(np.abs(error - median[:, None]), known)
+    typical = masked_median(sigma, known)
+    return (
+        median,
+        np.abs(median) / np.maximum(typical, spread),
+        TagErrors._make(each[1 - _TAG_EPOCHS :] for each in tags),
+    )

@@ -1,0 +1,116 @@
+"""Kind of a file by its content: one decision for every command."""
+
+from __future__ import annotations
+
+import codecs
+import re
+from typing import Final, Literal
+
+from railfix.core.errors import InputFileError
+from railfix.core.files import FilePath, ending
+from railfix.io.mate import mate_table
+from railfix.io.receiver.framing import is_receiver_log, read_head
+
+FileKind = Literal[
+    "observations", "navigation", "rinex", "sp3", "sbas", "receiver", "nmea", "novatel", "rtklib", "gpx", "table",
+    "mate", "geojson", "kml", "osm", "xml", "rdf", "ifc", "dxf", "gml", "gpkg", "shp", "fgb", "pbf", "toml", "android",
+    "unknown",
+]  # fmt: skip
+#: Kinds of logs of positions, and of track maps; a table may be either, and a GPX file, too.
+POSITIONS: Final[tuple[FileKind, ...]] = ("table", "rtklib", "nmea", "novatel", "gpx", "receiver")
+#: Maps that GDAL reads, by their kind.
+GDAL: Final[tuple[FileKind, ...]] = ("gpkg", "shp", "fgb", "gml", "dxf", "pbf")
+MAPS: Final[tuple[FileKind, ...]] = ("table", "mate", "geojson", "kml", "gpx", "osm", "xml", "rdf", "ifc", *GDAL)
+#: Each kind in words, for messages, with the option that takes it.
+KIND_WORDS: Final[dict[FileKind, str]] = {
+    "observations": "a RINEX observation file (--front, --rear)", "navigation": "a RINEX navigation file (--nav)",
+    "rinex": "a RINEX file of clocks or meteorology", "sp3": "a file of precise orbits, SP3 (--sp3)",
+    "sbas": "a log of SBAS messages (--sbas)", "receiver": "a receiver's log", "nmea": "an NMEA log",
+    "novatel": "a NovAtel log", "rtklib": "a solution of RTKLIB (.pos)", "gpx": "a GPX file", "table": "a table",
+    "android": "a log of Android's GnssLogger, which writes a RINEX file beside it", "mate": "a table of EGNSS MATE",
+    "geojson": "a JSON file", "kml": "a KML file", "osm": "a file of OpenStreetMap", "xml": "an XML file",
+    "rdf": "an RDF file", "ifc": "an IFC file", "dxf": "a DXF file", "gml": "a GML file", "gpkg": "a GeoPackage",
+    "shp": "a Shapefile", "fgb": "a FlatGeobuf file", "pbf": "a file of OpenStreetMap (.pbf)", "toml": "a TOML file",
+    "unknown": "no log, table or map of a known form",
+}  # fmt: skip
+#: First bytes of binary files.
+_BINARY: Final[dict[FileKind, bytes]] = {
+    "gpkg": b"SQLite format 3\0", "shp": b"\0\0\x27\n", "fgb": b"fgb\x03", "dxf": b"AutoCAD Binary DXF",
+}  # fmt: skip
+#: What the beginning of a text shows, in the order in which kinds are tried.
+_TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
+    "sp3": re.compile(rb"\A#[a-d][PV]\d"),
+    "ifc": re.compile(rb"\A\s*ISO-10303-21;"),
+    "rdf": re.compile(
+        rb'\A\s*(?:#.*\n\s*)*(?:@prefix|@base|PREFIX\s|BASE\s|<https?:[^>]*>\s+<|\[\s*\{|\{\s*"@(?:context|graph)")'
+    ),
+    "geojson": re.compile(rb"\A\s*\{"),
+    "dxf": re.compile(rb"\A\s*(?:999\s*\n.*\n\s*)*0\s*\n\s*SECTION"),
+    "android": re.compile(rb"\A# ?\r?\n|\A# Header Description|\ARaw,"),
+    "nmea": re.compile(rb"\$(?:[A-Z]{2}(?:GGA|RMC|ZDA|GSA|GSV|GLL|VTG|GNS|GST|TXT)|P[A-Z]{3})"),
+    "novatel": re.compile(rb"^[#%](?:BEST(?:GNSS)?POSA|INSPVA[SX]?A|[A-Z0-9]+A),", re.MULTILINE),
+    "rtklib": re.compile(rb"^%.*(?:latitude|ecef|baseline|program|GPST|UTC|JST)", re.MULTILINE),
+    "sbas": re.compile(
+        rb"^\s*(?:\d+\s+[\d.]+\s+1\d\d\s+\d+\s*:\s*|1\d\d(?:\s+[\d.]+){6}\s+\d+\s+)[0-9A-Fa-f]{32}", re.MULTILINE
+    ),
+}
+_ROOT: Final = re.compile(rb"\s*(?:<[?!][^>]*>\s*|<!--.*?-->\s*)*<(?:[\w.-]+:)?(\w+)", re.DOTALL)
+#: Kinds of XML files by the name of the root.
+_ROOTS: Final[dict[str, FileKind]] = {
+    "kml": "kml", "gpx": "gpx", "osm": "osm", "rdf": "rdf", "featurecollection": "gml",
+}  # fmt: skip
+_RINEX: Final[dict[str, FileKind]] = {"O": "observations", "B": "sbas", "M": "rinex", "C": "rinex"}
+#: Kinds by the ending of the name, where the content leaves the kind open.
+_ENDINGS: Final[dict[str, FileKind]] = {
+    ".csv": "table", ".pos": "rtklib", ".nmea": "nmea", ".gpx": "gpx", ".kml": "kml", ".osm": "osm", ".pbf": "pbf",
+    ".geojson": "geojson", ".json": "geojson", ".xml": "xml", ".landxml": "xml", ".railml": "xml", ".ifc": "ifc",
+    ".ttl": "rdf", ".rdf": "rdf", ".nt": "rdf", ".jsonld": "rdf", ".gpkg": "gpkg", ".shp": "shp", ".fgb": "fgb",
+    ".gml": "gml", ".dxf": "dxf",
+}  # fmt: skip
+
+
+def find_kind(path: FilePath) -> FileKind:
+    """Return the kind of a file by its first bytes, unpacked; by its ending where they leave it open."""
+    if mate_table(path):
+        return "mate"
+    if ending(path) == ".toml":
+        return "toml"
+    head = read_head(path)
+    if kind := next((kind for kind, magic in _BINARY.items() if head.startswith(magic)), None):
+        return kind
+    if b"OSMHeader" in head[:32]:
+        return "pbf"
+    if is_receiver_log(head):
+        return "receiver"
+    text = head.removeprefix(codecs.BOM_UTF8)
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        text = head.decode("utf-16", "ignore").encode()
+    first = text.partition(b"\n")[0].decode("latin-1")
+    if first[60:80].strip() == "RINEX VERSION / TYPE":
+        return _RINEX.get(first[20:21].upper(), "navigation")
+    if (root := _ROOT.match(text)) and not _TEXT["rdf"].search(text):
+        return _ROOTS.get(root[1].decode().lower(), "xml")
+    if kind := next((kind for kind, pattern in _TEXT.items() if pattern.search(text)), None):
+        return kind
+    header = _header_line(text)
+    if any(mark in header for mark in ",;\t|") and any(letter.isalpha() for letter in header):
+        return "mate" if {"TRACK_EDGE_ID", "TRACK_SEGMENT_TYPE"} <= {*re.split("[,;\t]", header.upper())} else "table"
+    return _ENDINGS.get(ending(path), "unknown")
+
+
+def wrong_kind(path: FilePath, expected: str) -> InputFileError:
+    """Return the error of a file of another kind than is expected."""
+    return InputFileError(path, f"is {KIND_WORDS[find_kind(path)]}; {expected} was expected")
+
+
+def has_times(path: FilePath) -> bool:
+    """Return whether the header of a table names columns of a log of positions that a track map has not."""
+    names = _header_line(read_head(path)).lower()
+    return any(word in names for word in ("time", "unix", "tow", "quality", "sigma_north", "antenna"))
+
+
+def _header_line(head: bytes) -> str:
+    """Return the first line that is neither blank nor a comment; "" without any."""
+    coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    lines = head.decode(coding, "replace").splitlines()
+    return next((line for line in lines if line.strip() and not line.startswith("#")), "")

@@ -1,0 +1,118 @@
+"""Lines of points in GPX (1.0, 1.1) and in KML (2.2, with Google's gx:Track), by the standard library."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError
+from railfix.core.files import FilePath, read_bytes
+
+Element = ElementTree.Element
+
+
+@dataclass(frozen=True, kw_only=True)
+class XmlLine:
+    """One line of a file, n points."""
+
+    fields: dict[str, str]  #: ``name``, blank where the file has none, and ``ExtendedData`` of KML.
+    points: Floats  #: Longitude, latitude [deg], height as the file has it [m], NaN without one; shape (n, 3).
+    geoid_m: Floats  #: ``geoidheight`` of GPX, NaN where there is none; shape (n,).
+    time: tuple[str, ...]  #: UTC as the file has it, blank where there is none.
+
+
+def read_root(path: FilePath) -> Element:
+    """Return the root of an XML file; InputFileError where it is none."""
+    content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros
+    try:
+        text: str | bytes = content.decode("utf-8")
+    except UnicodeDecodeError:  # in the encoding that the file declares
+        text = content
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise InputFileError(path, f"this is not XML ({error})", line=error.position[0]) from None
+
+
+def tag(element: Element) -> str:
+    """Return the name of an element without its namespace."""
+    return element.tag.rsplit("}", 1)[-1]
+
+
+def _texts(element: Element) -> dict[str, str]:
+    """Return the texts of the children by their names."""
+    return {tag(child): (child.text or "").strip() for child in element}
+
+
+def read_gpx_lines(path: FilePath) -> list[XmlLine]:
+    """Return the segments of tracks and the routes of a GPX file; InputFileError where a point has no place."""
+    lines = []
+    for owner in read_root(path):
+        if tag(owner) not in ("trk", "rte"):
+            continue
+        for part in [child for child in owner if tag(child) == "trkseg"] if tag(owner) == "trk" else [owner]:
+            points = [child for child in part if tag(child) in ("trkpt", "rtept")]
+            texts = [_texts(point) for point in points]
+            places = []
+            for number, (point, own) in enumerate(zip(points, texts, strict=True), start=1):
+                cells = [point.get("lon"), point.get("lat"), own.get("ele") or "nan", own.get("geoidheight") or "nan"]
+                places.append(_numbers(path, f"point {number} of a {tag(owner)}", cells))
+            if points:
+                values = np.array(places)
+                time = tuple(own.get("time", "") for own in texts)
+                fields = {"name": _texts(owner).get("name", "")}
+                lines.append(XmlLine(fields=fields, points=values[:, :3], geoid_m=values[:, 3], time=time))
+    return lines
+
+
+def read_kml_lines(path: FilePath) -> list[XmlLine]:
+    """Return the lines and tracks of a KML file; heights that are clamped to the ground are none.
+
+    InputFileError: a coordinate is no number, or heights are relative to the ground or the sea floor.
+    """
+    lines = []
+    for mark in (element for element in read_root(path).iter() if tag(element) == "Placemark"):
+        name = _texts(mark).get("name", "")
+        given = [child for child in mark.iter() if tag(child) in ("SimpleData", "Data")]
+        fields = {"name": name} | {child.get("name", ""): "".join(child.itertext()).strip() for child in given}
+        for part in (element for element in mark.iter() if tag(element) in ("LineString", "Track")):
+            mode = _texts(part).get("altitudeMode", "")
+            if mode.startswith("relativeTo"):
+                raise InputFileError(
+                    path, f"its altitudeMode is {mode}, no height of the track; write absolute heights or none"
+                )
+            rows = [_numbers(path, f"a coordinate of {name!r}", cells) for cells in _kml_cells(part)]
+            if not rows:
+                continue
+            values = np.array([(*row, np.nan)[:3] for row in rows])
+            if mode.startswith("clampTo"):
+                values[:, 2] = np.nan
+            time = tuple((child.text or "").strip() for child in part if tag(child) == "when") or ("",) * len(rows)
+            lines.append(XmlLine(fields=fields, points=values, geoid_m=np.full(len(rows), np.nan), time=time))
+    return lines
+
+
+def _kml_cells(part: Element) -> Iterator[list[str | None]]:
+    """Yield longitude, latitude and, where it is there, height of the points of a LineString or gx:Track."""
+    for child in part:
+        if tag(child) == "coordinates":
+            yield from ([*text.split(",")] for text in (child.text or "").replace(", ", ",").split())
+        elif tag(child) == "coord":
+            yield [*(child.text or "").split()]
+
+
+def _numbers(path: FilePath, where: str, cells: list[str | None]) -> list[float]:
+    """Return longitude, latitude and the cells after them as numbers."""
+    if comma := next((cell for cell in cells if "," in str(cell)), None):
+        raise InputFileError(path, f"{where}: {comma} has a comma in a number; a point was expected")
+    try:
+        values = [float(str(cell)) for cell in cells]
+    except ValueError:
+        values = []
+    if not 2 <= len(values) <= 4 or not (abs(values[0]) <= 360.0 and abs(values[1]) <= 90.0):
+        raise InputFileError(path, f"{where}: {', '.join(map(str, cells))} is no longitude, latitude and height")
+    return values
