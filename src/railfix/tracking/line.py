@@ -20,6 +20,8 @@ class Line:
         self.ecef_m: Floats = trajectory.ecef_m  #: Shape (V, 3).
         self.segment: Floats = trajectory.tangent  #: Unit vector of each segment; shape (V - 1, 3).
         self.joins_m = trajectory.joins_m
+        #: Standard deviations of the map [m].
+        self.sigma_plan_m, self.sigma_height_m = trajectory.sigma_plan_m, trajectory.sigma_height_m
 
     @cached_property
     def axes(self) -> Floats:
@@ -122,7 +124,7 @@ class Line:
             vertex[name] = getattr(self, name)
         for name in ("segment", "middle_m", "gradient"):
             vertex[name][:-1] = getattr(self, name)
-        line["sigma_plan_m"], line["sigma_height_m"] = self.trajectory.sigma_plan_m, self.trajectory.sigma_height_m
+        line["sigma_plan_m"], line["sigma_height_m"] = self.sigma_plan_m, self.sigma_height_m
         line["start_m"], line["end_m"] = self.bounds_m
         line["start_turn_m"] = np.nan_to_num(self.joins_m[0] - self.arc_m[0])
         line["end_turn_m"] = np.nan_to_num(self.arc_m[-1] - self.joins_m[1])
