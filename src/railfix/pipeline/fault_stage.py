@@ -24,7 +24,6 @@ from railfix.positioning.noise_windows import Windows
 from railfix.positioning.normal_equations import misfit
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import (
-    LastingErrorState,
     NoiseState,
     RobustFit,
     noise_scale,
@@ -49,13 +48,6 @@ class CheckedRanges(NamedTuple):
     lasting: Masks  #: Satellites that are wrong for long, shape (T, K).
 
 
-class NoiseStates(NamedTuple):
-    """New states of the noise scales and of the persistent biases, by antenna."""
-
-    stated: list[NoiseState]
-    lasting: list[LastingErrorState]
-
-
 def check_ranges(
     corrected: CorrectedRanges,
     ranges: Ranges,
@@ -63,7 +55,7 @@ def check_ranges(
     fix: LineFix,
     config: Config,
     states: Sequence[AntennaState],
-) -> tuple[CheckedRanges, NoiseStates]:
+) -> tuple[CheckedRanges, list[AntennaState]]:
     """Return positions without satellites that are wrong for long, then without single faults, and noise scales.
 
     The robust scale, which RAIM tests with, is learnt from ranges that agree with each other; the stated one from those
@@ -115,14 +107,14 @@ def check_ranges(
         windows, fix.constrained.wsse, ranges.redundancy, usable, robust,
         np.array([noise.remaining for noise in noises]), limits=learning, least=least,
     )  # fmt: skip
-    stated = [
-        NoiseState(time=when, age=age, robust=robust_sums[k], remaining=stated_sums[k])
-        for k, (when, age) in enumerate(windows.last)
-    ]
-    lasting_states = [copy_with(state, noise=raised_sums[k]) for k, state in enumerate(lasting_states)]
-    return CheckedRanges(corrected, ranges, fix, model, raim, scale, off_map, lasting), NoiseStates(
-        stated, lasting_states
-    )
+    after = [
+        copy_with(
+            state, noise=NoiseState(time=when, age=age, robust=robust_sums[k], remaining=stated_sums[k]),
+            lasting=copy_with(lasting_states[k], noise=raised_sums[k]),
+        )
+        for k, (state, (when, age)) in enumerate(zip(states, windows.last, strict=True))
+    ]  # fmt: skip
+    return CheckedRanges(corrected, ranges, fix, model, raim, scale, off_map, lasting), after
 
 
 @lru_cache

@@ -23,7 +23,7 @@ from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.fault_stage import CheckedRanges, check_ranges, contradict_map
 from railfix.pipeline.level_stage import level_stage
-from railfix.pipeline.off_map import OffMapState, off_map_epochs
+from railfix.pipeline.off_map import off_map_epochs
 from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import fit_ranges, reject
 from railfix.pipeline.solution import Solution
@@ -62,17 +62,17 @@ def position_stage(
     corrected = reject(corrected, points.gross, Reason.GROSS_ERROR)
     fix = fix_on_line(points.ranges, antennas, points.tied, config.fix_limits)
     corrected = reject(corrected, _alone_on_clock(corrected, points.ties), Reason.ALONE_ON_ITS_CLOCK)
-    checked, noise = check_ranges(corrected, points.ranges, antennas, fix, config, states)
+    checked, states = check_ranges(corrected, points.ranges, antennas, fix, config, states)
     corrected, fix, model, scale = checked.corrected, checked.fix, checked.model, checked.scale
     constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
     # ranges that contradict each other in space contradict every map
     unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
     off_map = checked.off_map & ~unresolved
 
-    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
-        return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
-
-    away, off_map_states = antennas.each_with_state(own_absence, states)
+    away, off_map_states = antennas.each_with_state(
+        lambda _, rows, own: off_map_epochs(time[rows], on_map[rows], off_map[rows], own.off_map, least_s=OFF_MAP_S),
+        states,
+    )
     excluded = checked.lasting | checked.raim.excluded
     agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
     offset, map_states = map_offset(
@@ -105,8 +105,7 @@ def position_stage(
     )
     after = [
         copy_with(
-            state, offsets=offsets[k], noise=noise.stated[k], lasting=noise.lasting[k], map_offset=map_states[k],
-            off_map=off_map_states[k], carrier=carriers[k],
+            state, offsets=offsets[k], map_offset=map_states[k], off_map=off_map_states[k], carrier=carriers[k]
         )
         for k, state in enumerate(states)
     ]  # fmt: skip

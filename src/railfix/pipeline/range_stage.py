@@ -14,7 +14,6 @@ from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.approximate import ANCHOR_SIGMA_M, ApproximatePosition, approximate_position
 from railfix.positioning.range_arrays import Ranges, weighted_ranges
-from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.channels import Channels
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.corrected import CorrectedRanges, SatelliteRanges, corrected_ranges, find_satellites
@@ -91,11 +90,8 @@ def _apply_error_model(
     model: ErrorModel, corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, config: Config
 ) -> CorrectedRanges:
     """Return the ranges with overbounding sigma and bias by an error model; those that it does not bound rejected."""
-
-    def front_deg(index: SearchIndex, rows: slice) -> Floats:
-        return index.trajectory.body_azimuth_deg(arc_m[rows])
-
-    turned = corrected.azimuth_deg - antennas.each(front_deg)[:, None]
+    front_deg = antennas.each(lambda index, rows: index.trajectory.body_azimuth_deg(arc_m[rows]))
+    turned = corrected.azimuth_deg - front_deg[:, None]
     bound, bias = model.at(corrected.elevation_deg, turned, corrected.cn0_dbhz)
     bound = np.hypot(bound, corrected.nominal_m) if model.covers == "local" or config.sbas else bound
     unbounded = (corrected.reason == 0) & ~np.isfinite(bound)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -122,12 +123,15 @@ def _get_screened(result: AntennaResult, column: ScreenColumn) -> Floats | None:
     return getattr(result.screens[column.verdict], column.field) if column.verdict in result.screens else None
 
 
-def _position_column(column: ScreenColumn) -> Column[AntennaResult]:
-    return Column(column.name, column.meaning, lambda r: _get_screened(r, column))
+def _get_screened_channels(observed: Observed, column: ScreenColumn) -> Floats:
+    """Return the array of a column that a screen of observations fills, on all channels."""
+    return observed.on_all_channels(_get_screened(observed.result, column))
 
 
-def _observation_column(column: ScreenColumn) -> Column[Observed]:
-    return Column(column.name, column.meaning, lambda o: o.on_all_channels(_get_screened(o.result, column)))
+def _screen_columns(table: str, get: Callable[..., Floats | None]) -> Iterator[Column[Any]]:
+    """Yield the columns that screens add to a table."""
+    for column in (column for screen in SCREENS for column in screen.columns if column.table == table):
+        yield Column(column.name, column.meaning, partial(get, column=column))
 
 
 @dataclass(frozen=True)
@@ -277,7 +281,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "araim_vertical_m", "the same, vertical", lambda r: None if r.araim is None else r.araim.space.level_m[:, 2]
         ),
-        *(_position_column(c) for screen in SCREENS for c in screen.columns if c.table == "positions"),
+        *_screen_columns("positions", _get_screened),
         Column(
             "conventional_status",
             "3-D single point: `valid`, `no_position`, `residuals` beyond noise (chi-square test), "
@@ -349,7 +353,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             "pseudorange, satellite clock, group delay and atmosphere applied",
             "result.corrected_code_m",
         ),
-        *(_observation_column(c) for screen in SCREENS for c in screen.columns if c.table == "observations"),
+        *_screen_columns("observations", _get_screened_channels),
         Column(
             "second_share",
             "two frequencies: weight of the second code; negative: toward the ionosphere-free combination; "
