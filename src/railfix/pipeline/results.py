@@ -181,7 +181,7 @@ def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Conf
         solution, interference = take_epochs(chunk.solution, rows), chunk.interference[k]
         wheel = fusion[name].wheel if name in fusion else None
         if wheel is not None and interference is not None:
-            solution, interference = _add_wheel_sign(solution, interference, wheel)
+            solution, interference = add_wheel_sign(solution, interference, wheel)
         trajectory = chunk.antennas.indices[k].trajectory
         has = with_coordinates(config.failed_checks)[solution.status]
         arc, protection, raim = np.where(has, solution.arc_m, np.nan), solution.protection, solution.raim
@@ -200,7 +200,7 @@ def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Conf
     return results
 
 
-def _add_wheel_sign(solution: Solution, interference: Interference, wheel: WheelSigns) -> tuple[Solution, Interference]:
+def add_wheel_sign(solution: Solution, interference: Interference, wheel: WheelSigns) -> tuple[Solution, Interference]:
     """Return positions and interference with the sign of the wheel where distances by satellites part from its own."""
     causes = np.where(wheel.parted, interference.causes | int(Sign.WHEEL_PARTS), interference.causes)
     interference = replace(interference, causes=causes)
