@@ -20,6 +20,7 @@ from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.results import Result, add_wheel_sign
+from railfix.pipeline.solution import Solution
 from railfix.run.tally import AntennaTally
 from railfix.tracking import TrackStatus
 from railfix.tracking.result import is_bounded
@@ -304,7 +305,8 @@ def test_the_sign_of_the_wheel_changes_the_status_of_its_own_epochs_alone() -> N
     nothing: Any = None
     causes = np.array([0, int(Sign.RECEIVER_SPOOFING), 0], dtype=np.int64)
     statuses = np.array([Status.OK, Status.ANTENNAS_DISAGREE, Status.OK], dtype=np.int8)
-    solution: Any = SimpleNamespace(status=statuses)
+    solution = object.__new__(Solution)  # the other outputs are not looked at
+    vars(solution)["status"] = statuses
     wheel: Any = SimpleNamespace(parted=np.array([False, False, True]))
     found, interference = add_wheel_sign(solution, Interference(causes=causes, power=nothing, motion=nothing), wheel)
     assert found.status.tolist() == [Status.OK, Status.ANTENNAS_DISAGREE, Status.SPOOFING_SUSPECTED]
