@@ -242,7 +242,7 @@ def test_separate_clocks_equal_an_independent_solution():
 
         start = np.r_[clean_trajectories()["front"].ecef_m[0], 0.0, 0.0]
         place = least_squares(residual, start, jac=jacobian, x_scale="jac", xtol=1e-14, ftol=1e-14).x
-        assert found.conventional_ecef_m[t] == pytest.approx(place[:3], abs=1e-3)
+        assert found.point.ecef_m[t] == pytest.approx(place[:3], abs=1e-3)
 
 
 @pytest.mark.requirement("B7")

@@ -57,7 +57,7 @@ class Recording:
         self.navigation: Navigation = read_navigation([self.nav])
         without = make_processor(parse_config({"filter": "off"}), self.navigation, {"front": self.line_at(None)})
         found = without.process({"front": self.observations[:200]})[0].antennas["front"]
-        self.parked = np.nanmedian(found.conventional_ecef_m, axis=0)
+        self.parked = np.nanmedian(found.point.ecef_m, axis=0)
         self.line = self.line_at(self.parked)
 
     def line_at(self, place: np.ndarray | None) -> Trajectory:
@@ -115,7 +115,7 @@ def test_a_corrected_code_is_the_sum_of_its_parts(recording: Recording, correcte
     states = satellite_states(
         corrected.time, satellite, corrected.signal[columns], code, recording.navigation, record=fixes.record
     )
-    place = corrected.conventional_ecef_m
+    place = corrected.point.ecef_m
     latitude, longitude, height = geodetic_from_ecef(np.where(np.isnan(place), recording.parked, place))
     elevation, azimuth = corrected.elevation_deg[:, columns], corrected.azimuth_deg[:, columns]
     grid = engine.ionosphere(corrected.time, latitude, longitude, elevation, azimuth)
@@ -148,8 +148,8 @@ def test_any_cutting_gives_the_same(recording: Recording, corrected: AntennaResu
 def test_the_parked_antenna_stays_where_it_is(recording: Recording, corrected: AntennaResult) -> None:
     """Corrections of metres move a position by metres, not by more: it agrees with the uncorrected one within 15 m."""
     plain = recording.process(parse_config({"filter": "off", "elevation": {"mask_deg": 10.0}}))
-    both = np.isfinite(corrected.conventional_ecef_m[:, 0]) & (np.arange(len(plain)) < 200)
-    moved = np.linalg.norm(corrected.conventional_ecef_m - plain.conventional_ecef_m, axis=1)[both]
+    both = np.isfinite(corrected.point.ecef_m[:, 0]) & (np.arange(len(plain)) < 200)
+    moved = np.linalg.norm(corrected.point.ecef_m - plain.point.ecef_m, axis=1)[both]
     assert both.sum() > 20
     assert 0.1 < np.median(moved) < 15.0
 

@@ -219,7 +219,7 @@ def test_open_sky_is_better_by_half(open_sky: dict[str, tuple[AntennaResult, Flo
     error = {}
     for name, (result, reference) in open_sky.items():
         up = reference / np.linalg.norm(reference, axis=1, keepdims=True)
-        apart = result.conventional_ecef_m - reference
+        apart = result.point.ecef_m - reference
         across = apart - np.einsum("ti,ti->t", apart, up)[:, None] * up
         error[name] = np.nanmedian(np.linalg.norm(across, axis=1)[60:])
     assert error["two"] < 0.5 * error["one"]

@@ -250,14 +250,14 @@ def test_sigmas_of_a_run_are_those_of_its_noise_model_and_weights_their_inverse_
     for t in range(len(result)):
         at = np.flatnonzero(used[t])
         for power in differences:
-            place, clock = result.conventional_ecef_m[t].copy(), 0.0
+            place, clock = result.point.ecef_m[t].copy(), 0.0
             for _ in range(4):
                 distance, sight = range_with_rotation(satellites[t, at], place)
                 design = np.column_stack([-sight, np.ones(len(at))])
                 root = expected[t, at] ** (-power / 2.0)
                 step, *_ = np.linalg.lstsq(design * root[:, None], (code[t, at] - distance - clock) * root, rcond=None)
                 place, clock = place + step[:3], clock + step[3]
-            difference = float(np.linalg.norm(place - result.conventional_ecef_m[t]))
+            difference = float(np.linalg.norm(place - result.point.ecef_m[t]))
             differences[power] = max(differences[power], difference)
     assert differences[2] < 1e-3 < 0.05 < differences[1]
 
@@ -369,7 +369,7 @@ def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
     observations, navigation = cases.clean_observations()["front"][:10], cases.clean_navigation()
     result = cases.front_alone(observations, {"screens": [], "systems": ["G"]})
     columns, used = result.columns, result.reason[:, result.columns] == 0
-    seen = SeenFrom.of(result.conventional_ecef_m, result.corrected.satellites.position_ecef_m)
+    seen = SeenFrom.of(result.point.ecef_m, result.corrected.satellites.position_ecef_m)
     frequency = np.full(len(columns), FREQUENCY_L1)
     delays = model_delays(result.time, seen, frequency, klobuchar=navigation.klobuchar["G"], troposphere="saastamoinen")
     states = result.corrected.satellites

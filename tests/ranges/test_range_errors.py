@@ -282,7 +282,7 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
     log = read_observations(folder / "cres_20080526.bin.obs")[:200]
     line = straight_line(log.header.approximate_ecef_m, 45.0)
     found, _ = make_processor(plain, navigation, {"front": line}).process({"front": log})
-    place = np.nanmedian(found.antennas["front"].conventional_ecef_m, axis=0)
+    place = np.nanmedian(found.antennas["front"].point.ecef_m, axis=0)
     line = straight_line(place, 45.0)
     processor = make_processor(config, navigation, {"front": line})
     result, _ = processor.process({"front": log})

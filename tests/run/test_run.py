@@ -288,7 +288,7 @@ def test_tables_hold_the_arrays(result: Result) -> None:
         mine = positions.filter(pl.col("antenna") == name)
         np.testing.assert_array_equal(mine["chainage_m"].to_numpy(), antenna.chainage_m)
         np.testing.assert_array_equal(mine["y_m"].to_numpy(), antenna.ecef_m[:, 1])
-        np.testing.assert_array_equal(mine["conventional_z_m"].to_numpy(), antenna.conventional_ecef_m[:, 2])
+        np.testing.assert_array_equal(mine["conventional_z_m"].to_numpy(), antenna.point.ecef_m[:, 2])
         np.testing.assert_array_equal(mine["time_gpst"].to_numpy(), antenna.time)
     rows = observations_table(result).filter(antenna="rear", satellite="G01")
     rear = result.antennas["rear"]

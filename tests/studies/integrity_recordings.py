@@ -303,7 +303,7 @@ def judged(
 def _bias(file: Path, result: AntennaResult, one: Recording) -> np.ndarray:
     """Largest nominal bias of each range by the model, shape (T, K)."""
     columns = result.columns
-    arc, _ = one.trajectory.nearest(np.nan_to_num(result.conventional_ecef_m))
+    arc, _ = one.trajectory.nearest(np.nan_to_num(result.point.ecef_m))
     turned = result.azimuth_deg[:, columns] - one.trajectory.body_azimuth_deg(arc)[:, None]
     _, bias = read_error_model(file).at(result.elevation_deg[:, columns], turned, result.cn0_dbhz[:, columns])
     return np.nan_to_num(bias)

@@ -305,7 +305,7 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
     """Errors of one way out of a result."""
     conventional = way.positions in ("conventional", "validated")
     chainage = got.conventional_chainage_m if conventional else got.chainage_m
-    place = got.conventional_ecef_m if conventional else got.ecef_m
+    place = got.point.ecef_m if conventional else got.ecef_m
     if way.positions == "filtered":
         assert track is not None
         chainage, place = track.chainage_m, track.ecef_m

@@ -146,7 +146,7 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
     latitude, longitude, _ = geodetic_from_ecef(place)
     axes = enu_axes(latitude, longitude)[:2].T
     along = along_track_error(result.arc_m, reference, trajectory)
-    on_line, in_space = (result.ecef_m - place) @ axes, (result.conventional_ecef_m - place) @ axes
+    on_line, in_space = (result.ecef_m - place) @ axes, (result.point.ecef_m - place) @ axes
     return Day(observations, result, along, on_line, in_space)
 
 

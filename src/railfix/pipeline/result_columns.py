@@ -322,9 +322,9 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "cn0_fall_db", "median fall of C/N0 of the satellites below their recent peak", "interference.power.fall_db"
         ),
-        Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 0]),
-        Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 1]),
-        Column("conventional_z_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 2]),
+        Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 0]),
+        Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 1]),
+        Column("conventional_z_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 2]),
     )
 )
 

@@ -130,11 +130,6 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
         residual = self.fix.constrained.residual_m
         return self.on_all_channels(np.where(self.corrected.reason == 0, residual, np.nan))
 
-    @property
-    def conventional_ecef_m(self) -> Floats:
-        """3-D single point from the same ranges, shape (T, 3)."""
-        return self.point.ecef_m
-
     @cached_property
     def _nearest(self) -> tuple[Floats, Floats]:
         return self.trajectory.nearest(self.point.ecef_m)
