@@ -78,7 +78,7 @@ def test_what_is_missing_or_does_not_fit_is_named(desk: Path, tmp_path: Path) ->
     far.write_text("latitude_deg,longitude_deg,height_m\n47,8,400\n47.001,8,400\n")
     result = RUNNER.invoke(app, ["doctor", *(str(path) for path in (desk / "front.obs", far, tmp_path / "notes.md"))])
     assert result.exit_code == 5, result.output
-    for words in ("notes.md: not recognised", "there is no navigation file", "km from the place in the header"):
+    for words in ("notes.md: not recognised", "no navigation file", "km from the place in the header"):
         assert words in result.output
     assert "run: railfix" not in result.output
     assert RUNNER.invoke(app, ["doctor", str(tmp_path / "none.obs")]).exit_code == 3

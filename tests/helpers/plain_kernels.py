@@ -9,6 +9,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, cast
 
+import numba  # noqa: F401 (it reads NUMBA_DISABLE_JIT when it is imported, and must not read that of `plain`)
 import numpy as np
 import pytest
 

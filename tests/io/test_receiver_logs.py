@@ -299,7 +299,7 @@ def test_a_restarted_receiver_and_repeated_messages(recordings: Path) -> None:
     whole, _ = in_fragments(data, [])
     twice, _ = in_fragments(data + data, [])
     assert np.array_equal(whole.time, twice.time)
-    assert twice.skipped["epochs not after the one before"] == len(whole)
+    assert twice.skipped["epochs not after the previous one"] == len(whole)
 
 
 def pieces_of(path: Path, epochs: int) -> Iterator[Observations]:
@@ -458,7 +458,7 @@ def test_observations_of_old_kinds_are_named(tmp_path: Path) -> None:
     rtcm = b"\xd3" + len(body).to_bytes(2, "big") + body
     rtcm += int(crc24q(np.frombuffer(rtcm, np.uint8), np.array([0]), np.array([len(rtcm)]))[0]).to_bytes(3, "big")
     (tmp_path / "old.log").write_bytes(2 * rtcm + ubx_frame(0x0210, bytes(8)))
-    with pytest.raises(InputFileError, match=r"its RTCM 1004 \(2\), UBX RXM-RAW \(1\) are of kinds that are not read"):
+    with pytest.raises(InputFileError, match=r"its RTCM 1004 \(2\), UBX RXM-RAW \(1\) are of unsupported kinds"):
         railfix.read_observations(tmp_path / "old.log")
 
 

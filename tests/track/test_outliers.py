@@ -26,4 +26,4 @@ def test_positions_beside_those_around_them_make_no_points() -> None:
     thinned = thin(time, ecef)
     assert not np.isin(thinned.kept, wrong).any()
     assert len(thinned.kept) > 0.97 * (count - len(wrong))
-    assert thinned.dropped["beside those before and after"] >= len(np.unique(wrong))
+    assert thinned.dropped["off the line of their neighbours"] >= len(np.unique(wrong))

@@ -136,7 +136,7 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
 def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]:
     """Return one choice per layer (dynamic programming) with the least sum of node costs and step costs.
 
-    `costs` of the choices of a layer, shape (n,); step costs from the layer before, shape (n, n before).
+    `costs` of the choices of a layer, shape (n,); step costs from the previous layer, shape (n, n before).
     """
     total, came = costs[0], list[Indices]()
     for cost, step in zip(costs[1:], steps, strict=True):

@@ -37,7 +37,7 @@ Paths = FilePath | Sequence[FilePath]  #: One file, or several.
 #: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
 Reader = Literal["railfix", "georinex"]  #: Program that reads RINEX observation files.
-#: Last clause of the error of a broken line: how to go on.
+#: Last clause of the error of a broken line: how to continue.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
 #: Endings of compressed files; the ending before them gives the kind.

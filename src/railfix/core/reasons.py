@@ -76,7 +76,7 @@ class Status(IntEnum):
     #: A position, but another place on the line fits the ranges equally well, or, at the level's risk, one beyond the
     #: protection level.
     AMBIGUOUS = 1
-    #: A position, but at an end of the map, or too far from the unconstrained position.
+    #: A position, but the ranges put it far beyond an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2
     #: No position: fewer usable satellites than `Config.min_satellites`.
     TOO_FEW_SATELLITES = 3
@@ -99,6 +99,8 @@ class Status(IntEnum):
     JAMMING_SUSPECTED = 11
     #: A position, but the signals may be those of a spoofer: nothing bounds its error.
     SPOOFING_SUSPECTED = 12
+    #: A position, but clamped to an end of the map: the ranges put it beyond, within their noise.
+    MAP_END = 13
 
     @property
     def text(self) -> str:
@@ -110,7 +112,8 @@ class Status(IntEnum):
 CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN, Status.SPOOFING_SUSPECTED)
 #: Statuses with coordinates (those of `CHECK_FAILED` unless they are dropped).
 POSITIONED: Final = (
-    Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, Status.JAMMING_SUSPECTED, *CHECK_FAILED,
+    Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, Status.JAMMING_SUSPECTED, Status.MAP_END,
+    *CHECK_FAILED,
 )  # fmt: skip
 
 

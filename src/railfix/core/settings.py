@@ -54,10 +54,11 @@ class Settings(BaseModel):
             )
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Show the settings that are not as by default."""
+        """Yield the settings that differ from their defaults, of which some are computed from the settings before."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
         for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            if field.is_required() or value != field.get_default(call_default_factory=True):
+            value = values[name]
+            if field.is_required() or value != field.get_default(call_default_factory=True, validated_data=values):
                 yield name, value
 
     @field_validator("*", mode="before")

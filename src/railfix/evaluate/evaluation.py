@@ -30,7 +30,7 @@ from railfix.evaluate.intervals import branch_table, interval_table, level_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
 
-#: Names of a reference that is looked for in the folder of a run's log.
+#: Names of a reference that is searched for in the folder of a run's log.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
 #: Columns of the positions that are evaluated in addition to the error columns of every table.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")

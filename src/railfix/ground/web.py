@@ -1,6 +1,6 @@
 """Page of the control centre: the line with trains, intervals and authorities, links, alarms and log.
 
-Reading is open; orders need a log-in. Nothing comes from outside the server.
+Reading is open; orders need a log-in. The page loads nothing from other servers.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
 #: A connection without a whole request for this time ends, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
-#: Connections at a time; further ones are refused. Of a peer, those without a whole request.
+#: Connections at a time; further ones are refused. Connections of one peer without a complete request.
 MOST_CONNECTIONS: Final = 500
 MOST_IDLE: Final = 20
 #: Name of who logs in by the password alone.
@@ -195,7 +195,7 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 async def _values(request: Request) -> dict[str, Any] | None:
     """Return the JSON object of a request; None where it has none.
 
-    Another page cannot send this content type without being asked by the browser, which is refused.
+    Another site cannot send this content type unless the browser asks first, which is refused.
     """
     if request.headers.get("content-type") != "application/json":
         return None
@@ -215,8 +215,8 @@ async def _values(request: Request) -> dict[str, Any] | None:
 class _TimedProtocol(H11Protocol):
     """HTTP whose connections end without a whole request, however slowly its bytes come.
 
-    Of each peer at most `MOST_IDLE` wait for one: with another the one that has waited longest ends, so that a peer
-    that opens many takes no place of others, nor its own next request's.
+    At most `MOST_IDLE` connections of a peer wait for a request: one more ends the longest waiting, so that a peer that
+    opens many blocks neither others nor its own next request.
     """
 
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}

@@ -39,8 +39,8 @@ class RaimResult:
     scale: Floats  #: Noise scale that the residuals are compared with, from earlier epochs; shape (T,).
     excluded: Masks  #: Shape (T, K).
     own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
-    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN where
-    #: there is no position, where a fault is left in it, or where the level or RAIM is off; shape (T,).
+    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN without
+    #: a position, where a fault remains in it, or where the level or RAIM is off; shape (T,).
     protection_level_m: Floats
 
     @property
@@ -82,9 +82,9 @@ def exclude_faults(
 
     The sum of squared residuals is tested against chi-square (P4, false alarm 1e-3), or against 100 m^2 (P1 table 6,
     mode "fixed"). Every satellite, then every pair is left out; a set is excluded where the rest passes and each of its
-    own errors is over the limit. Of two satellites that disagree with the rest, the rest can be the faulty ones: a pair
-    of which the robust fit of the epoch keeps a range is not believed. Where a fault stays unresolved, the position is
-    that of the ranges that the robust fit keeps (`RaimResult.faulty`).
+    own errors is over the limit. If two satellites disagree with the rest, the rest can be the faulty ones: a pair is
+    not excluded if the epoch's robust fit keeps a range of it. Where a fault stays unresolved, the position is that of
+    the ranges that the robust fit keeps (`RaimResult.faulty`).
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.receiver_noise import LastingErrorLimits, LastingErrorState
 
-#: Below this share of its own error in its residual a range shows nothing of it.
+#: Below this fraction of its own error in its residual a range does not show its error.
 _LEAST_REDUNDANCY: Final = 0.1
 #: A mean that is smaller is forgotten.
 _FORGOTTEN: Final = 1e-12
@@ -66,7 +66,7 @@ def reject_persistent_biases(
     noise : ndarray, shape (T,)
         Noise scale of the receiver.
     states : sequence of LastingErrorState
-        Of each antenna after the chunk before; `LastingErrorState()` at the start.
+        Of each antenna after the previous chunk; `LastingErrorState()` at the start.
     limits : BiasLimits
         With `LastingErrorLimits.most_satellites` 0 nothing is rejected.
     """

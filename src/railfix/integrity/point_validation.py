@@ -19,9 +19,9 @@ class PointStatus(IntEnum):
 
     #: Both checks passed; residuals without a redundant range pass.
     VALID = 0
-    #: There is no position.
+    #: No position.
     NO_POSITION = 1
-    #: The residuals exceed what noise explains.
+    #: The residuals exceed the noise.
     RESIDUALS = 2
     #: The dilution of precision is over its limit.
     DILUTION = 3

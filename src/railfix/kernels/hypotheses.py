@@ -1,4 +1,4 @@
-"""What each fault hypothesis does to the position."""
+"""Effect of each fault hypothesis on the position."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class _Tails(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """What one base of hypotheses needs: whether each channel belongs to it, and what is left without it.
+    """Inputs of one base of hypotheses: whether each channel belongs to it, and the remainder without it.
 
-    `others` has priors of the rest (n,), `removed` what the base takes with it (4,), `own` work space (n,).
-    By depth, for sets of channels left out one after the other: the system `reduced` (2, n + 4, n), what has been
-    `taken` (3, 4), whether nothing bounds a fault (`undetectable`), the next channel (`start`), where its sets are
-    written (`place`), and the product of the priors; shape (3,).
+    `others` has priors of the rest (n,), `removed` the effect of the base (4,), `own` work space (n,).
+    By depth, for sets of channels left out in sequence: the system `reduced` (2, n + 4, n), the part `taken` (3, 4),
+    whether nothing bounds a fault (`undetectable`), the next channel (`start`), where its sets are written (`place`),
+    and the product of the priors; shape (3,).
     """
 
     member: Masks
@@ -59,7 +59,7 @@ class _Work(NamedTuple):
 
 
 class _Sets(NamedTuple):
-    """Offset, sigma and separation over its threshold of sets of channels left out, written one after the other."""
+    """Offset, sigma and separation over its threshold of sets of left-out channels, written in sequence."""
 
     offset: Floats
     sigma: Floats
@@ -68,9 +68,10 @@ class _Sets(NamedTuple):
 
 @inner
 def _downdate(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, removed: Floats) -> bool:
-    """Leave out channels one after the other; return whether nothing bounds a fault of them.
+    """Leave out channels in sequence; return whether nothing bounds a fault of them.
 
-    `removed` becomes what they take with them; `work` the rows of what is left, for all channels where `every` says so.
+    `removed` becomes their effect; `work` has the rows of the remainder, for all channels if `every` is
+    set.
     """
     n, undetectable = rows.shape[1], False
     for i in range(n + 4):
@@ -109,7 +110,7 @@ def _with_each_later(
 ) -> None:
     """Write the sets of channel i and one after it, left out together from the system `rows`.
 
-    `removed` and `undetectable` are of what has been left out of it before.
+    `removed` and `undetectable` are those of the channels left out before.
     """
     n, own, limit = rows.shape[1], ranges.own, common[LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
@@ -170,7 +171,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
     Returns
     -------
     channel : ndarray of int, shape (T, n)
-        Channels in use, side by side.
+        Channels in use, adjacent.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
         As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
     separation : ndarray, shape (T,)
@@ -267,7 +268,7 @@ def _write_one(
     common: Floats,
     tails: _Tails,
 ) -> None:
-    """Write a hypothesis by what it takes with it; without a bound where nothing shows it."""
+    """Write a hypothesis by its effect; unbounded where it is undetectable."""
     tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = separate(
         removed[0], removed[1], removed[2], removed[3], more, common
     )
@@ -299,7 +300,7 @@ def _write_singles(
 
 @inner
 def _write_together(t: int, order: int, system: System, ranges: RangeErrors, work: _Work, tails: _Tails) -> None:
-    """Write sets of two and more: all but the last channel are left out one after the other, `depth` so far."""
+    """Write sets of two and more: all but the last channel are left out in sequence, `depth` so far."""
     n, limit, depth = len(work.own), system.common[LIMIT], 0
     while depth >= 0:
         i = work.start[depth]

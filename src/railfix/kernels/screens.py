@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
-#: A suspicion that there is none of: NaT as a number.
+#: Marks a condition without a suspicion: NaT as a number.
 NEVER = np.iinfo(np.int64).min
 _NS = 1_000_000_000
 
@@ -193,9 +193,9 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return which conditions have held for their time, which count still, and the state: see `held`.
+    """Return which conditions have been true for their time, which are still active, and the state: see `held`.
 
-    `before`: how long each has held, and when it last counted, shape (C,).
+    `before`: duration of each, and time of its last activity, shape (C,).
     """
     epochs, conditions = signs.shape
     run, last, previous = before[0].copy(), before[1].copy(), time_before

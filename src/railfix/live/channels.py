@@ -26,7 +26,7 @@ P = ParamSpec("P")
 
 #: First word of the second channel.
 _READY: Final = "ready"
-#: Stages in the order of processing, by the arrays that tell them apart.
+#: Stages in the order of processing, with their distinguishing arrays.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -93,7 +93,7 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
 
 
 class TwoChannels(LiveEngine):
-    """A `LiveEngine` with a second one beside it, in a process of its own, that gets every call as well."""
+    """A `LiveEngine` with a second one in another process, which gets every call as well."""
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
@@ -137,7 +137,7 @@ class TwoChannels(LiveEngine):
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
 
     def close(self) -> None:
-        """End the second channel: at once, as it holds nothing that is kept."""
+        """End the second channel at once; it has no data to store."""
         self._connection.close()
         self._process.kill()
         self._process.join(timeout=5.0)

@@ -74,7 +74,8 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 
 
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
-    """Return the features of a line in order: where gradient or curvature change most within `BASE_M`.
+    """Return the features of a line in order: where gradient or curvature change most within `BASE_M`, the middle of a
+    change that is longer.
 
     `least`, by quantity, shape (N,), of a measured line: a change must also exceed the root sum of squares of both
     sides.
@@ -89,8 +90,12 @@ def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None 
             size[size < np.hypot(least[quantity][reach:], least[quantity][:-reach])] = 0.0
         while len(size) and size.max() >= limit:
             k = int(np.argmax(size))
-            found.append(Feature(arc_m=float(series.arc_m[k + reach // 2]), quantity=quantity, change=float(change[k])))
-            size[max(k - reach, 0) : k + reach + 1] = 0.0
+            # a change that is longer lies in the middle of where it is half as large
+            less = np.flatnonzero(np.where(change * change[k] > 0.0, size, 0.0) < 0.5 * size[k])
+            first, end = int(np.max(less[less < k], initial=-1)) + 1, int(np.min(less[less > k], initial=len(size)))
+            arc = 0.5 * float(series.arc_m[first] + series.arc_m[end - 1 + reach])
+            found.append(Feature(arc_m=arc, quantity=quantity, change=float(change[k])))
+            size[max(first - reach // 2, 0) : end + reach // 2] = 0.0
     return sorted(found, key=lambda feature: feature.arc_m)
 
 

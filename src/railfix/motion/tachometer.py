@@ -151,7 +151,7 @@ class SpeedCheck:
     lag_s: float  #: Delay of its time tags.
 
 
-#: Largest lag that is looked for [s].
+#: Largest lag that is searched for [s].
 _LARGEST_LAG_S: Final = 3.0
 
 

@@ -17,13 +17,13 @@ from railfix.screens import PairedEpochs, Screened
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """Epochs of all antennas, those of one after those of the other, and the outputs of the stages so far."""
+    """Epochs of all antennas, concatenated, and the outputs of the stages so far."""
 
     names: tuple[str, ...]  #: Of the antennas.
     antennas: AntennaRows  #: Their trajectories and rows.
     corrected: CorrectedRanges  #: Corrected ranges with the verdicts so far.
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
-    sensors: SensorSamples | None  #: Samples of the sensors on board since the chunk before.
+    sensors: SensorSamples | None  #: Samples of the sensors on board since the previous chunk.
     notes: tuple[str, ...]
     screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metric and verdict of each screen of observations.
     combined: Combined | None = None  #: How codes of two frequencies were combined.

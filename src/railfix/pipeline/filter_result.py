@@ -1,4 +1,4 @@
-"""Results of the filter along the track, what it takes from single epochs, and the state that it passes on."""
+"""Results of the filter along the track, its input from single epochs, and its state."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from railfix.tracking.state import StateIndex
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Place by the filter at its last epoch: what the place by the wheel restarts from every few seconds."""
+    """Position by the filter at its last epoch, from which dead reckoning by the wheel restarts every few seconds."""
 
     time: np.datetime64
-    #: NaN where the filter has not decided on a place.
+    #: NaN where the filter has not decided on a position.
     arc_m: float
     sigma_m: float
     speed_mps: float
 
     def arc_at(self, time: np.datetime64) -> float:
-        """Place at a time nearby [m]."""
+        """Position at a nearby time [m]."""
         return self.arc_m + self.speed_mps * float(seconds(time - self.time))
 
 
@@ -44,7 +44,7 @@ class SingleEpochs:
     """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
     noise_scale: Floats  #: Noise of the receiver's codes against their sigmas.
-    #: Position: after an outage codes count again when it agrees with the place that the sensors carried.
+    #: Position: after an outage codes are used again when it agrees with the dead-reckoned position.
     arc_m: Floats
     sigma_m: Floats
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
@@ -57,21 +57,21 @@ class SingleEpochs:
 class FilterState(NotebookTable):
     """State of the filter along the track of one antenna after a chunk."""
 
-    slips: CycleSlipState | None = None  #: Of the carrier phases.
+    slips: CycleSlipState | None = None  #: State of the carrier phases.
     track: TrackState | None = None
-    level: LevelState = field(default_factory=LevelState)  #: Of the filter that gives the levels.
+    level: LevelState = field(default_factory=LevelState)  #: State of the filter that gives the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
-    #: Place of the filter at the last epoch, and at the last one before the present stretch.
+    #: Position of the filter at the last epoch, and at the last epoch before the present block.
     fixed: FilterFix | None = None
     anchor: FilterFix | None = None
 
     gate: ReturnState = field(default_factory=ReturnState)
-    #: Of the comparison of distances by the wheel with those of single epochs, and of the filter.
+    #: State of the comparison of distances by the wheel with those of single epochs, and of the filter.
     wheel: WheelState = field(default_factory=WheelState)
     pulled: WheelState = field(default_factory=WheelState)
-    #: Last epoch at which places or speeds of the two antennas disagreed.
+    #: Last epoch at which positions or speeds of the two antennas disagreed.
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    passings: PassingState | None = None  #: Of balises and virtual ones.
+    passings: PassingState | None = None  #: State of balises and virtual ones.
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
@@ -79,7 +79,7 @@ class FilterState(NotebookTable):
         return f"<FilterState: {plural(self.track.hypotheses, 'place')}, the most probable at {self._place()} m>"
 
     def _place(self) -> str:
-        """Return the most probable place with its standard deviation."""
+        """Return the most probable position with its standard deviation."""
         track = self.track
         if track is None:
             return ""
@@ -98,7 +98,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
     direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed does not tell; shape (T,).
     standstill: Masks  #: Shape (T,).
     sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    #: Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at; shape
+    #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape
     #: (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.
@@ -111,7 +111,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
 
     @property
     def motion(self) -> FilteredMotion:
-        """Places and speeds, for the comparison with those of another antenna."""
+        """Positions and speeds, for the comparison with those of another antenna."""
         found = self.tracked
         return FilteredMotion(self.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
 
@@ -122,7 +122,9 @@ class AlongTrack(LineCoordinates, NotebookTable):
         return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return how many epochs have a place with a bound: ``1,890 of 2,000 epochs tracking or coasting``."""
+        """Return the number of epochs that have a position with a bound: ``1,890 of 2,000 epochs tracking or
+        coasting``.
+        """
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:

@@ -31,7 +31,13 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions, Slips
 from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
-from railfix.positioning.map_offset import LinePositions, OffsetErrors, beyond_threshold, map_offset
+from railfix.positioning.map_offset import (
+    LinePositions,
+    OffsetErrors,
+    beyond_threshold,
+    map_offset,
+    offset_from_line,
+)
 from railfix.positioning.normal_equations import SinglePoint, point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
 from railfix.positioning.receiver_noise import (
@@ -69,12 +75,16 @@ def position_stage(
     unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
     off_map = checked.off_map & ~unresolved
 
-    away, off_map_states = antennas.each_with_state(
-        lambda _, rows, own: off_map_epochs(time[rows], on_map[rows], off_map[rows], own.off_map, least_s=OFF_MAP_S),
-        states,
-    )
     excluded = checked.lasting | checked.raim.excluded
     agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
+    right_m = offset_from_line(free.ecef_m, constrained.arc_m, antennas)[:, 0]
+
+    away, off_map_states = antennas.each_with_state(
+        lambda _, rows, own: off_map_epochs(
+            time[rows], on_map[rows], off_map[rows], right_m[rows], own.off_map, least_s=OFF_MAP_S
+        ),
+        states,
+    )
     offset, map_states = map_offset(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
@@ -96,11 +106,15 @@ def position_stage(
     if sigma.phase is not None:
         off_map = contradict_map(checked.ranges, antennas, fix, sigma.arc_m, config) & ~unresolved
     observed = np.asarray(np.isfinite(corrected.code_m).any(axis=1))
-    inconsistent = raim.faulty | unresolved
     solution = copy_with(
         solution,
         status=_status(
-            observed, checked.ranges, solution, sigma.judged_m, (off_map, inconsistent, open_elsewhere), config
+            observed,
+            checked.ranges,
+            solution,
+            sigma.judged_m,
+            (off_map, raim.faulty | unresolved, open_elsewhere),
+            config,
         ),
     )
     after = [
@@ -122,15 +136,15 @@ def _alone_on_clock(corrected: CorrectedRanges, ties: InterSystemBiases) -> Mask
     return alone
 
 
-#: Variance of an epoch's ranges in space over that of the receiver from which on they contradict each other.
+#: Ratio of the variance of an epoch's ranges in 3-D to that of the receiver from which on they contradict each other.
 _CONTRADICT: Final = 25.0
 
 
 def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
-    """Return ranges and 3-D positions that judge the map: without the `excluded` satellites where all ranges together
-    contradict each other, NaN where they still do or nothing tells which one is wrong.
+    """Return ranges and 3-D positions for the test of the map: without the `excluded` satellites where all ranges
+    together contradict each other, NaN where they still do or the wrong one cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
@@ -155,7 +169,7 @@ class PublishedPositions(NamedTuple):
     arc_m: Floats
     along_m: Floats  #: Standard deviation along the line.
     epoch_m: Floats  #: Single-epoch sigma.
-    judged_m: Floats  #: What `Config.largest_sigma_m` is compared with.
+    judged_m: Floats  #: Sigma that is compared with `Config.largest_sigma_m`.
     phase: PhasePositions | None
 
 
@@ -201,10 +215,10 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
-    """Return the mean square distance to the best other place of ambiguous epochs, shape (T,).
+    """Return the mean square distance to the best other position of ambiguous epochs, shape (T,).
 
-    The other place fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
-    (normal likelihoods, neither place likelier beforehand).
+    The other position fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
+    (normal likelihoods, equal priors).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
@@ -224,9 +238,9 @@ def _status(
     failed: tuple[Masks, Masks, Masks],
     config: Config,
 ) -> Codes:
-    """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first.
+    """Return the status of each epoch, shape (T,): the first condition that is true, the most serious first.
 
-    `failed`: ranges that contradict the map, or each other, and other places that are open; shape (T,) each.
+    `failed`: ranges that contradict the map, or each other, and other possible positions; shape (T,) each.
     """
     off_map, inconsistent, open_elsewhere = failed
     redundancy, constrained, section = ranges.redundancy, solution.fix.constrained, solution.fix.section
@@ -243,6 +257,7 @@ def _status(
             (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,
             Status.AMBIGUOUS,
         ),
+        (constrained.overshoot_m > 0.0, Status.MAP_END),
     ]
     status = np.full(len(ranges), Status.OK, dtype=np.int8)
     for condition, value in reversed(conditions):

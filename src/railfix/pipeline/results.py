@@ -208,14 +208,14 @@ class Result(NotebookTable):
     """Results of one chunk."""
 
     antennas: Mapping[str, AntennaResult]
-    notes: tuple[str, ...]  #: Differences between what was requested and what was used, one sentence each.
+    notes: tuple[str, ...]  #: Differences between the requested and the used data, one sentence each.
     #: Positions of the filter along the track, by antenna; empty where it is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
     #: What the filter was given, by antenna, to smooth its positions (`railfix.pipeline.smoothed_track`).
     replays: Mapping[str, tuple[Replay, ...]] = field(default_factory=dict)
 
     def __getitem__(self, antenna: str) -> AntennaResult:
-        """Return the single-epoch results of an antenna; KeyError where there is none of that name."""
+        """Return the single-epoch results of an antenna; KeyError where no antenna has that name."""
         return self.antennas[antenna]
 
     def __repr__(self) -> str:

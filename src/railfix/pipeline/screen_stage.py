@@ -31,8 +31,8 @@ def screen_antennas(
 ) -> tuple[Chunk, list[AntennaState]]:
     """Return the chunk after the screens that judge one antenna alone (`screens`, with their limits), and new states.
 
-    Dopplers and phases of the wrong sign or unit are left out first. Codes of two frequencies are combined then, and
-    smoothed by the carrier phase where the settings ask for it.
+    Dopplers and phases of the wrong sign or unit are left out first. Codes of two frequencies are combined here, and
+    smoothed by the carrier phase where the settings request it.
     """
     corrected, antennas = chunk.corrected, chunk.antennas
     checked = [

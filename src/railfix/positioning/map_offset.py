@@ -120,8 +120,8 @@ class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
     arc_m: Floats  #: NaN where missing, shape (T,).
-    #: The train is away from the line. These epochs have a separate window: positions off the line say nothing about
-    #: the map when the train has returned to it; shape (T,).
+    #: The train is away from the line. These epochs have a separate window: positions off the line contain no
+    #: information on the map when the train has returned to it; shape (T,).
     off_map: Masks
 
 
@@ -169,6 +169,15 @@ def map_offset(
         detectable_m=np.where(enough[:, None], detectable, np.nan),
     )  # fmt: skip
     return result, after
+
+
+def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
+    """Return how far 3-D positions (T, 3) lie right of places on the line and above them, shape (T, 2); NaN without."""
+    known = np.isfinite(arc_m)
+    arc = np.where(known, arc_m, 0.0)
+    axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]
+    offset = np.einsum("tij,tj->ti", axes, ecef_m - antennas.at_arc(arc))
+    return np.asarray(np.where(known[:, None], offset, np.nan))
 
 
 def terms_of_epochs(

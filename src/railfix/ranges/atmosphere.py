@@ -53,6 +53,11 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
 
 
+def geomagnetic_latitude(latitude: Floats, longitude: Floats) -> Floats:
+    """Return the geomagnetic latitude of the broadcast ionosphere model (IS-GPS-200, 20.3.3.5.2.5) in semicircles."""
+    return np.asarray(latitude + 0.064 * np.cos((longitude - 1.617) * np.pi))
+
+
 def klobuchar_delay_m(
     time: Datetimes,
     latitude_deg: Floats,
@@ -74,7 +79,7 @@ def klobuchar_delay_m(
     earth_angle = 0.0137 / (elevation + 0.11) - 0.022
     latitude = np.clip(latitude_deg[:, None] / 180.0 + earth_angle * np.cos(azimuth), -0.416, 0.416)
     longitude = longitude_deg[:, None] / 180.0 + earth_angle * np.sin(azimuth) / np.cos(latitude * np.pi)
-    magnetic = latitude + 0.064 * np.cos((longitude - 1.617) * np.pi)
+    magnetic = geomagnetic_latitude(latitude, longitude)
     local = (43_200.0 * longitude + seconds_of_week[:, None]) % SECONDS_PER_DAY
     low = 0.53 - elevation
     slant = 1.0 + 16.0 * low * low * low

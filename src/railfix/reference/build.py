@@ -1,6 +1,6 @@
 """Reference positions of one run: fixes are checked and matched to the track, gaps are bridged.
 
-1. The positions of each antenna are checked by themselves, in pairs, and against the track (`fixes`).
+1. The positions of each antenna are checked separately, in pairs, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at the current positions, which are interpolated between fixes
    at first, and smoothed in the next rounds. 3. The distance between fixes is compared with the distance travelled;
    fixes that disagree are rejected.
@@ -40,7 +40,7 @@ from railfix.reference.smoother import (
 from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Speeds further apart leave the distance between them unknown [s], with this variance [m2].
+#: Speeds farther apart leave the distance between them unknown [s], with this variance [m2].
 LONGEST_STEP_S: Final = 2.5
 UNKNOWN_M2: Final = 1e8
 
@@ -72,7 +72,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where there is none."""
+    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where missing."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)

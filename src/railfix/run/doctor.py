@@ -1,4 +1,4 @@
-"""Files examined before a run: what each is, what is inside, what is missing, and the command to run."""
+"""Files examined before a run: kind and content of each, missing files, and the command to run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ Kind = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class FileFinding:
-    """What one file is: kind, facts in words, span in GPS time and place (ECEF, shape (3,) [m]) where it has them."""
+    """Properties of one file: kind, facts in words, span in GPS time and position (ECEF, shape (3,) [m])
+    where known.
+    """
 
     path: Path
     kind: Kind
@@ -49,12 +51,12 @@ class FileFinding:
     place_ecef_m: Floats | None = None
     ephemerides: Span | None = None  #: Reference times of the ephemerides in the file; None without any.
     options: tuple[str, ...] = ()  #: Options that a command needs to read the file.
-    problems: tuple[str, ...] = ()  #: What is wrong with the file alone, a sentence each.
+    problems: tuple[str, ...] = ()  #: Faults of the file alone, one sentence each.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """Findings on each file, what does not fit together or is missing, and the command to run (blank: none)."""
+    """Findings on each file, mismatches and missing files, and the command to run (blank: none)."""
 
     findings: tuple[FileFinding, ...]
     problems: tuple[str, ...]
@@ -96,7 +98,9 @@ def examine_files(paths: Sequence[Path]) -> Diagnosis:
 
 
 def _examine(path: Path) -> FileFinding:
-    """Return what a file is: its content decides the kind, and the reader of that kind says what is wrong with it."""
+    """Return the properties of a file: its content determines the kind, and the reader of that kind reports
+    its faults.
+    """
     errors: list[str] = []
     kinds = _find_kinds(path)
     for kind in kinds:
@@ -189,7 +193,7 @@ def _own_ephemerides(path: Path) -> tuple[int, Span] | None:
         return None
     try:
         navigation = read_navigation([path])
-    except InputFileError:  # it has none: observations alone are no fault of a log
+    except InputFileError:  # without navigation records: observations alone are no fault of a log
         return None
     span = navigation_span(navigation)
     return None if span is None else (len(navigation.kepler) + len(navigation.glonass), span)
@@ -211,7 +215,7 @@ def _navigation(path: Path) -> FileFinding:
 
 
 def _track(path: Path) -> FileFinding:
-    """Return what a track map is: one route, or a network of which a run finds the route; without heights, too."""
+    """Return the kind of a track map: one route, or a network in which a run finds the route; also without heights."""
     options: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     try:
@@ -304,14 +308,18 @@ def _sbas(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
 
 
-#: What a file of each kind can be for railfix.
+#: Uses of a file of each kind.
 _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
-    "observations": ("observations",), "navigation": ("navigation",), "sp3": ("orbits",), "sbas": ("sbas",),
-    "receiver": ("observations", "navigation", "positions"), "gpx": ("positions", "track"),
-    "toml": ("vehicle", "settings"), **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
+    "observations": ("observations",),
+    "navigation": ("navigation",),
+    "sp3": ("orbits",),
+    "sbas": ("sbas",),
+    "receiver": ("observations", "navigation", "positions"),
+    "gpx": ("positions", "track"),
+    "toml": ("vehicle", "settings"),
+    **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
-}  # fmt: skip
-#: What reads each kind of file.
+}  # Readers of each kind of file.
 _READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
@@ -337,17 +345,17 @@ def _filter(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
 
 
 def _problems(findings: Sequence[FileFinding]) -> list[str]:
-    """Return what does not fit together, and what is missing for a run, a sentence each."""
+    """Return mismatches, and files missing for a run, one sentence each."""
     problems = [problem for finding in findings for problem in finding.problems]
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     readable = [log for log in logs if log.span is not None]
     navigation = [finding for finding in findings if finding.ephemerides is not None or finding.kind == "navigation"]
     if not logs:
-        problems.append("there is no log of observations: give a RINEX observation file or a receiver's log")
+        problems.append("no log of observations: give a RINEX observation file or a receiver's log")
     if not navigation and logs:
-        problems.append("there is no navigation file: give the broadcast ephemerides of the day")
+        problems.append("no navigation file: give the broadcast ephemerides of the day")
     if not tracks and logs:
-        problems.append("there is no track map: railfix map survey makes one of runs over the line")
+        problems.append("no track map: railfix map survey makes one from runs over the line")
     if len(logs) > 2:
         problems.append("there are more than two logs: give the files of one run")
     for log in readable:

@@ -55,7 +55,7 @@ class Finding:
     #: First and last point of the range.
     first: int
     last: int
-    #: Of the first point; the kilometrage may be NaN.
+    #: Values of the first point; the kilometrage may be NaN.
     chainage_m: float
     kilometrage_m: float
     #: The worst value and its limit; NaN for faults without a number.

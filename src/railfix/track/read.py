@@ -139,7 +139,7 @@ def check_heights(
 
 
 def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of one map file in their order; a file without heights gives segments without."""
+    """Read the lines of one map file in their order; a file without heights gives segments without heights."""
     segments = _read_segments(file, reading)
     if (given := reading.sigma_plan_m) is not None:
         return [_with_given_accuracy(segment, given) for segment in segments]
@@ -160,7 +160,7 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with an accuracy in plan that holds for all, the transformation from its datum included."""
+    """Return a segment with an accuracy in plan that is valid for all, including the transformation from its datum."""
     note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)

@@ -133,7 +133,7 @@ _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the linear elements that have a geometry as segments; InputFileError where there is none."""
+    """Read the linear elements that have a geometry as segments; InputFileError where none exists."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [

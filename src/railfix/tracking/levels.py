@@ -39,7 +39,7 @@ class AccumulatedIncrement:
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     number: int = -1  #: Number of periods from `start` to the last epoch taken; -1 before the first.
     epochs: int = 0  #: Epochs since then.
-    #: Satellites whose carrier phase went on at all of them; None where there was no epoch.
+    #: Channels whose carrier phase went on at all of them; None where there was no epoch.
     unbroken: frozenset[str] | None = None
     #: Sums over these epochs of distances by wheel and radar [m] and force [m/s2], and of variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
@@ -132,14 +132,14 @@ def _balises(
 
 
 def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
-    """Return which satellites' phases went on at all epochs since the last one that was taken, shape (K,)."""
+    """Return which channels' phases went on at all epochs since the last one that was taken, shape (K,)."""
     if since.unbroken is None:
-        return np.ones(len(epochs.satellite), dtype=np.bool_)
-    return np.array([name in since.unbroken for name in epochs.satellite.tolist()], dtype=np.bool_)
+        return np.ones(len(epochs.channel), dtype=np.bool_)
+    return np.array([name in since.unbroken for name in epochs.channel.tolist()], dtype=np.bool_)
 
 
 def _names(epochs: GnssEpochs, unbroken: Masks, *, restarted: bool) -> frozenset[str] | None:
-    return None if restarted else frozenset(epochs.satellite[unbroken].tolist())
+    return None if restarted else frozenset(epochs.channel[unbroken].tolist())
 
 
 def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats) -> SensorEpochs:
@@ -161,8 +161,8 @@ _EXPLAINED: Final = (3.0, 4.0)
 #: Larger levels are none [m]: they are those of a sub-filter that is left without measurements.
 LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
-    "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m", "amount_m",
-    "status",
+    "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
+    "unchecked_prior", "amount_m", "status",
 )  # fmt: skip
 
 
@@ -174,7 +174,7 @@ class LevelState:
     every: bool = True  #: It has taken every epoch so far: it is the filter itself.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Its last epoch.
-    #: Its place, speed, levels with parts, amount and status at that epoch; shape (9,).
+    #: Its place, speed, levels with parts, amount and status at that epoch; shape (10,).
     values: Floats = field(default_factory=lambda: np.full(len(_KEPT), np.nan))
 
 
@@ -235,7 +235,7 @@ def carried_levels(
         columns = np.array([getattr(place, name) for name in _KEPT], dtype=np.float64).T
         columns[:, _KEPT.index("level_m")] = np.where(is_bounded(place.status), place.level_m, np.inf)
         times, values = np.concatenate([times, place.time]), np.concatenate([values, columns])
-    arc, speed, level, ground, noise, of_speed, separation, amount, status = values[number].T
+    arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
     tau = _since(times[number], tracked.time)
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
     # What the place may have gone wrong by since then: V tau + a tau^2 / 2.
@@ -263,6 +263,7 @@ def carried_levels(
         tracked, status=reported, sigma_m=np.hypot(tracked.sigma_m, spread), level_m=_useful(level),
         ground_level_m=_useful(widened(ground, straight)), level_noise_m=np.where(known, noise, np.nan),
         level_speed_mps=np.where(known, of_speed, np.nan), separation_m=np.where(known, separation, np.nan),
+        unchecked_prior=np.where(known, unchecked, np.nan),
         amount_m=_useful(np.where(known, amount, np.nan)),
     )  # fmt: skip
     return tracked, copy_with(state, time=times[-1], values=values[-1])

@@ -113,6 +113,9 @@ class TrackingLimits(Settings):
     #: Probability that the map is wrong by more than its sigma, and by how much. An assumption.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
+    #: Probability that the ionosphere is tilted over the sky by more than `slow_code_m`: a storm, or the equatorial
+    #: anomaly (`tracking.line.TILT_M` has the size). An assumption.
+    level_tilt_prior: float = Field(default=1e-3, ge=0, lt=1)
 
     @property
     def tails(self) -> Tails:

@@ -92,6 +92,8 @@ class Tracked:
     level_speed_mps: Floats
     #: Largest separation of a sub-filter. NaN where levels are off; shape (T,).
     separation_m: Floats
+    #: Probability of faults that the level does not bound: one common to the only constellation; shape (T,).
+    unchecked_prior: Floats
     #: Over- and under-reading amount: the level, and never less than the bound of the scale times the distance since
     #: codes were used (SUBSET-026 3.6.8); shape (T,).
     amount_m: Floats

@@ -70,12 +70,8 @@ STILL_MPS: Final = 0.3
 DIRECTION_MPS: Final = 1.0
 #: Shorter than this the tangent is the direction of a displacement [m].
 CHORD_M: Final = 0.5
-#: Shares of a sensor's variance, and of that of what it measures, that no weight takes away: two sensors of the same
-#: combination, or a wheel and phases before the speed is known, keep it regular.
-SENSOR_FLOOR: Final = 1e-6
 #: Share of their own information below which phases or Dopplers say nothing that others do not.
 LEAST_PIVOT: Final = 1e-12
-UNKNOWN_FLOOR: Final = 1e-10
 
 # Clocks.
 #: A clock whose median innovation is beyond this many standard deviations has stepped.

@@ -70,6 +70,7 @@ VERTEX: Final = record_of({
 LINE: Final = record_of({
     "sigma_plan_m": float,  # of the map across [m]
     "sigma_height_m": float,  # of the map's heights [m]
+    "tilt_m": float,  # sigma of a displacement along the line by a tilted ionosphere [m]
     "start_m": float,  # open ends; infinite where closed [m]
     "end_m": float,
     "start_turn_m": float,  # length of the turn that goes on before the start or after the end, 0 where open [m]

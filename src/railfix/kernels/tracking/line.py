@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking.layout import Record, Records
@@ -38,13 +40,7 @@ def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float
 def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: Floats) -> None:
     """Write point [m] and axes (tangent, right, up) of the line at an arc length; shapes (3,), (3, 3)."""
     arc = wrap_arc(vertex, line, arc)
-    low, high = 1, len(vertex) - 1
-    while low < high:
-        half = (low + high) // 2
-        if vertex[half].arc_m <= arc:
-            low = half + 1
-        else:
-            high = half
+    low = 1 + np.searchsorted(vertex["arc_m"][1:-1], arc, side="right")
     here, after = vertex[low - 1], vertex[low]
     along = arc - here.arc_m
     share = min(max(along / (after.arc_m - here.arc_m), 0.0), 1.0)
@@ -64,13 +60,7 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
     """Return the gradient of the line, linear between the middles of segments."""
     arc = wrap_arc(vertex, line, arc)
     segments = len(vertex) - 1
-    low, high = 0, segments
-    while low < high:
-        half = (low + high) // 2
-        if vertex[half].middle_m <= arc:
-            low = half + 1
-        else:
-            high = half
+    low = np.searchsorted(vertex["middle_m"][:segments], arc, side="right")
     if low == 0:
         return float(vertex[0].gradient)
     if low == segments:

@@ -108,6 +108,9 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
         else:
             continue
         variance = _exclude_source(given, t, rows, state, b, best.equations)
+        if one.running and _has_diverged(b - satellites, P, variance):
+            one.running = False
+            continue
         _correct(given, t, rows, variance, best, (x, P), equations, found)
         _update_contradiction(given, t, rows, state, b, variance, found)
 
@@ -118,6 +121,16 @@ def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
     near = abs(x[ix.ARC] - best.x_prior[ix.ARC]) < constants.JOINED * sigma
     return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ix.ARC, ix.ARC])
+
+
+@inner
+def _has_diverged(clock: int, P: Floats, variance: Floats) -> bool:
+    """Return whether a sub-filter without a constellation, `clock` in `CLOCKS`, has nothing left to measure.
+
+    Its place is as uncertain as at a start: it bounds nothing (`railfix.kernels.tracking.level.find_unchecked`).
+    """
+    lost = 0 <= clock < ix.CLOCK_COUNT and math.sqrt(P[ix.ARC, ix.ARC]) > constants.START_SIGMA_M
+    return lost and not np.isfinite(variance).any()
 
 
 @inner

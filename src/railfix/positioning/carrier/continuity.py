@@ -44,7 +44,9 @@ def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
 
 
 def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
-    """Return the row of each channel in the epoch before, shape (M,); -1, the NaN appended to values, for new ones."""
+    """Return the row of each channel in the previous epoch, shape (M,); -1, the NaN appended to values, for new
+    ones.
+    """
     row = {key: i for i, key in enumerate(before)}
     return np.array([row.get(key, -1) for key in now], dtype=np.intp)
 
@@ -128,7 +130,7 @@ class TrackJumps:
     metric_m: Floats  #: Change of phase less that of the remaining channels; NaN where not judged; shape (T, M).
     judged: Masks  #: Shape (T, M).
     moved_m: (
-        Floats  #: Distance along the line since the epoch before, from the phases; NaN where not known; shape (T,).
+        Floats  #: Distance along the line since the previous epoch, from the phases; NaN where not known; shape (T,).
     )
     moved_sigma_m: Floats  #: Shape (T,).
 

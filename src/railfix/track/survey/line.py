@@ -38,7 +38,8 @@ _ADJUSTMENT_ROUNDS: Final = 15
 _SETTLED_M: Final = 0.02
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Scales of the stated standard deviations that residuals may show; they do not show errors that satellites share.
+#: Scales of the stated standard deviations that residuals may indicate; they do not indicate errors that satellites
+#: share.
 _SCALES: Final = (0.5, 10.0)
 _ANYWHERE_M: Final = 1e5  #: Loose prior for conditioning: standard deviation of every unknown [m].
 #: Points of the line whose standard deviation is computed at most, others are interpolated, and columns at a time.
@@ -51,7 +52,7 @@ class Adjusted:
     """Result of an adjustment."""
 
     ecef_m: tuple[Floats, ...]  #: Positions of each run, its offset taken off; shape (n, 3).
-    #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not asked for.
+    #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not requested.
     line_m: Floats
     line_sigma_m: Floats
     #: Mean weight of the positions or codes of each row, about 1 without outliers; 0 without any; shape (n,).
@@ -106,7 +107,9 @@ def adjust(
 
 
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
-    """Return the share of each row in an independent position, by time and distance since the last row, shape (n,)."""
+    """Return the weight of each row as a fraction of an independent position, by time and distance since the last row,
+    shape (n,).
+    """
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
     by_time = since / np.maximum(2.0 * limits.correlation_s, 1e-9)
@@ -194,12 +197,12 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
 
 
 _ROUNDS: Final = 3  #: Adjustments with the line; after each of them the passes are found again.
-#: The directions have a track each where they lie apart by more than so many standard deviations of what a run may be
-#: off: three of the difference of two.
+#: The directions are on separate tracks where they are apart by more than this many standard deviations of a run's
+#: offset: three of the difference of two.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Way over which a change of direction is looked for [m].
+_TURN_M: Final = 40.0  #: Way over which a change of direction is searched for [m].
 _END_POINTS: Final = 8  #: Points that show the direction at an end of the line.
-_OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that is that of the whole map.
+_OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that represents the whole map.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,12 +216,12 @@ class Survey:
     passes: Integers  #: Number of passes at each point, shape (V,).
     runs_ecef_m: tuple[Floats, ...]  #: Adjusted positions of each run, shape (n, 3).
     scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run against those stated.
-    beside_m: float  #: Way of the runs that does not lie on the line.
+    beside_m: float  #: Length of the runs off the line.
     closed: bool
 
 
 def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None, name: str = "survey") -> Survey:
-    """Adjust runs to the map of one line, alone, then as passes. ValueError: they never move, or lie apart."""
+    """Adjust runs to the map of one line, individually, then as passes. ValueError: they never move, or are apart."""
     limits = limits or SurveyLimits()
     origin = np.nanmean(np.concatenate([run.ecef_m for run in runs]), axis=0)
     axes = axes_at(origin)
@@ -286,7 +289,7 @@ def _reference_line(course: Course, origin: Floats, axes: Floats) -> ReferenceLi
 
 
 def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
-    """Return how often each run passes the place of each of its rows, shape (n,) each."""
+    """Return how often each run passes each of its rows, shape (n,) each."""
     found = []
     for r, run in enumerate(runs):
         mine = ties.run == r
@@ -298,7 +301,9 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return points of an open line without those at its ends that do not lead on: noise of runs that stand there."""
+    """Return points of an open line without points at its ends that do not lead on, which are noise of
+    standing runs.
+    """
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:
@@ -311,7 +316,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Return points that lead on from the last by half a spacing or more: where runs stand, noise makes others."""
+    """Return points that lead on from the last by half a spacing or more: standing runs add others by noise."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]

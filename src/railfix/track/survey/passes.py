@@ -1,4 +1,6 @@
-"""The line that the passes of several runs share: its course without repetitions, and where each pass lies on it."""
+"""The line that the passes of several runs share: its course without repetitions, and the position of each
+pass on it.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from railfix.track.survey.runs import SurveyLimits
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one line.
 #: Parts of a leg nearer than this many widths (`same_line_m`) along it are no repetition of each other.
 _APART_WIDTHS: Final = 3.0
-_MOSTLY: Final = 0.8  #: Share of the points of a stretch that lie on the line where the stretch does.
+_MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must lie on the line.
 _SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is evened out [m].
 _GAP_S: Final = 10.0  #: Longer without any row a run is not followed [s].
 _NEIGHBOURS: Final = 24  #: Neighbouring vertices that a point is compared with.
@@ -58,7 +60,7 @@ class Leg:
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """The line as a polyline, J points; the last one of a closed line goes on at the first."""
+    """The line as a polyline, J points; the last point of a closed line is joined to the first."""
 
     point_m: Floats
     closed: bool = False
@@ -149,7 +151,7 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
 
 
 def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
-    """Return the beginning of a polyline up to where it lies beside itself for some widths."""
+    """Return the beginning of a polyline up to where it runs parallel to itself for some widths."""
     least = int(_APART_WIDTHS * width_m / spacing_m)
     way = directions(points)
     tree = cKDTree(points[:, :2])
@@ -173,7 +175,9 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Return one turn of a closed line: from point `start` to `end`, which is the same place; the gap is evened out."""
+    """Return one turn of a closed line: from point `start` to `end`, which is the same point; the gap is
+    distributed.
+    """
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
@@ -226,7 +230,9 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Return the fractional point of the course, direction (0: beside) and distance to its right [m], shapes (q,)."""
+    """Return the fractional point of the course, direction (0: off the course) and distance to its right [m], shapes
+    (q,).
+    """
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
     count = min(_NEIGHBOURS, len(course))
@@ -253,7 +259,7 @@ def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats
 
 
 def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tuple[list[Pass], float]:
-    """Find the pieces of all legs that lie on the course, and the way that does not [m]."""
+    """Find the pieces of all legs that lie on the course, and the length that does not [m]."""
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     passes: list[Pass] = []
     beside = 0.0
@@ -321,7 +327,7 @@ class Ties:
 
     run: Indices  #: Shape (m,).
     row: Indices  #: Rows of the run about the point, shape (m, 4).
-    weight: Floats  #: Of these rows, with the sum 1; shape (m, 4).
+    weight: Floats  #: Weights of these rows, with the sum 1; shape (m, 4).
     point: Indices  #: Shape (m,).
     number: Indices  #: Number of the pass, shape (m,).
 
