@@ -106,24 +106,15 @@ def position_stage(
     if sigma.phase is not None:
         off_map = contradict_map(checked.ranges, antennas, fix, sigma.arc_m, config) & ~unresolved
     observed = np.asarray(np.isfinite(corrected.code_m).any(axis=1))
-    solution = copy_with(
-        solution,
-        status=_status(
-            observed,
-            checked.ranges,
-            solution,
-            sigma.judged_m,
-            (off_map, raim.faulty | unresolved, open_elsewhere),
-            config,
-        ),
-    )
+    failed = off_map, raim.faulty | unresolved, open_elsewhere
+    status = _status(observed, checked.ranges, solution, sigma.judged_m, failed, config)
     after = [
         copy_with(
             state, offsets=offsets[k], map_offset=map_states[k], off_map=off_map_states[k], carrier=carriers[k]
         )
         for k, state in enumerate(states)
     ]  # fmt: skip
-    return corrected, solution, after
+    return corrected, copy_with(solution, status=status), after
 
 
 def _alone_on_clock(corrected: CorrectedRanges, ties: InterSystemBiases) -> Masks:

@@ -271,13 +271,8 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     doppler = -(path_rate[:, column] - scale * ionosphere_rate[:, column] + drift) / wavelength
     noise = receiver.white(len(time))
     sine = np.sin(np.radians(np.maximum(geometry.elevation_deg, 1.0)))
-    cn0 = (
-        settings.cn0_horizon_dbhz
-        + settings.cn0_rise_db * sine
-        + CN0_SECOND_DB * receiver.second
-        + receiver.cn0_offset_db
-    )
-    cn0 = cn0 + settings.cn0_sigma_dbhz * noise[:, :, 3] + receiver.carried.cn0_db(len(time))
+    cn0 = settings.cn0_horizon_dbhz + settings.cn0_rise_db * sine + CN0_SECOND_DB * receiver.second
+    cn0 = cn0 + receiver.cn0_offset_db + settings.cn0_sigma_dbhz * noise[:, :, 3] + receiver.carried.cn0_db(len(time))
     added_code, added_phase, added_doppler, cn0 = _disturb(simulation, receiver, geometry, cn0)
     cn0 = np.round(cn0 / CN0_STEP_DBHZ) * CN0_STEP_DBHZ
     weak = 10.0 ** ((_SIGMA_AT_DBHZ - np.minimum(cn0, _BEST_DBHZ)) / 20.0)
