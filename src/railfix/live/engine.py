@@ -175,7 +175,7 @@ class LiveEngine:
     def _hear(self, item: _FromSatellites) -> None:
         self._heard = item.heard
         last = self._from_satellites[-1] if self._from_satellites else None
-        if last is not None and last.heard > self._heard_at_push:  # no epoch came between
+        if last is not None and last.heard > self._heard_at_push:  # no epoch was received between
             self._from_satellites[-1] = last.with_later(item)
         else:
             self._from_satellites.append(item)

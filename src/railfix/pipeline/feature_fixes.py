@@ -69,7 +69,7 @@ def ahead_m(trajectory: Trajectory) -> float:
 class RateSeries:
     """Rates of the body at K ticks."""
 
-    #: Times at which they hold, and when they were known; shape (K,).
+    #: Times for which they are valid, and when they became known; shape (K,).
     time: Datetimes
     known: Datetimes
     distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).

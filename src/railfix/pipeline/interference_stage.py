@@ -76,7 +76,7 @@ class InterferenceState:
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
-    second: int = -1  #: GPS second of the last epoch that was looked at.
+    second: int = -1  #: GPS second of the last epoch that was checked.
     #: Break and the receiver's alarms since then.
     broken: bool = False
     alarm: int = 0
@@ -129,7 +129,9 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites that are wrong separately, not by a spoofer who moves all of a clock; shape (T, K)."""
+    """Return the satellites that are wrong individually, not by a spoofer who moves all satellites of a clock; shape
+    (T, K).
+    """
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:

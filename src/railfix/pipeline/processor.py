@@ -163,7 +163,7 @@ class EpochProcessor:
         return ThreadPoolExecutor(len(self.trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the threads, which another process has of its own."""
+        """Return everything but the threads, which another process creates itself."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
 
     @cached_property
@@ -173,7 +173,7 @@ class EpochProcessor:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the data known from the start, and on screens that cannot judge."""
+        """Notes on the data known from the start, and on screens that cannot be run."""
         return (*self.received.notes, *self._lacking)
 
     def _inactive_notes(self) -> tuple[str, ...]:

@@ -102,7 +102,7 @@ def by_name(columns: Iterable[Column[Source]]) -> dict[str, Column[Source]]:
 
 
 def of_one_meaning(meaning: str, **values: str | Callable[[Any], NDArray[Any] | None]) -> Iterator[Column[Any]]:
-    """Return columns of floats with one meaning, and each with values of its own."""
+    """Return columns of floats with one meaning and separate values."""
     return (Column(name, meaning, source) for name, source in values.items())
 
 

@@ -172,7 +172,9 @@ def map_offset(
 
 
 def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
-    """Return how far 3-D positions (T, 3) lie right of places on the line and above them, shape (T, 2); NaN without."""
+    """Return how far 3-D positions (T, 3) lie right of positions on the line and above them, shape (T, 2); NaN
+    without.
+    """
     known = np.isfinite(arc_m)
     arc = np.where(known, arc_m, 0.0)
     axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]

@@ -133,7 +133,7 @@ class _ReferenceBuilder:
         self.trajectory = data.trajectories[name]
 
     def built(self, fixes: Fixes) -> Built:
-        """From judged fixes to the reference."""
+        """From checked fixes to the reference."""
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
@@ -273,7 +273,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to instants and its variance: by a wheel if any, else by Dopplers."""
+        """Return the distance travelled up to instants and its variance: by a wheel if any, otherwise by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

@@ -107,7 +107,7 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     for name, pattern in patterns.items():
         _check_pattern(path, name, pattern)
         if other := sorted(set(_FIELD.findall(pattern)) - set(fields)):
-            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front has not")
+            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front lacks")
     found = {name: _find(folder, pattern) for name, pattern in patterns.items()}
     keys = list(dict.fromkeys(tuple(values[name] for name in fields) for _, values in found["front"]))
     if not keys:

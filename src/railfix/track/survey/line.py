@@ -51,7 +51,7 @@ _COLUMNS: Final = 20
 class Adjusted:
     """Result of an adjustment."""
 
-    ecef_m: tuple[Floats, ...]  #: Positions of each run, its offset taken off; shape (n, 3).
+    ecef_m: tuple[Floats, ...]  #: Positions of each run without its offset; shape (n, 3).
     #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not requested.
     line_m: Floats
     line_sigma_m: Floats
