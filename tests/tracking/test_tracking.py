@@ -83,7 +83,7 @@ def test_a_chunk_with_its_channels_in_another_order_goes_on_with_the_phases_of_t
     late = part(case.epochs, slice(40, None))
     columns = {name: getattr(late, name) for name in names if getattr(late, name).shape[1:2] == (10,)}
     turned = {name: values[:, order] for name, values in columns.items()}
-    turned |= {name: getattr(late, name)[order] for name in ("satellite", "clock")}
+    turned |= {name: getattr(late, name)[order] for name in ("satellite", "signal", "clock")}
     _, state = track(part(case.epochs, slice(0, 40)), case.line)
     found, _ = track(replace(late, **turned), case.line, state)
     absent = [k for k in range(10) if k not in order]
@@ -93,6 +93,31 @@ def test_a_chunk_with_its_channels_in_another_order_goes_on_with_the_phases_of_t
     expected, _ = track(replace(late, code_m=code, phase_m=phase, rate_mps=rate), case.line, state)
     np.testing.assert_allclose(found.arc_m, expected.arc_m, atol=1e-6)
     np.testing.assert_allclose(found.weight, expected.weight[..., order], atol=1e-6)
+
+
+@pytest.mark.requirement("A8")
+def test_a_satellite_whose_signals_take_turns_is_the_same_epoch_by_epoch() -> None:
+    """Its error goes on with either signal; its phase goes on with its own alone."""
+    epochs, line = ride(60, noise=1.0).epochs, ride(60).line
+    both = np.append(np.arange(10), 3)  # the fourth satellite has two signals
+    fourth = np.arange(60) % 7 == 5  # in some epochs only the second one
+    values = {f.name: getattr(epochs, f.name) for f in fields(GnssEpochs) if getattr(epochs, f.name) is not None}
+    values |= {name: value[:, both] for name, value in values.items() if value.shape[1:2] == (10,)}
+    values |= {name: values[name][both] for name in ("satellite", "signal", "clock")}
+    values["signal"][-1] = "1W"
+    for name in ("code_m", "phase_m", "rate_mps"):
+        values[name] = np.array(values[name])
+        values[name][fourth, 3], values[name][~fourth, -1] = np.nan, np.nan
+    values["phase_joined"] = np.array(values["phase_joined"])
+    values["phase_joined"][1:, [3, -1]] = (fourth[1:] == fourth[:-1])[:, None]
+    mixed = GnssEpochs(**values)
+    whole, _ = track(mixed, line)
+    state, arcs = None, []
+    for k in range(60):
+        one = part(mixed, slice(k, k + 1))
+        found, state = track(one, line, state)
+        arcs.append(found.arc_m[0])
+    np.testing.assert_allclose(np.array(arcs), whole.arc_m, atol=1e-9)
 
 
 @pytest.mark.requirement("E5")

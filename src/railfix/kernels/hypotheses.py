@@ -171,7 +171,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
     Returns
     -------
     channel : ndarray of int, shape (T, n)
-        Channels in use, side by side.
+        Channels in use, adjacent.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
         As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
     separation : ndarray, shape (T,)

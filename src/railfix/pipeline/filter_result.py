@@ -112,7 +112,7 @@ class AlongTrack(NotebookTable, OnDemand):
     direction: Codes
     standstill: Masks  #: Shape (T,).
     sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    #: Distance from the position of the other antenna less that of the antennas; NaN where it was not looked at; shape
+    #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape
     #: (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.

@@ -70,11 +70,11 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     seen = np.full((len(epochs) + 1, len(state.satellite)), np.datetime64("NaT", "ns"), dtype="datetime64[ns]")
     seen[0] = state.seen
     used = (slot >= 0).nonzero()[0]
-    seen[1:, slot[used]] = np.where(any_kind[:, used], epochs.time[:, None], np.datetime64("NaT", "ns"))
+    present = np.zeros((len(epochs), len(state.satellite)), dtype=np.bool_)
+    np.logical_or.at(present, (slice(None), slot[used]), any_kind[:, used])  # a satellite may have several channels
+    seen[1:] = np.where(present, epochs.time[:, None], seen[1:])
     seen = np.fmax.accumulate(seen, axis=0)
     kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * constants.CODE_CORRELATION_S
-    fresh = np.zeros(kept.shape, dtype=np.bool_)
-    fresh[:, slot[used]] = any_kind[:, used]
     state.seen = seen[-1]
 
     variance = _compute_variance(epochs, limits)
@@ -93,7 +93,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
         channel[name] = np.moveaxis(values, 0, -1)
     return Chunk(
         time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, apart=apart, off_map=epochs.off_map,
-        fresh=fresh & ~kept, within_memory=kept,
+        fresh=present & ~kept, within_memory=kept,
     )  # fmt: skip
 
 
@@ -125,7 +125,7 @@ def _pack_epochs(epochs: GnssEpochs, interval: Floats, velocity: Velocity, limit
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
     """Make the state ready to be handed on: without satellites long unseen, with the phases of the last epoch."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
-    state.previous = Previous(satellite=epochs.satellite, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
+    state.previous = Previous(channel=epochs.channel, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
     kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * constants.CODE_CORRELATION_S
     if not kept.all():
         state.rearrange(kept.nonzero()[0], ())
@@ -133,12 +133,12 @@ def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
 
 def _previous(epochs: GnssEpochs, previous: Previous | None) -> tuple[Floats, Floats]:
     """Return the phase and satellites of the epoch before the first, in the order of the channels."""
-    if previous is not None and epochs.satellite.tolist() == previous.satellite.tolist():
+    if previous is not None and np.array_equal(epochs.channel, previous.channel):
         return previous.phase_m, previous.sat_ecef_m
     size = len(epochs.satellite)
     phase, sat = np.full(size, np.nan), np.full((size, 3), np.nan)
     if previous is not None:
-        _, here, there = np.intersect1d(epochs.satellite, previous.satellite, return_indices=True)
+        _, here, there = np.intersect1d(epochs.channel, previous.channel, return_indices=True)
         phase[here], sat[here] = previous.phase_m[there], previous.sat_ecef_m[there]
     return phase, sat
 

@@ -39,7 +39,7 @@ class AccumulatedIncrement:
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     number: int = -1  #: Number of periods from `start` to the last epoch taken; -1 before the first.
     epochs: int = 0  #: Epochs since then.
-    #: Satellites whose carrier phase went on at all of them; None where there was no epoch.
+    #: Channels whose carrier phase went on at all of them; None where there was no epoch.
     unbroken: frozenset[str] | None = None
     #: Sums over these epochs of distances by wheel and radar [m] and force [m/s2], and of variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
@@ -132,14 +132,14 @@ def _balises(
 
 
 def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
-    """Return which satellites' phases went on at all epochs since the last one that was taken, shape (K,)."""
+    """Return which channels' phases went on at all epochs since the last one that was taken, shape (K,)."""
     if since.unbroken is None:
-        return np.ones(len(epochs.satellite), dtype=np.bool_)
-    return np.array([name in since.unbroken for name in epochs.satellite.tolist()], dtype=np.bool_)
+        return np.ones(len(epochs.channel), dtype=np.bool_)
+    return np.array([name in since.unbroken for name in epochs.channel.tolist()], dtype=np.bool_)
 
 
 def _names(epochs: GnssEpochs, unbroken: Masks, *, restarted: bool) -> frozenset[str] | None:
-    return None if restarted else frozenset(epochs.satellite[unbroken].tolist())
+    return None if restarted else frozenset(epochs.channel[unbroken].tolist())
 
 
 def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats) -> SensorEpochs:
