@@ -376,6 +376,12 @@ def _notes(
         f"{against:.0%} of it against its direction; each point is passed {count.min()} to {count.max()} times",
         f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height: 95th percentiles along it",
     ]
+    steps = np.concatenate([np.diff(leg.arc_m) for leg in legs])
+    if len(bridged := steps[steps > _TURN_M]):
+        notes.append(
+            f"{plural(bridged, 'gap')} in the runs bridged by a curve, the longest {bridged.max():.0f} m: the accuracy "
+            "there is that of its ends"
+        )
     if len(runs) == 1:
         plan, height = (2.0 * value for value in runs[0].common_sigma_m)
         notes.append(
