@@ -365,7 +365,8 @@ def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
     """Change of each range by a metre along the line at the reference, shape (T, M), and by a tilted ionosphere.
 
     The tilt is ``cot(elevation)`` times cosine and sine of the azimuth over ``cot(20 deg)``, no more than 1, shape
-    (T, M, 2): a metre on a satellite at 20 deg in the north, or in the east. 0 where unknown.
+    (T, M, 2): a metre on a satellite at 20 deg in the north, or in the east. 0 where unknown. Tilts turn with the sky,
+    those along the line with the train.
     """
     processor = make_processor(parse_config({"filter": "off"}), case.navigation, {"front": case.trajectory})
     found = processor.process({"front": case.observations})[0].antennas["front"]
@@ -385,7 +386,7 @@ def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
     for k, column in enumerate(found.columns):
         change = np.where(known & np.isfinite(sat[:, k, 0]), -(sight[:, k] * tangent).sum(axis=1), 0.0)
         along[:, names == names[column]] = change[:, None]
-        tilt[:, names == names[column]] = of_channel[:, k, None]
+        tilt[:, names == names[column]] = of_channel[:, column, None]
     return along, tilt
 
 

@@ -212,7 +212,7 @@ def test_misuse_ends_with_one_sentence_and_its_code(
     words: list[str], code: int, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "log.obs").write_text("     3.03           OBSERVATION DATA\n")
+    (tmp_path / "log.obs").write_text(f"{'     3.03           OBSERVATION DATA':60}RINEX VERSION / TYPE\n")
     (tmp_path / "few.csv").write_text(
         "time_gpst,latitude_deg,longitude_deg,height_m\n2024-05-01T08:00:00,48,11,500\n2024-05-01T08:00:01,48,11.1,500\n"
     )

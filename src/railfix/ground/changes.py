@@ -46,17 +46,28 @@ def _placed(
 
 
 def correct_interval(
-    state: Interlocking, train: int, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
+    state: Interlocking,
+    train: int,
+    layout: Layout,
+    *,
+    direction: int,
+    rear_m: float,
+    front_m: float,
+    track: int,
+    silent: bool = False,
 ) -> Changed:
     """Return the state with the interval of a stopped train set by hand, and the reason of a refusal.
 
-    Its routes and its authority end; points that it does not occupy are free.
+    Its routes and its authority end, and points that it no longer stands on are free: so the train has to report that
+    it obeys the order to brake, unless it has been `silent` for longer than an authority lasts on board.
     """
     known = state.trains.get(train)
     if known is None:
         return state, f"no such train: {train}"
     if known.stop is None:
         return state, f"train {train} is not stopped: stop it first"
+    if known.unbraked and not silent:
+        return state, f"train {train} has not reported that it obeys the order to brake, and may run on: wait for that"
     moved = _placed(known, layout, direction=direction, rear_m=rear_m, front_m=front_m, track=track)
     if isinstance(moved, str):
         return state, moved
@@ -100,7 +111,7 @@ def _refused_overlap(
 
 
 def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[PointName, PointState]:
-    """Return points that a train locks no more."""
+    """Return points that a train no longer locks."""
     return {
         name: replace(point, locked={n: since for n, since in point.locked.items() if n != train})
         if train in point.locked
@@ -123,7 +134,7 @@ def remove_train(state: Interlocking, train: int, layout: Layout) -> Changed:
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # a station as a whole only where its points are occupied: its tracks are sections of their own
+        # a station as a whole only where its points are occupied: its tracks are separate sections
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None

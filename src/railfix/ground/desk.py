@@ -22,6 +22,8 @@ from railfix.ground.web import Order
 
 #: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
+#: A train that was silent for this time runs by no authority any more (`OnBoardLimits.fresh_s`) and stands [s].
+SILENT_S: Final = 60.0
 #: Longest reason that is taken [characters].
 LONGEST_REASON: Final = 200
 Values = dict[str, Any]
@@ -73,7 +75,7 @@ class OrderedCentre(Protocol):
         """Set a train's route to the next station."""
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train to give its route to the next station back."""
+        """Request a train to return its route to the next station."""
 
 
 @dataclass(kw_only=True)
@@ -81,7 +83,7 @@ class OrderDesk:
     """Orders of one centre."""
 
     centre: OrderedCentre
-    #: Orders that have been given once, by name and values: when and by whom.
+    #: Orders that have been given once, by name and values: time and author.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def given(self, name: str, order: Callable[[Values, str], str | None], values: Values, by: str = "") -> str | None:
@@ -158,6 +160,13 @@ class OrderDesk:
                 return "train {} reports {:.0f} to {:.0f} m, outside of that interval".format(number, *known.reported_m)
         return None
 
+    def is_silent(self, train: int) -> bool:
+        """Return whether a train has not been heard for so long that it stands, whatever it was granted."""
+        supervision = self.centre.supervision
+        record = supervision.records.get(train)
+        heard_s = supervision.begun_s if record is None else max(record.heard_s, supervision.begun_s)
+        return self.centre.clock() - heard_s > SILENT_S
+
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
         """Return the state after a change of trains, and the reason of a refusal."""
         state, layout = self.centre.supervision.state, self.centre.supervision.layout
@@ -172,7 +181,7 @@ class OrderDesk:
                     return state, value
             place: Any = {"rear_m": ends[0], "front_m": ends[1], "track": track, "direction": direction}
             if of == "correct":
-                return correct_interval(state, train, layout, **place)
+                return correct_interval(state, train, layout, **place, silent=self.is_silent(train))
             length = metres_of(values, "length_m")
             if isinstance(length, str):
                 return state, length
@@ -251,7 +260,7 @@ class OrderDesk:
         return None
 
     def orders(self) -> dict[str, Order]:
-        """Return the orders by name; each takes its values and who gives it."""
+        """Return the orders by name; each is called with its values and its author."""
         centre = self.centre
 
         def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:

@@ -68,6 +68,7 @@ class Supervision:
     #: When a train was sent the order to brake that it has not acknowledged yet, and the number of the order.
     ordered: dict[int, tuple[float, int]] = field(default_factory=dict)
     issued: dict[int, set[int]] = field(default_factory=dict)  #: Numbers of all orders to brake since the start.
+    begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
     #: Trains that must report before anything is granted (`begin_again`).
     awaited: set[int] = field(default_factory=set)
     #: Sections that are detected as occupied; None: not answered yet.
@@ -99,8 +100,11 @@ class Supervision:
     def _take_answer(self, message: TrainMessage) -> None:
         """Process a report's statement on the order to brake that the train obeys."""
         number, held = message.train, message.brake_order
-        if number in self.ordered and is_obeyed(message, self.ordered[number][1]):
-            self.ordered[number] = math.inf, self.ordered[number][1]
+        sent_s, first = self.ordered.get(number, (0.0, 0))
+        if number in self.ordered and is_obeyed(message, first):
+            self.ordered[number] = math.inf, first
+        elif sent_s == math.inf:  # a start on board since then has reset it
+            self.ordered[number] = -math.inf, first
         elif held is not None and held not in self.issued.get(number, ()):
             reason = "the train obeys an order to brake from before this start"
             self.state = stop_trains(self.state, [number], reason)
@@ -142,14 +146,17 @@ class Supervision:
         authorities unknown to the database, and the train accepts no late authority of the earlier centre any more. The
         stored detection of points is dropped.
         """
-        self.awaited, last = set(self.state.trains), self.state.granted
+        self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
+        trains = {n: replace(t, unbraked=t.sequence > 0) for n, t in self.state.trains.items()}
         points = {name: replace(p, detected=None, commanded=False) for name, p in self.state.points.items()}
-        self.state = replace(self.state, points=points, granted=last + SKIPPED, skipped=(last, last + SKIPPED))
+        self.state = replace(
+            self.state, trains=trains, points=points, granted=last + SKIPPED, skipped=(last, last + SKIPPED)
+        )
         self._asked_s = dict.fromkeys(points, now_s)
         return tuple(points)
 
     def set_section_detected(self, section: str, occupied: bool | None) -> None:
-        """Process the detection of a section; None where it is not known any more."""
+        """Process the detection of a section; None where it is unknown."""
         self.detected[section] = occupied
         cleared = SWEPT if occupied is False else {UNKNOWN}
         bars = {bar for bar in self.state.bars if bar[0] != section or bar[1] not in cleared}
@@ -170,7 +177,7 @@ class Supervision:
         return reason
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train to give its route to the next station back; return the reason of a refusal."""
+        """Request a train to return its route to the next station; return the reason of a refusal."""
         self.state, reason = ask_route_back(self.state, train, self.layout, limits=self.limits)
         return reason
 
@@ -294,8 +301,8 @@ class Supervision:
 
 
 def is_obeyed(message: TrainMessage, number: int) -> bool:
-    """Return whether a report names an order to brake, or an authority from after it: that was an order as well."""
-    return (message.brake_order or -1) >= number or (message.authority or 0) > number
+    """Return whether a report names an order to brake, or one from after it."""
+    return (message.brake_order or -1) >= number
 
 
 def counts(reason: Rejection | None) -> bool:

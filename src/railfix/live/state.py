@@ -26,7 +26,7 @@ from railfix.live.engine import EngineState
 from railfix.live.state_values import StateFormatError, decode, encode
 from railfix.live.stream import ReceiverState
 
-_FORM: Final = "railfix live state 4"
+_FORM: Final = "railfix live state 5"
 
 
 @dataclass(frozen=True, kw_only=True)

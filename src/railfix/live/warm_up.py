@@ -1,6 +1,6 @@
 """Compilation of all kernels at the first command on a machine: later ones load them from disk.
 
-During a live session it would delay epochs by seconds, in a run nobody would know why nothing happens.
+During a live session it would delay epochs by seconds, and a run would pause without a message.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def compile_filter() -> None:
     """Compile the recursion of the filter along the track; it is kept on disk for other processes."""
     nothing = np.full((1, 1), np.nan)
     epochs = GnssEpochs(
-        time=np.array(["2024-01-01"], dtype="datetime64[ns]"), satellite=np.array(["G01"]), clock=np.array(["G"]),
+        time=np.array(["2024-01-01"], dtype="datetime64[ns]"), satellite=np.array(["G01"]),
+        signal=np.array(["1C"]), clock=np.array(["G"]),
         sat_ecef_m=np.full((1, 1, 3), np.nan), sat_velocity_mps=np.full((1, 1, 3), np.nan), code_m=nothing,
         code_sigma_m=nothing, phase_m=nothing, phase_joined=np.zeros((1, 1), dtype=np.bool_), rate_mps=nothing,
         cn0_dbhz=nothing, off_map=np.zeros(1, dtype=np.bool_),
@@ -81,7 +82,7 @@ def compile_filter() -> None:
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     line = Line.of(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
-    state, limits = TrackState.empty(), TrackingLimits()
+    state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
     recursion.advance(state, len(epochs), trace=None)  # of no epoch: the call compiles it

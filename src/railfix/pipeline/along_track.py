@@ -32,7 +32,7 @@ from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, 
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
+#: Reasons with which a code is still used: the filter weighs multipath and faults itself, over more than one epoch.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK
@@ -332,7 +332,7 @@ def gnss_epochs(
     standard deviation is that of the range times `noise_scale`, shape (T,).
 
     The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in
-    the Dopplers; the change of the carrier phase has both taken off.
+    the Dopplers; the change of the carrier phase has both subtracted.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state
@@ -349,7 +349,7 @@ def gnss_epochs(
         np.where(np.isnan(air), 0.0, air),
     )
     epochs = GnssEpochs(
-        time=obs.time, satellite=ranges.satellite, clock=ranges.channels.clock,
+        time=obs.time, satellite=ranges.satellite, signal=ranges.signal, clock=ranges.channels.clock,
         sat_ecef_m=ranges.satellites.position_ecef_m, sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
         code_m=np.where(healthy, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
         phase_m=np.where(moving & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],

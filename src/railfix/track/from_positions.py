@@ -44,9 +44,9 @@ class ThinningLimits(Settings):
     #: Below this horizontal speed over `_STANDING_WINDOW_S` the antenna is stationary and its positions are noise or
     #: drift. Requires times; 0 keeps all.
     standing_mps: float = Field(default=0.2, ge=0)
-    #: Neighbouring points further apart, joined by a straight line, are reported.
+    #: Neighbouring points farther apart, joined by a straight line, are reported.
     jump_m: float = Field(default=50.0, gt=0)
-    gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points further apart do not form a line: an error.
+    gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points farther apart do not form a line: an error.
     #: Positions that the vehicle could reach from the others only faster than this are wrong and dropped; without
     #: times, positions farther than `gap_m` from the others.
     speed_mps: float = Field(default=150.0, gt=0)
@@ -58,7 +58,7 @@ class Thinned:
 
     kept: Indices  #: Rows that became points of the map, in order; shape (V,).
     dropped: dict[str, int]  #: Number of rows by reason.
-    jumps: Indices  #: Points whose successor is further away than `ThinningLimits.jump_m`, shape (j,).
+    jumps: Indices  #: Points whose successor is farther away than `ThinningLimits.jump_m`, shape (j,).
     jump_m: Floats  #: Distance to the successor, shape (j,).
     #: Points at which the path turns by more than 120 degrees: reversals, or wrong positions; shape (t,).
     turns: Indices

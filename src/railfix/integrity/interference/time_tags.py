@@ -1,7 +1,7 @@
 """A common error of the time tags as a hypothesis: position, receiver clocks and the error fitted together.
 
 Satellites were where they are not at the tags, so that the column of the error is the range rate of the satellites with
-its sign changed. Bad codes and a train off its map are the other hypotheses: the error has to explain clearly more.
+its sign changed. Bad codes and a train off its map are the alternative hypotheses: the error must explain clearly more.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 
 _RATE_MPS: Final = 500.0  #: Range rate of a satellite, by its order: unit of the column of the error [m/s].
-#: The error is a median over so many epochs at most and at least, none older than the window.
+#: The error is a median over at most and at least these numbers of epochs, none older than the window.
 _TAG_EPOCHS: Final = 10
 _TAG_LEAST: Final = 3
 _TAG_WINDOW: Final = np.timedelta64(60, "s")
@@ -23,12 +23,12 @@ _STEPS: Final = 6  #: Steps of a fit at most; and up to which error [s] and posi
 _SETTLED_S: Final = 0.05
 _SETTLED_M: Final = 100.0
 _ROUNDS: Final = 2  #: Fits of each step, with the weights by the residuals before.
-_FITS_WELL: Final = 3.0  #: Residuals up to so many times the median one have their full weight.
-_SHOWN: Final = 3.0  #: Errors from so many standard deviations on are tested against the other hypotheses.
+_FITS_WELL: Final = 3.0  #: Residuals up to this multiple of the median have full weight.
+_SHOWN: Final = 3.0  #: Errors from this many standard deviations on are tested against the other hypotheses.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's position across and above its line.
 _LEAST_FREEDOM: Final = 2  #: Redundant ranges that agree on an error at least.
-#: Residuals up to so many standard deviations agree; larger ones cost no more. An error of the time tags takes one bad
-#: code in by itself, so that it has to cost less by more than one of these squared.
+#: Residuals up to this many standard deviations agree; larger ones cost no more. An error of the time tags takes one
+#: bad code in by itself, so that it has to cost less by more than one of these squared.
 _AGREES: Final = 5.0
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
@@ -76,10 +76,10 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     found = _fit(part, every, start, tags=True, line=True)
     other = start._replace(error_s=np.zeros(len(shown)), place_ecef_m=part.near_ecef_m)
     without = _fit(part, part.used, other, tags=False, line=True).residual
-    # without a redundant range those that are left fit, and those that are named do not
+    # without a redundant range the remaining ones fit in any case
     without = np.where(np.isnan(without), np.where(_with_line(part.named, False), np.inf, 0.0), without)
     rows = _with_line(every, True)
-    # of this fit, not that of the receiver, which an error of the tags takes for noise
+    # noise of this fit, not that of the receiver, which would include an error of the tags
     noise = np.maximum(masked_median(found.residual, rows) / _NORMAL_MEDIAN, 1.0)[:, None]
     costs = [np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, found.residual)]
     unknowns = 4 + (clock_columns(part) * every[..., None]).any(axis=1).sum(axis=1)
@@ -125,7 +125,8 @@ def _with_line(channels: Masks, line: bool) -> Masks:
 def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks) -> tuple[Floats, Floats, Floats]:
     """Return solutions, standard deviations of the fourth unknown, and residuals over their standard deviations.
 
-    Rows that are `counted` are fitted, those that fit badly with less weight; of others there are residuals alone.
+    Rows that are `counted` are fitted, with less weight where they fit badly; for the others only residuals are
+    computed.
     """
     now = full = np.where(counted, weight, 0.0)
     for _ in range(_ROUNDS):
@@ -151,7 +152,7 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
     """Return the median error of the time tags over the last epochs, also in standard deviations, and those to keep.
 
-    The standard deviation is the median one of the epochs, or that of their spread where it is larger. NaN for fewer
+    The standard deviation is the median of the epochs, or that of their spread where it is larger. NaN for fewer
     than `_TAG_LEAST` epochs.
     """
     tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))

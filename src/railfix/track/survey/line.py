@@ -51,7 +51,7 @@ _COLUMNS: Final = 20
 class Adjusted:
     """Result of an adjustment."""
 
-    ecef_m: tuple[Floats, ...]  #: Positions of each run, its offset taken off; shape (n, 3).
+    ecef_m: tuple[Floats, ...]  #: Positions of each run without its offset; shape (n, 3).
     #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not requested.
     line_m: Floats
     line_sigma_m: Floats
@@ -200,7 +200,7 @@ _ROUNDS: Final = 3  #: Adjustments with the line; after each of them the passes 
 #: The directions are on separate tracks where they are apart by more than this many standard deviations of a run's
 #: offset: three of the difference of two.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Way over which a change of direction is looked for [m].
+_TURN_M: Final = 40.0  #: Way over which a change of direction is searched for [m].
 _END_POINTS: Final = 8  #: Points that show the direction at an end of the line.
 _OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that represents the whole map.
 

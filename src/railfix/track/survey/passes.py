@@ -319,7 +319,9 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
 def without_other_track(
     course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
 ) -> tuple[list[Pass], float]:
-    """Return the passes of the direction with more, where both have a track each, and how far apart, else 0 [m]."""
+    """Return the passes of the direction with more, where each has a separate track, and the distance of the tracks,
+    otherwise 0 [m].
+    """
     across: dict[int, Floats] = {}
     for sign in (1, -1):
         found = [
