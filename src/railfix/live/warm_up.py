@@ -82,7 +82,7 @@ def compile_filter() -> None:
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     line = Line.of(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
-    state, limits = TrackState.empty(), TrackingLimits()
+    state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
     recursion.advance(state, len(epochs), trace=None)  # of no epoch: the call compiles it
