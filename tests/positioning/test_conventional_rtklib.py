@@ -138,7 +138,7 @@ def weights_of_rtklib(found: AntennaResult, navigation: Navigation) -> np.ndarra
     satellite, signal = found.satellite[found.columns], found.signal[found.columns]
     elevation, azimuth = found.elevation_deg[:, found.columns], found.azimuth_deg[:, found.columns]
     sine = np.sin(np.radians(elevation))
-    accuracy = found.satellites.accuracy_m
+    accuracy = found.corrected.satellites.accuracy_m
     table = URA_M[np.minimum(np.searchsorted(URA_M, np.nan_to_num(accuracy)), len(URA_M) - 1)]
     accuracy = np.where(satellite.astype("<U1") == "E", accuracy, table)
     latitude, longitude, _ = geodetic_from_ecef(found.point.ecef_m)
@@ -154,7 +154,7 @@ def solved_again(found: AntennaResult, weight: np.ndarray) -> np.ndarray:
     """Single points from the ranges of a result with other weights, shape (T, 3)."""
     used = (found.reason[:, found.columns] == 0) & np.isfinite(weight)
     ranges = Ranges(
-        sat_ecef_m=np.where(used[..., None], found.satellites.position_ecef_m, 2.6e7),
+        sat_ecef_m=np.where(used[..., None], found.corrected.satellites.position_ecef_m, 2.6e7),
         code_m=np.where(used, found.corrected_code_m[:, found.columns], 0.0),
         weight=np.where(used, weight, 0.0),
         groups=clock_groups(found.satellite[found.columns].astype("<U1")),
