@@ -137,7 +137,7 @@ MORE: Final[dict[str, Mistake]] = {
         {"s.csv": "latitude_deg,longitude_deg\n35,135\n35.1,135\n"}, _TRACK, 3, "neither 'height_m' nor 'elevation_m'",
     ),
     "header_missing": ({"s.csv": "35,135,3\n35.1,135,3\n"}, _TRACK, 3, "numbers where a header line"),
-    "points_equal": ({"s.csv": _HEAD + "35,135,3\n" * 3}, _TRACK, 3, "the same point as line 2"),
+    "points_equal": ({"s.csv": _HEAD + "35,135,3\n" * 3}, _TRACK, 3, "at least two different points"),
     "point_alone": ({"s.csv": _HEAD + "35,135,3\n"}, _TRACK, 3, "a track needs at least two"),
     "line_of_no_length": ({"s.csv": _HEAD + "35,135,3\n35.00000000001,135,3\n"}, _TRACK, 5, "m long; give the track"),
     "datum_contradicts": (

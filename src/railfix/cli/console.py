@@ -132,7 +132,7 @@ class TableConsole(Console):
     """The standard output: text as it is; a table that is wider is printed in parts, and no number is cut or folded."""
 
     def __init__(self) -> None:
-        super().__init__(highlight=False)
+        super().__init__(highlight=False, markup=False)
         if not self.is_terminal:
             self.width = max(self.width, _FILE_WIDTH)
 

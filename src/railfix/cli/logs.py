@@ -86,7 +86,7 @@ def which_track(
     Each track of the map within 60 m is a hypothesis; one more is a track missing from the map (`none`). The
     codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with
     a base station carrier phases count, too. The decision is taken when the probability of all other hypotheses
-    together is below `--risk`; else all probabilities are printed.
+    together is below `--risk`; otherwise all probabilities are printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
@@ -213,11 +213,13 @@ def export(
     show_files(console, [path for path in (out, style) if path is not None])
 
 
+@from_models
 def doctor(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Logs, navigation, track, vehicle, references.")
     ],
     *,
+    reading: Annotated[LogReading, Without("broken_lines", "reader")],
     as_json: JsonOption = False,
 ) -> None:
     """Identify files before a run, check whether they fit together, and print the command to run.
@@ -232,7 +234,7 @@ def doctor(
     """
     from railfix.run.doctor import examine_files
 
-    diagnosis = examine_files(files)
+    diagnosis = examine_files(files, date=reading.instant)
     problems = diagnosis.problems
     if as_json:
         print_json(diagnosis.as_dict())

@@ -27,9 +27,6 @@ from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
-Columns = Annotated[
-    list[str] | None, typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description))
-]
 
 #: Settings of reading a track that only a run needs.
 RUN_ALONE = ("reference", "cache")
@@ -38,7 +35,7 @@ MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "
 
 
 class RouteChoice(Settings):
-    """The way of a route through a network."""
+    """Selection of a route through a network."""
 
     tracks: str | None = option("Tracks to pass, in order; others between are found.", None, metavar="NAME,NAME...")
     via: tuple[str, ...] = option("A point to pass; repeat it in the order of travel.", (), metavar="LAT,LON")

@@ -15,7 +15,7 @@ from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs
 from railfix.core.errors import SettingsError
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import Column, count, listing, number, percent, plain_table, plural
-from railfix.run.inputs import ColumnNames, LogReading
+from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits
 
 #: Fraction of the epochs of a stretch that must lie within the alarm limit for the stretch to be served.
@@ -112,7 +112,6 @@ def survey(
     files: SurveyFiles,
     limits: SurveyLimits,
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
-    reading: LogReading,
     columns: ColumnNames,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -134,7 +133,7 @@ def survey(
     settings, _ = resolve_settings(choices)
     surveyed = survey_files(
         runs, files.nav, settings,
-        limits=limits, name=files.name or out.stem, reading=reading, columns=columns.names,
+        limits=limits, name=files.name or out.stem, reading=columns.logs, columns=columns.names,
     )  # fmt: skip
     result = surveyed.survey
     track = result.track

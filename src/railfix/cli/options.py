@@ -218,7 +218,7 @@ class Choices(Settings):
         None,
         metavar="NAME",
     )
-    config: Path | None = option("Settings file; defaults where it is silent.", None, metavar="TOML")
+    config: Path | None = option("Settings file; defaults for settings that it lacks.", None, metavar="TOML")
     setting: tuple[str, ...] = option(
         "One setting, overriding the file's: --set elevation.mask_deg=15; may be repeated.",
         (),

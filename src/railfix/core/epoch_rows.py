@@ -22,8 +22,8 @@ class OnDemand:
 
     @classmethod
     def create(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
-        """Return an instance with some fields; `later` returns another field by name, and fields computed together with
-        it.
+        """Return an instance with some fields; `later` returns another field by name, with fields computed in the same
+        step.
         """
         return cast(Value, _make(cls, {**members, "_later": later}))
 

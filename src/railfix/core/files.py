@@ -37,7 +37,7 @@ Paths = FilePath | Sequence[FilePath]  #: One file, or several.
 #: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
 Reader = Literal["railfix", "georinex"]  #: Program that reads RINEX observation files.
-#: Last clause of the error of a broken line: how to go on.
+#: Last clause of the error of a broken line: how to continue.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
 #: Endings of compressed files; the ending before them gives the kind.
@@ -394,8 +394,8 @@ FROM_BUILD: Final = Path(__file__).parents[1] / "_commit.txt"
 def source_commit() -> str:
     """Return the commit of the source, "unknown" where neither the build nor a checkout has it.
 
-    "+changed" follows where files were not as committed when the package was built. For a checkout
-    (``pip install -e``) git's files are read; changes since its commit are not seen.
+    "+changed" follows where files were not as committed when the package was built. For a checkout (``pip install -e``)
+    git's files are read; changes since its commit are not detected.
     """
     if FROM_BUILD.is_file():
         return FROM_BUILD.read_text(encoding="ascii").strip()

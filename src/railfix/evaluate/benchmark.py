@@ -177,7 +177,7 @@ BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, own limit)" for name in _OF_STANFORD},
     "error": "reason for a missing result",
 }
-#: Names in the table that people read: column, head, feature of EN 16803-1, decimals, factor.
+#: Names in the table for readers: column, head, feature of EN 16803-1, decimals, factor.
 _SHOWN: Final = (
     ("observed", "epochs", "", 0, 1),
     ("rate", "rate %", "Availability", 1, 100),
@@ -207,8 +207,9 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, and judge them and other programs; return `BENCHMARK_COLUMNS`
-    and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out cases.
+    """Run the cases of a folder with one configuration, and evaluate them with other programs; return
+    `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out
+    cases.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)
@@ -300,12 +301,12 @@ def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
 
 
 def heads() -> tuple[list[str], list[str]]:
-    """Return the heads of the table that people read, and the performance feature of EN 16803-1 of each column."""
+    """Return the heads of the table for readers, and the performance feature of EN 16803-1 of each column."""
     return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
 
 
 def shown_rows(table: pl.DataFrame) -> list[list[str]]:
-    """Return the rows of the table that people read; "-" where a column has no value."""
+    """Return the rows of the table for readers; "-" where a column has no value."""
     return [
         [
             f"{row['case']}{' (held out)' if row['held_out'] else ''}",

@@ -30,7 +30,7 @@ from railfix.evaluate.intervals import branch_table, interval_table, level_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
 
-#: Names of a reference that is looked for in the folder of a run's log.
+#: Names of a reference that is searched for in the folder of a run's log.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
 #: Columns of the positions that are evaluated in addition to the error columns of every table.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
@@ -92,7 +92,9 @@ class Evaluation:
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return one figure of the row with these values, by default of "all", own, constrained; else LookupError."""
+        """Return one figure of the row with these values, by default of "all", own, constrained; otherwise
+        LookupError.
+        """
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:
@@ -305,7 +307,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Return every grouping of every run; of several also the runs of each configuration together."""
+    """Return every grouping of every run; for several runs also those of each configuration."""
     epochs = epochs.select(*KEYS, *USED)
     groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
     tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]

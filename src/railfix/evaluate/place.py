@@ -171,7 +171,7 @@ class PlaceErrors:
     error_m: Floats
     conventional_error_m: Floats
     #: Straight distance between the position on the map and the reference: its point on the map where the trajectory is
-    #: read, else its own position; shape (T,).
+    #: read, otherwise its own position; shape (T,).
     distance_m: Floats
     reference_chainage_m: Floats  #: Chainage of the reference; from the map where the reference has none; shape (T,).
     files: tuple[tuple[str, Path], ...] = ()  #: Track and vehicle, if they were read.

@@ -1,4 +1,4 @@
-"""Errors of single pseudoranges against a reference position, clock and common errors taken off (P1 7, fig. 14).
+"""Errors of single pseudoranges against a reference position, clock and common errors subtracted (P1 7, fig. 14).
 
 Common errors are those that a nearby reference station has measured; of the errors of runs an error model is made.
 """

@@ -345,7 +345,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
 
     ==================== ================================================================
     evaluation.json      all figures with their units, options, inputs with their hashes
-    errors.parquet       one row an epoch, antenna and run
+    errors.parquet       one row per epoch, antenna and run
     tables.csv           figures of every grouping, long form
     intervals.csv        distances and times between positions
     levels.csv           protection levels, where a run has any

@@ -99,7 +99,7 @@ class Observations(NotebookTable):
     #: True where epochs must not be differenced with the one before: power failure (epoch flag 1), new site or moving
     #: antenna (2, 3), start of another file after a gap; shape (T,).
     break_before: Masks
-    #: The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 where there is none, or the log has no such
+    #: The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 without one, or the log has no such
     #: message; shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
     #: Gain of the front end, in the receiver's unit; NaN where the log does not have it; shape (T,).

@@ -1,8 +1,7 @@
 """Braking curves: how fast a train may run so that it stops before an end, on a line with gradients.
 
-After the shape of SUBSET-026 chapter 3.13, in its simplest form: one deceleration of the train with a safety factor,
-gradients as steps, no rotating mass, no adhesion, no service brake, no display of its own. Positions are distances in
-running direction.
+A simplified form of SUBSET-026 chapter 3.13: one deceleration of the train with a safety factor, gradients as steps, no
+rotating mass, no adhesion, no service brake, no display. Positions are distances in running direction.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 GRAVITY_MPS2: Final = 9.80665
-#: Highest speed that is looked for [m/s], and the number of halvings of it.
+#: Highest speed that is searched for [m/s], and the number of halvings of it.
 _TOP_MPS, _HALVINGS = 150.0, 40
 
 

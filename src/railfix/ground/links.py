@@ -128,7 +128,7 @@ class LinkChoice:
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:
         """Return the choice after new results of both links.
 
-        The spare link is taken after misses of the normal one in a row, unless it misses as well; the normal link
+        The spare link is taken after misses of the normal one in per row, unless it misses as well; the normal link
         again after answers in a row and a time, or at once where only the spare one misses.
         """
         limits = normal.limits
@@ -261,7 +261,7 @@ class TrainLinks:
         idle_s = self.meters[name].limits.idle_s
         while True:
             try:
-                # read each time: new certificates are taken over by the next connection
+                # read each time, so that the next connection uses new certificates
                 settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
                 async with connection(
                     self._bearers[name].centre,

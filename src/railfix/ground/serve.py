@@ -124,7 +124,7 @@ class CentreFile(Settings):
         if bool(self.stations) == bool(self.network):
             raise ValueError("the line is given by stations, or by network, and not by both")
         if self.network:
-            return self  # looked at again with its stations
+            return self  # checked again with its stations
         layout, numbers = self.layout, [train.number for train in self.trains]
         for name in self.detected_sections:
             if name not in layout.sections:

@@ -102,7 +102,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
     there = np.stack([np.isin(time, epoch) for epoch in epochs])
     # a receiver without an epoch removes no satellite from the others: their own fixes still count
     shared = (usable | ~there[:, :, None]).all(axis=0)
-    # the same weights too, else an error common to the receivers moves each fix otherwise
+    # with the same weights too, as otherwise a common error moves each fix differently
     square = np.where(usable, sigma**2, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
     groups = clock_groups([name[0] for name in satellite.tolist()])

@@ -38,7 +38,7 @@ REQUEST_S: Final = 10.0
 #: Connections at a time; further ones are refused. Connections of one peer without a complete request.
 MOST_CONNECTIONS: Final = 500
 MOST_IDLE: Final = 20
-#: Name of who logs in by the password alone.
+#: Name for a log-in by the password alone.
 OPERATOR: Final = "operator"
 _COOKIE: Final = "railfix-session"
 _LONGEST_BODY: Final = 1000
@@ -49,7 +49,7 @@ _HEADERS: Final = {
     "Cache-Control": "no-store",
 }
 
-#: An order: takes the values of the request and who gives it, returns the reason of a refusal.
+#: An order: called with the values of the request and its author, returns the reason of a refusal.
 Order = Callable[..., str | None]
 
 
@@ -85,7 +85,7 @@ class Sessions:
         return token
 
     def name_of(self, token: str) -> str:
-        """Return who a session is of."""
+        """Return the owner of a session."""
         return self._names[token]
 
     def log_out(self, token: str) -> None:
@@ -214,7 +214,7 @@ class _TimedProtocol(H11Protocol):
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to look at the connection every `REQUEST_S`."""
+        """Begin to check the connection every `REQUEST_S`."""
         super().connection_made(transport)
         peer = id(self.server_state), self.client[0] if self.client else ""
         mine = self.waiting.setdefault(peer, {})

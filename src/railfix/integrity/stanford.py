@@ -84,9 +84,9 @@ def stanford(
     time : ndarray of datetime64, shape (T,)
         Ascending; every epoch of the run, with a position or without.
     error_m : array_like, shape (T,) [m]
-        Along the track, signed or not; NaN where there is no position or no reference.
+        Along the track, signed or not; NaN without a position or no reference.
     level_m : array_like, shape (T,) [m]
-        Infinite where no error can be excluded, NaN where there is no position. An error without a level counts as one
+        Infinite where no error can be excluded, NaN without a position. An error without a level counts as one
         with an infinite level.
     windows_s : sequence of float [s]
         Lengths of the windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next.

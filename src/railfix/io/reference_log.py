@@ -177,7 +177,7 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
 
 _ISO: Final = "%Y-%m-%dT%H:%M:%S%.9f"  #: Format of times.
 
-LONGEST_STEP_S = 1.0  #: Rows further apart than this are a gap, within which values are unknown [s].
+LONGEST_STEP_S = 1.0  #: Rows farther apart than this are a gap, within which values are unknown [s].
 
 
 @dataclass(frozen=True, kw_only=True)

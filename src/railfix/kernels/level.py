@@ -1,4 +1,4 @@
-"""The level at which Gaussian tails of many hypotheses together keep within a risk."""
+"""The level at which Gaussian tails of many hypotheses sum to a risk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.kernels.compiling import inner, kernel
 _CLOSE = 5e-4
 #: Steps at most; a level that they do not come close to stays at the lowest one found within the risk.
 _STEPS = 60
-#: From this step on every other one halves the bracket: steps between two points would go on for ever.
+#: From this step on every other one halves the bracket: steps between two points would continue for ever.
 _HALVING = 8
 #: Fraction of the risk that remains unused.
 _AIM = 0.002
@@ -122,7 +122,7 @@ def solve_level(
     share : ndarray, shape (T, kinds)
         Risk that each kind may use.
     reserved : ndarray, shape (T,)
-        Risk taken off their sum beforehand.
+        Risk subtracted from their sum beforehand.
 
     Returns
     -------

@@ -21,7 +21,7 @@ _NOISE, _VARIANCE, _MAP_ACROSS, _MAP_UP, _BIAS_ACROSS, _BIAS_UP, _K, _LEAST, _FR
 
 
 class Channels(NamedTuple):
-    """The channels of an epoch side by side, those in use first; zero for others. Shape (n,) each."""
+    """The channels of an epoch adjacent, those in use first; zero for others. Shape (n,) each."""
 
     number: Indices  #: Index of the channel in the model.
     root: Floats  #: Root of its weight [1/m].
@@ -127,7 +127,7 @@ def choose_channels(root: Floats, number: Indices) -> None:
 
 @inner
 def write_channels(model: Any, errors: Any, prior: Floats, t: int, channels: Channels) -> None:
-    """Write the channels of an epoch side by side."""
+    """Write the channels of an epoch adjacent."""
     n = len(channels.number)
     for i in range(n):
         m = channels.number[i]

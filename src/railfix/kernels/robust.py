@@ -113,7 +113,7 @@ def _new_room(channels: int, clocks: int) -> _Room:
 
 @inner
 def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
-    """Write the channels in use side by side, their sights and misfits, and return how many they are."""
+    """Write the channels in use adjacent, their sights and misfits, and return how many they are."""
     channels, clocks, count = ranges.weight.shape[1], len(ranges.starts), 0
     for g in range(clocks):
         room.begin[g], stop = count, ranges.starts[g + 1] if g + 1 < clocks else channels

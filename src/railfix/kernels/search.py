@@ -116,7 +116,7 @@ def points_in_balls(
     least: Floats,
     weight_norm: Floats,
 ) -> tuple[Indices, Indices, Floats, Floats, Masks]:
-    """Find the points of a line in one ball an epoch, and their q by the quadratic form around its centre.
+    """Find the points of a line in one ball per epoch, and their q by the quadratic form around its centre.
 
     Parameters
     ----------

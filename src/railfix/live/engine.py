@@ -34,7 +34,7 @@ from railfix.ranges.sbas import SbasMessages
 END_NS: Final = 1 << 62
 #: Number of epochs of one antenna that may wait; more than that means that the other antenna's clock differs.
 _LONGEST_QUEUE = 100
-#: Distance after which the order of the antennas is looked at again [m].
+#: Distance after which the order of the antennas is examined again [m].
 _ORDER_STEP_M = 10.0
 
 
@@ -111,7 +111,7 @@ class LiveEngine:
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
+        Sentences for the log on what happened: what is used in place of what was requested, and when that ends,
         restarts, what became of a saved state.
     """
 
@@ -175,7 +175,7 @@ class LiveEngine:
     def _hear(self, item: _FromSatellites) -> None:
         self._heard = item.heard
         last = self._from_satellites[-1] if self._from_satellites else None
-        if last is not None and last.heard > self._heard_at_push:  # no epoch came between
+        if last is not None and last.heard > self._heard_at_push:  # no epoch was received between
             self._from_satellites[-1] = last.with_later(item)
         else:
             self._from_satellites.append(item)
@@ -310,7 +310,7 @@ class LiveEngine:
         return numbered
 
     def _patience_ns(self) -> int:
-        """Return the longest time without a message: half a period more than one after an epoch, then one period."""
+        """Return the longest time without a message: half a period more than one after per epoch, then one period."""
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
@@ -409,7 +409,7 @@ class LiveEngine:
         return LiveOutput(message=message, result=result, place=place)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
-        """Return the samples since the epoch before up to an epoch; later ones wait."""
+        """Return the samples since the previous epoch up to an epoch; later ones wait."""
         time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._late_sensors(tag_ns)
         self.counts.update(f"{name} silent" for name in silent)
         samples = self._samples.between(np.datetime64("NaT", "ns"), time)

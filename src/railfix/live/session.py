@@ -76,7 +76,7 @@ async def run_session(
         RINEX observation files are replayed as well.
     speed : float or None
         For recorded files: times as fast as recorded. None: as fast as they go; the clock is then that of the time
-        tags (set `LiveSettings.no_input` to "skip" for one message an epoch and no more).
+        tags (set `LiveSettings.no_input` to "skip" for one message per epoch and no more).
     sensors : mapping of str to str, optional
         Streams of sensors on board (`railfix.live.stream`) by name; the engine has tables of files before.
     date : datetime64, optional
@@ -348,7 +348,7 @@ class _Pace:
 
 
 class _InTurn:
-    """Holds back a file that has been read further than another one, so that none of its epochs pile up unpaired."""
+    """Holds back a file that has been read farther than another one, so that none of its epochs pile up unpaired."""
 
     def __init__(self, read_to_ns: Mapping[str, int]) -> None:
         self._read_to_ns = read_to_ns

@@ -1,6 +1,6 @@
 """Compilation of all kernels at the first command on a machine: later ones load them from disk.
 
-During a live session it would delay epochs by seconds, in a run nobody would know why nothing happens.
+During a live session it would delay epochs by seconds, and a run would pause without a message.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def compile_filter() -> None:
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     line = Line.of(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
-    state, limits = TrackState.empty(), TrackingLimits()
+    state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
     recursion.advance(state, len(epochs), trace=None)  # of no epoch: the call compiles it

@@ -127,7 +127,7 @@ class ListedBalises:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSamples:
-    """Samples of all sensors on board received since the chunk before."""
+    """Samples of all sensors on board received since the previous chunk."""
 
     tachometer: TachometerPulses = field(default_factory=TachometerPulses)
     inertial: InertialSamples = field(default_factory=InertialSamples)

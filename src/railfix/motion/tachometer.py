@@ -138,7 +138,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 
 
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
-    """Return the number of lost and doubled pulses seen up to instants, two pulses late, shape (N,)."""
+    """Return the number of lost and doubled pulses detected up to instants, two pulses late, shape (N,)."""
     lost, doubled = tooth_faults(pulses)
     total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
     return np.asarray(total[np.maximum(np.searchsorted(pulses.time, time, side="right") - 2, 0)], dtype=np.int64)
@@ -153,7 +153,7 @@ class SpeedCheck:
     lag_s: float  #: Delay of its time tags.
 
 
-#: Largest lag that is looked for [s].
+#: Largest lag that is searched for [s].
 _LARGEST_LAG_S: Final = 3.0
 
 

@@ -32,7 +32,7 @@ from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, 
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
+#: Reasons with which a code is still used: the filter weighs multipath and faults itself, over more than one epoch.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK
@@ -332,7 +332,7 @@ def gnss_epochs(
     standard deviation is that of the range times `noise_scale`, shape (T,).
 
     The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in
-    the Dopplers; the change of the carrier phase has both taken off.
+    the Dopplers; the change of the carrier phase has both subtracted.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state

@@ -227,9 +227,9 @@ class AntennaOrder:
         self._stretches: dict[int, tuple[float, float, float]] = {}
 
     def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
-        """Add the positions of more epochs; whether the train is on a stretch not seen before.
+        """Add the positions of more epochs; return whether the train is on a new stretch.
 
-        For each antenna time tags, chainage [m] and its sigma [m], shape (F,) and (R,); NaN where there is no position.
+        For each antenna time tags, chainage [m] and its sigma [m], shape (F,) and (R,); NaN without a position.
         """
         at_front, at_rear = pair_epochs(front[0], rear[0], tolerance_s=self._tolerance_s)
         (place, other), (sigma, other_sigma) = (

@@ -162,7 +162,7 @@ def find_passings(
 ) -> tuple[tuple[Passing, ...], PassingState]:
     """Return the passings that ended in a chunk and the readings in it that are wrong, and the state to pass on.
 
-    `listed` has balises and virtual ones, `readings` are those since the chunk before, `tracked` has levels.
+    `listed` has balises and virtual ones, `readings` are those since the previous chunk, `tracked` has levels.
     """
     state = state or PassingState.empty(len(listed))
     own = trajectory.arc_at_chainage(listed.chainage_m)

@@ -29,7 +29,7 @@ from railfix.track.trajectory import Trajectory
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
 _NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
-#: Positions of a station that differ by no more are the same [m].
+#: Positions of a station that differ by no more than this are equal [m].
 _SAME_PLACE_M: Final = 0.01
 
 

@@ -26,7 +26,7 @@ class Chunk:
     combined: Combined | None  #: How codes of two frequencies were combined.
     slips: Slips | None  #: Wavelength of all channels of the observations, where the carrier phase is used.
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
-    sensors: SensorSamples | None  #: Samples of the sensors on board since the chunk before.
+    sensors: SensorSamples | None  #: Samples of the sensors on board since the previous chunk.
     notes: tuple[str, ...]
     results: Mapping[str, AntennaResult] = field(default_factory=dict)  #: Single epochs by antenna, once positioned.
     #: The train is away from the line, epochs of all antennas; empty before they are positioned.

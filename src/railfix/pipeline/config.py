@@ -55,7 +55,7 @@ FILTER_SOURCES: Final[tuple[FilterSource, ...]] = (
     "code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range",
 )  # fmt: skip
 
-#: Names of the screens, in the order in which they judge.
+#: Names of the screens, in the order in which they are run.
 SCREEN_NAMES: Final = tuple(screen.name for screen in SCREENS)
 
 #: Settings by the name of their preset. "strict": accuracy before availability. "p1": exactly table 6

@@ -69,12 +69,12 @@ def ahead_m(trajectory: Trajectory) -> float:
 class RateSeries:
     """Rates of the body at K ticks."""
 
-    #: Times at which they hold, and when they were known; shape (K,).
+    #: Times for which they are valid, and when they became known; shape (K,).
     time: Datetimes
     known: Datetimes
     distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).
     arc_m: Floats  #: Position of the antenna by the wheel; NaN where it is not known; shape (K,).
-    #: Change of heading (+ to the right) and of pitch (+ nose up) since the tick before, shape (K,).
+    #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
     turned_rad: Floats
     climbed_rad: Floats
     speed_mps: Floats  #: In rising arc length, shape (K,).

@@ -12,6 +12,7 @@ from railfix.core.epoch_rows import OnDemand
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState
+from railfix.kernels.tracking import index as ix
 from railfix.pipeline.balises import Passing, PassingState
 from railfix.pipeline.outage_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
@@ -22,7 +23,6 @@ from railfix.screens import FilteredMotion
 from railfix.tracking import Line, Tracked, TrackState
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
-from railfix.tracking.state import StateIndex
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,8 +85,8 @@ class FilterState(NotebookTable):
         track = self.track
         if track is None:
             return ""
-        best = int(np.argmax(track.log_probability))
-        place, variance = track.mean[best, StateIndex.ARC], track.covariance[best, StateIndex.ARC, StateIndex.ARC]
+        best = int(np.argmax(track.hypothesis["log_probability"]))
+        place, variance = track.mean[best, ix.ARC], track.covariance[best, ix.ARC, ix.ARC]
         return f"{place:,.1f} ± {np.sqrt(variance):.1f}"
 
 
@@ -112,7 +112,7 @@ class AlongTrack(NotebookTable, OnDemand):
     direction: Codes
     standstill: Masks  #: Shape (T,).
     sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    #: Distance from the position of the other antenna less that of the antennas; NaN where it was not looked at; shape
+    #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape
     #: (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.

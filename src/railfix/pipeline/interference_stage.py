@@ -39,7 +39,7 @@ from railfix.ranges.corrected import CorrectedRanges
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )
-#: Reasons of satellites that are wrong by themselves, where they are few.
+#: Reasons of satellites that are wrong separately, where they are few.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
 #: Largest number of satellites that are wrong by residuals, and of one clock by gross errors; a spoofer that gives a
 #: position of its own affects more.
@@ -76,7 +76,7 @@ class InterferenceState:
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
-    second: int = -1  #: GPS second of the last epoch that was looked at.
+    second: int = -1  #: GPS second of the last epoch that was checked.
     #: Break and the receiver's alarms since then.
     broken: bool = False
     alarm: int = 0
@@ -98,7 +98,7 @@ class Interference:
 
 
 class PositionEpochs(NamedTuple):
-    """Results of single epochs that the signs are looked for in, T epochs."""
+    """Results of single epochs that the signs are searched for in, T epochs."""
 
     #: 3-D positions without the map, of all ranges; and of those that agree, NaN where ranges contradict each other;
     #: shape (T, 3).
@@ -112,7 +112,7 @@ class PositionEpochs(NamedTuple):
 def _motion_inputs(
     corrected: CorrectedRanges, single: PositionEpochs, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
-    """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
+    """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the previous epoch."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
     near = np.where(np.isnan(consistent), single.point_ecef_m[rows], consistent)
@@ -141,7 +141,9 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites that are wrong by themselves, not by a spoofer who moves all of a clock; shape (T, K)."""
+    """Return the satellites that are wrong individually, not by a spoofer who moves all satellites of a clock; shape
+    (T, K).
+    """
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -161,7 +163,7 @@ def _find_interference(
 ) -> tuple[Interference, InterferenceState]:
     """Return the interference of some epochs of one antenna, and the state for the next chunk.
 
-    `alarm`: alarms of the receiver since the epoch before, of each; `failed`: their position failed a check.
+    `alarm`: alarms of the receiver since the previous epoch, of each; `failed`: their position failed a check.
     """
     other_signal = (corrected.reason[rows] & _NOT_ITS_SIGNAL) != 0
     cn0 = np.where(other_signal | np.isnan(corrected.code_m[rows]), np.nan, corrected.cn0_dbhz[rows])
@@ -178,7 +180,7 @@ def _find_interference(
 
 
 def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
-    """Return which signs the epochs show by themselves, shape (T, causes)."""
+    """Return which signs the epochs show separately, shape (T, causes)."""
     sigmas = limits.jump_sigmas
     by_cause = {
         Sign.RECEIVER_JAMMING: (alarm & 1) != 0,

@@ -121,7 +121,7 @@ def level_facts(config: Config) -> dict[str, Any]:
 
 
 def get_risk_budget(config: Config) -> RiskBudget:
-    """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones are left."""
+    """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones remain."""
     return config.risk if choose_kind(config) == "separation" else config.local_risk
 
 

@@ -34,7 +34,8 @@ _EARTH_RADIUS_M: Final = 6.371e6
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Heights for which the tropospheric model has values [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
-#: Root mean square of raw residuals, the atmosphere's delays among them, from which on gross errors are looked for [m].
+#: Root mean square of raw residuals, the atmosphere's delays among them, from which on gross errors are searched for
+#: [m].
 _QUIET_M: Final = 10.0
 
 

@@ -46,14 +46,14 @@ def gated_codes(
     line: Line,
     limits: SensorLimits,
 ) -> tuple[Masks, ReturnState]:
-    """Return the epochs whose codes do not count yet, shape (T,), and the state to pass on.
+    """Return the epochs whose codes are not yet used, shape (T,), and the state to pass on.
 
     After an outage single-epoch positions are compared with the position dead-reckoned by the sensors: codes are used
     again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
     and after `SensorLimits.return_s` in any case. Where no sensor gives a distance nothing is refused.
 
-    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the epoch before; `place_m`, `sigma_m`
-    of each epoch by itself; NaN where missing. `state` has the position of the filter at the epoch before the
+    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the previous epoch; `place_m`,
+    `sigma_m` of each epoch by itself; NaN where missing. `state` has the position of the filter at the epoch before the
     first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)

@@ -70,7 +70,7 @@ def satellites_rejected(member: Integers, reason: Bits) -> Integers:
 class Solution:
     """Positions of one antenna, T epochs, before coordinates are dropped because of their status."""
 
-    point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
+    point: SinglePoint  #: Conventional position: every constellation with a separate clock.
     #: 3-D positions of the ranges that agree, without excluded ones; NaN where they contradict each other; (T, 3).
     consistent_ecef_m: Floats
     point_status: Codes  #: `railfix.integrity.PointStatus`, shape (T,).

@@ -1,7 +1,7 @@
 """Positioning of chunks of epochs: the calls in reading order.
 
 `EpochProcessor` has the constant data of a run (settings, trajectories, error model). `process` takes a chunk
-of observations with the navigation records, SBAS messages and sensor samples received since the chunk before, and the
+of observations with the navigation records, SBAS messages and sensor samples received since the previous chunk, and the
 state after that chunk; it returns every intermediate result and the new state. A live epoch is a chunk of length one;
 any cutting gives the same results.
 """
@@ -99,12 +99,12 @@ class EpochProcessor:
         Screens that are on, with their limits.
     setup : ScreenSetup
     notes : tuple of str
-        Differences between what was asked for and what is used, one sentence each.
+        Differences between what was requested and what is used, one sentence each.
 
     Raises
     ------
     SettingsError
-        SBAS and precise ephemerides together, no SBAS message of the GEO asked for, or an argument of another type.
+        SBAS and precise ephemerides together, no SBAS message of the GEO requested, or an argument of another type.
     """
 
     def __init__(
@@ -170,12 +170,12 @@ class EpochProcessor:
         return ThreadPoolExecutor(len(self.trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the threads, which another process has of its own."""
+        """Return everything but the threads, which another process creates itself."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the data known from the start, and on screens that cannot judge."""
+        """Notes on the data known from the start, and on screens that cannot be run."""
         return (*self.received.notes, *self._lacking)
 
     def _inactive_notes(self) -> tuple[str, ...]:
@@ -223,15 +223,15 @@ class EpochProcessor:
         state : State, optional
             State after the chunk before this one; None at the start of a log.
         navigation : Navigation, optional
-            Records received since the chunk before. Results equal those with all records given at the start,
+            Records received since the previous chunk. Results equal those with all records given at the start,
             where each record is given before the first epoch that uses it.
         messages : SbasMessages, optional
-            SBAS messages received since the chunk before.
+            SBAS messages received since the previous chunk.
         sensors : SensorSamples, optional
-            Samples of the sensors on board since the chunk before, for the filter along the track. An antenna without
+            Samples of the sensors on board since the previous chunk, for the filter along the track. An antenna without
             observations in this chunk has them with its next one.
         base : Observations, optional
-            Of the base station since the chunk before, up to the last epoch of this one.
+            Of the base station since the previous chunk, up to the last epoch of this one.
 
         Raises
         ------
@@ -338,7 +338,7 @@ class EpochProcessor:
         Parameters
         ----------
         state : State
-            Of it only what the filter left after the chunk before is used, and replaced.
+            Of it only what the filter left after the previous chunk is used, and replaced.
         """
         fusion, filter_states, sensors = {}, dict(state.fusion), chunk.sensors
         if sensors:

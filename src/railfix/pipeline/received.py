@@ -64,9 +64,9 @@ class Received:
     navigation: Navigation = field(default_factory=no_navigation)
     messages: SbasState | None = None  #: SBAS messages of the GEO in use; None: SBAS is not used.
     sbas: SbasCorrections | DfmcService | None = None  #: Corrections by these messages.
-    #: Ionospheric coefficients in use; None leaves the ionosphere uncorrected, or to SBAS; shape (8,).
+    #: Ionospheric coefficients in use; None: the ionosphere is uncorrected, or corrected by SBAS; shape (8,).
     klobuchar: Floats | None = None
-    #: Standard deviation of the vertical delay by coefficients that were not received; else 0.
+    #: Standard deviation of the vertical delay by coefficients that were not received; otherwise 0.
     ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()  #: Requested data, and the data used instead, one sentence each.
     base: BaseErrors | None = None  #: Range errors that a base station has measured.

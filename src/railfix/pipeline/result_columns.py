@@ -102,7 +102,7 @@ def by_name(columns: Iterable[Column[Source]]) -> dict[str, Column[Source]]:
 
 
 def of_one_meaning(meaning: str, **values: str | Callable[[Any], NDArray[Any] | None]) -> Iterator[Column[Any]]:
-    """Return columns of floats with one meaning, and each with values of its own."""
+    """Return columns of floats with one meaning and separate values."""
     return (Column(name, meaning, source) for name, source in values.items())
 
 
@@ -112,7 +112,7 @@ def float_column(values: Floats) -> pl.Series:
 
 
 def make_table(columns: Mapping[str, Column[Source]], source: Source, rows: int, **given: str) -> pl.DataFrame:
-    """Return a table of columns with one row an epoch; `given` has the value of columns that the source has not."""
+    """Return a table of columns with one row per epoch; `given` has the value of columns that the source has not."""
     return pl.DataFrame(
         {name: column.series(given.get(name, column.of(source)), rows) for name, column in columns.items()}
     )

@@ -86,7 +86,7 @@ class AntennaResult(NotebookTable, OnDemand):
     #: Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which judges positions,
     #: has shape (T,).
     screens: Mapping[str, Screened]
-    single_point: SinglePoint  #: The conventional position: every constellation with a clock of its own.
+    single_point: SinglePoint  #: The conventional position: every constellation with a separate clock.
     section: Section
     constrained: Constrained  #: Position on the line.
     #: Positions from code and phase, where ``Config.carrier`` is "float"; the coordinates are theirs.

@@ -55,7 +55,7 @@ def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def positions_table(result: Result) -> pl.DataFrame:
-    """Return one row an epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
+    """Return one row per epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
@@ -81,7 +81,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 
 def observations_table(result: Result) -> pl.DataFrame:
-    """Return `OBSERVATION_COLUMNS`: a row an epoch, antenna and channel that was observed, in the order of these."""
+    """Return `OBSERVATION_COLUMNS`: a row per epoch, antenna and channel that was observed, in the order of these."""
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 

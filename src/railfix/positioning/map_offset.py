@@ -120,8 +120,8 @@ class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
     arc_m: Floats  #: NaN where missing, shape (T,).
-    #: The train is away from the line. These epochs have a separate window: positions off the line say nothing about
-    #: the map when the train has returned to it; shape (T,).
+    #: The train is away from the line. These epochs have a separate window: positions off the line contain no
+    #: information on the map when the train has returned to it; shape (T,).
     off_map: Masks
 
 
@@ -172,7 +172,9 @@ def map_offset(
 
 
 def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
-    """Return how far 3-D positions (T, 3) lie right of places on the line and above them, shape (T, 2); NaN without."""
+    """Return how far 3-D positions (T, 3) lie right of positions on the line and above them, shape (T, 2); NaN
+    without.
+    """
     known = np.isfinite(arc_m)
     arc = np.where(known, arc_m, 0.0)
     axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]

@@ -68,7 +68,7 @@ class Section:
 
 
 class SectionCandidates(NamedTuple):
-    """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points."""
+    """Evaluated points, sorted by epoch and point, with q and its slope there; n epochs, p points."""
 
     #: The epochs, and how many points each has (at least one); shape (n,).
     at: Indices
@@ -94,7 +94,7 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
     point : SinglePoint
-        3-D positions from the same ranges (`point_position`), NaN where there are none: they save time, and change
+        3-D positions from the same ranges (`point_position`), NaN where none exist: they save time, and change
         nothing.
     limits : SectionLimits, optional
         Of ambiguous sections (P1 3.2).

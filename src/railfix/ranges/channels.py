@@ -57,7 +57,7 @@ def relative_noise(signal: str) -> float:
 
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
-    """Return slices of channels that share a receiver clock; ValueError where they are not side by side."""
+    """Return slices of channels that share a receiver clock; ValueError where they are not adjacent."""
     clocks = [CLOCK_GROUP[str(letter)] for letter in system]
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):
@@ -79,7 +79,7 @@ def channel_order(
 
 
 def first_available(satellite: Strings, available: Masks) -> Masks:
-    """Choose one channel a satellite and epoch: the first available one, in `channel_order`, shape (T, K)."""
+    """Choose one channel per satellite and epoch: the first available one, in `channel_order`, shape (T, K)."""
     starts = np.flatnonzero(np.append(True, satellite[1:] != satellite[:-1])) if len(satellite) else np.empty(0, int)
     if len(starts) == len(satellite):
         return available.copy()

@@ -78,7 +78,7 @@ class CurveFit(Settings):
     bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
     least_samples: int = Field(default=30, ge=1)  #: A bin of fewer samples is left out.
     least_bins: int = Field(default=4, ge=2)  #: A kind and signal of fewer bins gets no curve.
-    #: Samples further from their bin's median, in robust standard deviations, are left out.
+    #: Samples farther from their bin's median, in robust standard deviations, are left out.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 

@@ -105,7 +105,7 @@ class BroadcastSource:
     #: Standard deviation of the vertical delay with coefficients that were not received.
     ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
-    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed errors of satellites and atmosphere.
+    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed satellite and atmospheric errors.
     notes: tuple[str, ...] = ()  #: Requested data, and the data used instead.
     second: Literal["none", "optional", "required"] = "optional"
 

@@ -1,6 +1,6 @@
 """Reference positions of one run: fixes are checked and matched to the track, gaps are bridged.
 
-1. The positions of each antenna are checked by themselves, in pairs, and against the track (`fixes`).
+1. The positions of each antenna are checked separately, in pairs, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at the current positions, which are interpolated between fixes
    at first, and smoothed in the next rounds. 3. The distance between fixes is compared with the distance travelled;
    fixes that disagree are rejected.
@@ -40,7 +40,7 @@ from railfix.reference.smoother import (
 )
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Speeds further apart leave the distance between them unknown [s], with this variance [m2].
+#: Speeds farther apart leave the distance between them unknown [s], with this variance [m2].
 LONGEST_STEP_S: Final = 2.5
 UNKNOWN_M2: Final = 1e8
 
@@ -72,7 +72,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where there is none."""
+    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where missing."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
@@ -133,7 +133,7 @@ class _ReferenceBuilder:
         self.trajectory = data.trajectories[name]
 
     def built(self, fixes: Fixes) -> Built:
-        """From judged fixes to the reference."""
+        """From checked fixes to the reference."""
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
@@ -273,7 +273,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to instants and its variance: by a wheel if any, else by Dopplers."""
+        """Return the distance travelled up to instants and its variance: by a wheel if any, otherwise by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

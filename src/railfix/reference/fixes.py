@@ -84,7 +84,7 @@ class ReferenceSettings(Settings):
     acceleration_mps2: float = _positive(0.02)
 
 
-#: Positions of two antennas that are tagged no further apart belong to one instant [ns].
+#: Positions of two antennas that are tagged no farther apart belong to one instant [ns].
 _PAIR_NS: Final = 5_000_000
 _LOOK_BACK: Final = 60  #: Runs of agreeing fixes that a run may be joined to, back from it.
 #: Standard deviations of the travelled distance that a difference may have.

@@ -54,7 +54,7 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Measurements along one antenna's path at N instants; NaN where there is none."""
+    """Measurements along one antenna's path at N instants; NaN where missing."""
 
     time: Datetimes  #: Rising, steps of at most some seconds; shape (N,).
     #: Arc length of good fixes, shape (N,).
@@ -84,8 +84,8 @@ class SmoothedReference:
 class _States:
     """Column of each state that the measurements need; -1 for the others.
 
-    Position, speed and acceleration of the train; with an accelerometer its offset and the speed at the instant before;
-    the time-correlated error of the Doppler speed; difference and scale error of the wheel's distance.
+    Position, speed and acceleration of the train; with an accelerometer its offset and the speed at the previous
+    instant; the time-correlated error of the Doppler speed; difference and scale error of the wheel's distance.
     """
 
     def __init__(self, evidence: Evidence) -> None:
@@ -281,7 +281,9 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the random error of the wheel from the closing errors, its scale taken off [m per square root of m]."""
+    """Return the random error of the wheel from the closing errors, without its scale error [m per square
+    root of m].
+    """
     moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
@@ -301,7 +303,7 @@ _LEAST_SLIP_M: Final = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """Gap between two good fixes that are further apart than the log's usual step."""
+    """Gap between two good fixes that are farther apart than the log's usual step."""
 
     start: np.datetime64
     end: np.datetime64

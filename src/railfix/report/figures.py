@@ -83,7 +83,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
 
 
 def _priors(priors: Any) -> str:
-    """Return priors by constellation, equal ones together."""
+    """Return priors by constellation, equal ones merged."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}

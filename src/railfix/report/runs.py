@@ -84,7 +84,7 @@ class ReportedRun:
 
 
 def get_figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
-    """Return the figures of merit of one antenna and kind of position; empty where there are none."""
+    """Return the figures of merit of one antenna and kind of position; empty where none exist."""
     rows = evaluation.figures.filter(
         grouping="all", epochs_of="own", run=run.name_in(evaluation), antenna=antenna, position=position
     )

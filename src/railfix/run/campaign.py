@@ -1,4 +1,4 @@
-"""Campaigns: many logs positioned side by side, resumable, each with its own results folder.
+"""Campaigns: many logs positioned adjacent, resumable, each with its own results folder.
 
 The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables
 together are one hive-partitioned data set: ``pl.scan_parquet(out / "runs/**/positions.parquet")``.
@@ -107,7 +107,7 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     for name, pattern in patterns.items():
         _check_pattern(path, name, pattern)
         if other := sorted(set(_FIELD.findall(pattern)) - set(fields)):
-            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front has not")
+            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front lacks")
     found = {name: _find(folder, pattern) for name, pattern in patterns.items()}
     keys = list(dict.fromkeys(tuple(values[name] for name in fields) for _, values in found["front"]))
     if not keys:

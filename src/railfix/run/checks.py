@@ -24,7 +24,7 @@ from railfix.track.trajectory import Trajectory
 _SECOND: Final = np.timedelta64(1, "s")
 #: Number of conventional positions, all this far away, after which a run is stopped early.
 ENOUGH_TO_STOP: Final = 10
-#: Navigation records further from the log than this are of another day.
+#: Navigation records farther from the log than this are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
 #: Records reach about this far beyond their reference time (Galileo, IODnav of 4 h and its margin).
 RECORD_REACH: Final = np.timedelta64(4, "h")
@@ -44,7 +44,7 @@ def navigation_times(navigation: Navigation) -> Datetimes:
 
 
 def navigation_span(navigation: Navigation) -> Span | None:
-    """Return the reference times of the first and the last record; None where there is none."""
+    """Return the reference times of the first and the last record; None without one."""
     times = navigation_times(navigation)
     return (times[0], times[-1]) if len(times) else None
 

@@ -282,7 +282,7 @@ _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measure
 #: A change counts when it is this multiple of its standard deviation, from this many values on either side.
 _SIGMAS: Final = 5.0
 _LEAST_VALUES: Final = 3
-#: Rounds in which the window about a change moves to its middle.
+#: Iterations that centre the window on a change.
 _CENTRED: Final = 5
 #: A slip affects the gradient for some time before it is detected: values this near to one are left out.
 _BEFORE_SLIP: Final = np.timedelta64(1500, "ms")

@@ -140,7 +140,7 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-#: Rows of a group of a file, which is put together in memory.
+#: Rows of a group of a file, which is combined in memory.
 _GROUP: Final = 30_000
 #: How often a caller that waits looks whether the writer has failed [s].
 _LOOK_S: Final = 0.1

@@ -58,7 +58,7 @@ class PreparedLines:
         self._folder = cache_folder() if use else None
 
     def track(self, key: str) -> Track | None:
-        """Return the track that was kept under a key; None where there is none."""
+        """Return the track that was kept under a key; None without one."""
         found = self._load(key)
         if found is None:
             return None
@@ -75,7 +75,7 @@ class PreparedLines:
             self._keep(key, {**plain, "provenance": asdict(track.provenance)}, arrays)
 
     def path(self, key: str) -> Trajectory | None:
-        """Return the trajectory that was kept under a key; None where there is none."""
+        """Return the trajectory that was kept under a key; None without one."""
         found = self._load(key)
         if found is None:
             return None

@@ -213,7 +213,7 @@ class RouteOfLog:
         low = float(self.probability.min())
         first = (
             f"route found from the log: {', '.join(self.names)}; chainage rises in this order; its probability is "
-            f"{self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv has every track near)"
+            f"{self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv has all nearby tracks)"
         )
         if self.left_out:
             beside = ", ".join(self.network.names[k] for k in self.left_out)

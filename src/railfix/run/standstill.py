@@ -32,7 +32,7 @@ _AT_REST_M: Final = 8.0
 _SLIP: Final = 0.25
 #: Fraction of the epochs over which a double difference must be unbroken.
 _UNBROKEN: Final = 0.5
-#: Bit of the loss-of-lock indicator: a slip since the epoch before; and that half a cycle is unknown.
+#: Bit of the loss-of-lock indicator: a slip since the previous epoch; and that half a cycle is unknown.
 _LOST, _HALF_CYCLE = 1, 2
 
 
@@ -164,7 +164,7 @@ class StandstillPhases:
     """Carrier phases of an antenna at rest less those of a base station, T epochs, M satellites."""
 
     difference_m: Floats  #: Less those computed for the origin; NaN where one of the receivers has none; shape (T, M).
-    lost: Masks  #: Whether one of them reports a slip since the epoch before, shape (T, M).
+    lost: Masks  #: Whether one of them reports a slip since the previous epoch, shape (T, M).
     toward: Floats  #: Unit vectors to the satellites, east, north, up; shape (T, M, 3).
     elevation_deg: Floats  #: Shape (T, M).
     wavelength_m: Floats  #: Shape (M,).

@@ -231,7 +231,7 @@ class AntennaTally:
 
     @property
     def never_recorded(self) -> dict[str, int]:
-        """Satellites seen for which no record was ever usable, with their observations."""
+        """Satellites seen for which no record was usable, with their observations."""
         return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
 
     def as_dict(self) -> dict[str, Any]:
@@ -268,7 +268,7 @@ class Tally:
     min_satellites: int = 3  #: Satellites that an epoch needs.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)  #: Used as keys, in the order of arrival.
-    #: First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
+    #: First epoch of each chunk, its epochs of all antennas, and the time since the previous chunk [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
     order: AntennaOrder | None = None  #: Test of the order of two antennas.
 
@@ -324,10 +324,10 @@ class ResultRows:
 
     folder: OutputFolder
     line: OpenedLine
-    observations: bool  #: Whether rows of observations are wanted.
+    observations: bool  #: Whether rows of observations are requested.
     checks: SensorChecks | None  #: Collects those of the first antenna, where there are sensors.
     replays: Mapping[str, Replays]  #: Keeps the filter's input, by antenna; empty where nothing is smoothed.
-    passings: bool = False  #: Whether rows of balises and virtual ones are wanted.
+    passings: bool = False  #: Whether rows of balises and virtual ones are requested.
     #: Balises so far that were missed, or read where they are not.
     balise_notes: list[str] = field(default_factory=list)
 

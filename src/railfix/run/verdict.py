@@ -24,7 +24,7 @@ _PROMISED: Final = ("tracking", "coasting")
 
 @dataclass(frozen=True, kw_only=True)
 class PositionFigures:
-    """Figures of one kind of positions of an antenna; None where there are none."""
+    """Figures of one kind of positions of an antenna; None where none exist."""
 
     epochs: int  #: All epochs for the filter along the track, those with observations for single epochs.
     positions: int  #: Epochs with a position.

@@ -139,13 +139,13 @@ def _settings(scenario: Scenario) -> dict[str, Any]:
     return table
 
 
-#: Decimals of metres, metres a second and metres a second squared in the truth.
+#: Decimals of metres, metres per second and metres per second squared in the truth.
 TRUTH_DECIMALS: Final = 4
 _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",)
 
 
 def truth_table(simulation: Simulation) -> pl.DataFrame:
-    """Return the ground truth of the antennas at the epochs of their receivers, one row an epoch and antenna.
+    """Return the ground truth of the antennas at the epochs of their receivers, one row per epoch and antenna.
 
     `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point abeam the antenna, on the track map's chainage),
     `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage), `acceleration_mps2` (along the

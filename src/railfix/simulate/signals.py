@@ -87,7 +87,7 @@ class Simulation:
         return self.compute_errors(self.satellites)
 
     def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
-        """Return the errors of satellites and atmosphere; errors of a satellite are independent of the others."""
+        """Return satellite and atmospheric errors; errors of a satellite are independent of the others."""
         scenario = self.scenario
         return CommonErrors(
             scenario.errors,

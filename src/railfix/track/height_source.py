@@ -31,14 +31,14 @@ RASTERS: Final = (
 HeightSource = FilePath | PositionLog  #: A file, or positions in memory.
 _SPACING_M: Final = 50.0  #: Largest distance of the points that heights are put on [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Cells of a raster read at a time.
-_NEAR_M: Final = 15.0  #: Positions further than this from the line in plan are of another line [m].
-_REACH_M: Final = 200.0  #: Points further than this from a height along the line have none [m].
+_NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan are of another line [m].
+_REACH_M: Final = 200.0  #: Points farther than this from a height along the line have none [m].
 #: Standard deviation of the weights of positions along the line [m]: of fixed ones, and of single ones, whose errors
 #: last for hundreds of metres; a vertical curve of 2 km radius is then off by up to 5 m.
 _KERNEL_M: Final = 15.0
 _LARGEST_KERNEL_M: Final = 150.0
-#: Positions whose heights are this many median deviations off count no more (Cleveland 1979, robust locally weighted
-#: regression, doi:10.1080/01621459.1979.10481038), and how often they are weighed again.
+#: Positions whose heights are this many median deviations off have zero weight (Cleveland 1979, robust locally weighted
+#: regression, doi:10.1080/01621459.1979.10481038), and number of iterations.
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 

@@ -69,7 +69,7 @@ _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
 _SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
-#: Segments of an edge that are further apart than this do not meet [m].
+#: Segments of an edge that are farther apart than this do not meet [m].
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
 

@@ -36,7 +36,7 @@ _NEAR_WAY_M: Final = 5_000.0  #: Ways searched before the whole network is [m].
 _SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
 #: Number of nearest samples examined for each position at first; more where these do not extend far enough.
 _SAMPLES: Final = 32
-_TOGETHER: Final = 256  #: Positions that are looked up together: of each every sample near it is in memory.
+_TOGETHER: Final = 256  #: Positions that are processed together: every nearby sample of each is in memory.
 #: Properties that the connections do not change.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
 _NAMED: Final = 8  #: Number of tracks that a message names individually.
@@ -276,7 +276,7 @@ class Network:
         return chainage, offset
 
     def kilometrage_on(self, track: Indices, chainage_m: Floats) -> Floats:
-        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where there is none."""
+        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where missing."""
         kilometrage = np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
             rows = track == number
@@ -323,7 +323,7 @@ class Network:
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Return the tracks of the shortest route that passes the given tracks in order; None where there is none."""
+        """Return the tracks of the shortest route that passes the given tracks in order; None without one."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         best: dict[int, tuple[float, list[int]]] = {4 * wanted[0] + e: (0.0, [wanted[0]]) for e in (1, 3)}
         for stop in wanted[1:]:

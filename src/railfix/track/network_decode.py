@@ -45,8 +45,8 @@ _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Difference of path length and distance at which a joint is half as probable as where they agree [m].
 _PASSING_M: Final = 5.0
-#: Least gain of a change of track, in positions on the right track; less at a joint, which is known by its probability:
-#: on a short track of a switch there are one or two positions.
+#: Least gain of a change of track, in positions on the right track; less at a joint, which is identified by its
+#: probability: on a short track of a switch there are one or two positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
@@ -64,8 +64,8 @@ class Residuals:
     `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
     without a candidate; `beyond_m` how far the position lies beyond an end; `above_m` its height above the track, NaN
     without (n, m). `clear` tells which `SHIFTS_M` from the nearest track are clear of all tracks (n, S), `moved_m` how
-    far that track lies right of the nearest one of the position before, and `turned` whether its direction is opposite
-    (n,). `weight` is the share of the correlation time that a position covers, `seconds` since the one before;
+    far that track lies right of the nearest one of the previous position, and `turned` whether its direction is
+    opposite (n,). `weight` is the share of the correlation time that a position covers, `seconds` since the one before;
     `sigma_m` and `common_m` are of one horizontal axis, `common_up_m` is 0 where heights do not count.
     """
 

@@ -32,7 +32,7 @@ _ENOUGH: Final = 30  #: Positions that an estimate needs.
 _COMMON_M: Final = 2.0  #: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map.
 _COMMON_SHARE: Final = 0.7  #: Share of the stated standard deviation that the common error has where it is smaller.
 _BEST: Final = 0.1  #: Quantile of the stated standard deviations that the common error has where it is smaller.
-#: Least distance to which tracks are looked for [m], and farther ones in standard deviations and metres.
+#: Least distance to which tracks are searched for [m], and farther ones in standard deviations and metres.
 _WITHIN_M: Final = 30.0
 _WITHIN_SIGMAS: Final = 5.0
 _FARTHEST_M: Final = 100.0
@@ -47,7 +47,7 @@ _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "pro
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
 _ROUNDED_M: Final = 0.1  #: Distances of tracks are known to this [m].
 _STEP_S: Final = 0.4  #: Time between positions that state none, or one before the last [s].
-_MOST_TRACKS: Final = 16  #: Tracks near a position that are looked at.
+_MOST_TRACKS: Final = 16  #: Tracks near a position that are examined.
 _APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each other for which heights count [m].
 
 
@@ -69,7 +69,9 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions, given in the frame of the satellites, in that of the network; else MismatchError."""
+        """Return the positions, given in the frame of the satellites, in that of the network; otherwise
+        MismatchError.
+        """
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -354,7 +356,7 @@ def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) 
     right_m = offset[:, :1] - offset * cosine  # of the nearest track
     apart = np.where(present, np.abs(SHIFTS_M[:, None, None] - right_m), np.inf).min(axis=2)
     clear = (apart.T > CLEARANCE_M - _ROUNDED_M) & present[:, :1] & (np.abs(beyond_m[:, :1]) <= CLEARANCE_M)
-    before = np.concatenate([track[:1, :1], track[:-1, :1]])  # the nearest track of the position before
+    before = np.concatenate([track[:1, :1], track[:-1, :1]])  # the nearest track of the previous position
     same = (track == before) & (before >= 0)
     rows, column = np.arange(len(track)), same.argmax(axis=1)
     known = same.any(axis=1)

@@ -32,14 +32,13 @@ def read_network(
     paths: Sequence[FilePath], reading: MapReading | None = None, *, tolerance_m: float = TOLERANCE_M
 ) -> Network:
     """Read a network from map files, connected as they state, else where ends, or an end and a track, meet."""
-    of_file = replace(reading or MapReading(), duplicates="keep")
-    tracks = [track for path in paths for track in read_segments(path, of_file)]
+    tracks = [track for path in paths for track in read_segments(path, reading or MapReading())]
     check_order(tracks)
     return connect_network(tracks, paths, tolerance_m=tolerance_m)
 
 
 def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
-    """Connect tracks to a network: as their files state it, else by their ends; see `read_network`."""
+    """Connect tracks to a network: as their files state it, otherwise by their ends; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))

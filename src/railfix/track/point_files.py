@@ -222,12 +222,6 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     for wrong, right in misspelt(line.properties, (*OPTIONAL_COLUMNS, "geoid_m", *_MEMBERS)).items():
         if right not in line.properties:
             raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
-    same = (np.diff(line.coordinates, axis=0) == 0).all(axis=1)
-    if reading.duplicates == "reject" and same.any():
-        raise line.error(
-            f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
-            "'railfix map check' lists them all"
-        )
     place = _in_frame(line.source, crs, line.coordinates)
     of_way = get_metadata(line.feature)
     return make_segment(
@@ -299,14 +293,6 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
     heights = table.numbers("height_m" if datum == "ellipsoidal" else "elevation_m")
     if len(table) < 2:
         raise InputFileError(path, f"{plural(table, 'point')}; a track needs at least two")
-    same = (np.diff(latitude) == 0) & (np.diff(longitude) == 0) & (np.diff(heights) == 0)
-    if reading.duplicates == "reject" and same.any():
-        row = int(np.argmax(same)) + 1
-        raise table.error(
-            row,
-            f"the same point as line {table.line[row - 1]} ({int(same.sum())} such in the file); remove it, "
-            "'railfix map check' lists them all",
-        )
     crs = choose_crs(path, reading.crs, table.metadata.get("crs"))
     place = _place(crs, latitude, longitude, path=table.path)
     geoid, geoid_m, above = reading.geoid, None, None

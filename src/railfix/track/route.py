@@ -45,7 +45,7 @@ class MapReading:
     crs: str | None = None
     height_datum: str | None = None
     geoid: str | None = None
-    duplicates: str = "reject"
+    duplicates: str = "merge"
     sigma_plan_m: float | None = None
 
 

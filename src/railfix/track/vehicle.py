@@ -125,7 +125,7 @@ class _VehicleLine:
 
     @property
     def open_ends(self) -> tuple[bool, bool]:
-        """Whether the line does not go on before its start, after its end."""
+        """Whether the line does not continue before its start, after its end."""
         return bool(np.isnan(self.joins[0])), bool(np.isnan(self.joins[1]))
 
     def at(self, chainage: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Ranges of epochs that the signs of interference are looked for in, and least-squares fits of them."""
+"""Ranges of epochs that the signs of interference are searched for in, and least-squares fits of them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class MotionInputs(NamedTuple):
     corrected_code_m: Floats
     sigma_m: Floats
     used: Masks  #: Channels without a reason against them, shape (T, K).
-    named: Masks  #: Channels that are wrong by themselves, and would be used otherwise; shape (T, K).
+    named: Masks  #: Channels that are wrong separately, and would be used otherwise; shape (T, K).
     noise_scale: Floats  #: Shape (T,).
     #: Known offsets between the receiver clocks, and their sigmas; shape (T, G).
     clock_offset_m: Floats

@@ -76,7 +76,7 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     found = _fit(part, every, start, tags=True, line=True)
     other = start._replace(error_s=np.zeros(len(shown)), place_ecef_m=part.near_ecef_m)
     without = _fit(part, part.used, other, tags=False, line=True).residual
-    # without a redundant range those that are left fit, and those that are named do not
+    # without a redundant range the remaining ones fit in any case
     without = np.where(np.isnan(without), np.where(_with_line(part.named, False), np.inf, 0.0), without)
     rows = _with_line(every, True)
     # noise of this fit, not that of the receiver, which would include an error of the tags

@@ -1,7 +1,7 @@
 """Distance by satellites against that of a wheel: detects a pull along the track that no other test detects.
 
 Over a window the two differ by the noise of two positions and by the wheel's scale error, which is estimated before the
-window. A pull from the beginning, or as slow as the diameter is uncertain, is not seen.
+window. A pull from the beginning, or as slow as the uncertainty of the diameter, is not detected.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Least standard deviation of a position: errors of satellites and atmosphere that change over minutes [m].
+#: Least standard deviation of a position: satellite and atmospheric errors that change over minutes [m].
 _LEAST_M: Final = 1.0
 #: Speed up to which a tachometer without output counts as standing, or may creep [m/s].
 _SLOW_MPS: Final = 0.5
@@ -85,7 +85,7 @@ def wheel_signs(
     """Compare distances by satellites and wheel, shapes (T,), and return the state to pass on.
 
     `arc_m` and `sigma_m` are positions along the line, of single epochs or of the filter, NaN without one; `wheel_m` is
-    the distance that the wheel has rolled since the epoch before, NaN where it is not known, `signed` whether it has
+    the distance that the wheel has rolled since the previous epoch, NaN where it is not known, `signed` whether it has
     the sign of the motion along the line.
     """
     if not len(time):

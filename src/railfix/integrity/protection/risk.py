@@ -27,7 +27,7 @@ from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 
-#: Probability that a satellite is faulty at a time: 1e-5 an hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
+#: Probability that a satellite is faulty at a time: 1e-5 per hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
 #: Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the Galileo service definition after it); the
 #: others as Galileo, as no commitment of theirs is as old.
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
@@ -58,11 +58,11 @@ Probability = Annotated[float, Field(ge=0, lt=1)]  #: A probability below 1.
 class RiskBudget(Settings):
     """Integrity risk, its allocation, and the probabilities of faults."""
 
-    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 an hour.
+    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 per hour.
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s: multipath of a
     #: moving train changes within seconds, that of a standing one within tens of seconds, SBAS corrections within
-    #: minutes (DO-229D appendix J counts 10 samples an hour). More samples are the safe side; from 10 to 3600 the
+    #: minutes (DO-229D appendix J counts 10 samples per hour). More samples are the safe side; from 10 to 3600 the
     #: fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
     #: Fractions of the risk of an epoch; together at most 1. They determine the three parts, from the largest of which
@@ -137,11 +137,11 @@ class RiskBudget(Settings):
         return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
 
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
-        """Return the risk of an epoch in the set that is left after exclusions, any shape.
+        """Return the risk of an epoch for the set that remains after exclusions, any shape.
 
-        More faults than are checked, of probability `beyond`, are taken off once. Every set that exclusion could have
-        left is a possible failure, so the part of the risk for e exclusions is divided by the number of sets of e among
-        all satellites. 0 beyond `MOST_EXCLUDED`, and where nothing remains.
+        The probability of faults beyond the checked ones, `beyond`, is subtracted once. Every set that exclusion could
+        have left is a possible failure, so the part of the risk for e exclusions is divided by the number of sets of e
+        among all satellites. 0 beyond `MOST_EXCLUDED`, and where nothing remains.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
@@ -171,7 +171,7 @@ def set_sums(prior: Floats, most: int) -> Floats:
     return np.stack(sums, axis=1)
 
 
-#: Shared faults at a time that may be hypotheses; the probability of more is taken off the risk.
+#: Largest number of simultaneous shared faults in a hypothesis; the probability of more is subtracted from the risk.
 _MOST_SHARED: Final = 3
 FEW: Final = 2  #: Epochs of two antennas, live: their allocation is kept.
 REMEMBERED: Final = 512  #: Such allocations: satellites come and go behind obstacles.
@@ -346,7 +346,7 @@ class _Classes:
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Return how many satellites at most are left out with each set of shared faults, shape (T, B).
+        """Return the largest number of satellites left out with each set of shared faults, shape (T, B).
 
         `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a
         satellite.

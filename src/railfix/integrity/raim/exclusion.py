@@ -97,9 +97,9 @@ def detect(
     Parameters
     ----------
     wsse : array_like, shape (T,)
-        Weighted sum of squared residuals; NaN where there is no position.
+        Weighted sum of squared residuals; NaN without a position.
     residual_m : array_like, shape (T, M) [m]
-        0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel` allow for the map error, those
+        0 (or NaN) where not used; requested in fixed mode only. Those of a `LinearModel` allow for the map error, those
         of a `Constrained` position do not: the same only where the map is taken as exact, as in P1 (a sigma of a
         millimetre).
     freedom : array_like of int, shape (T,)
@@ -171,7 +171,7 @@ class Exclusion:
 
     outcome: Codes  #: `Outcome`, shape (T,).
     excluded: Masks  #: Channels to leave out; none unless the outcome is EXCLUDED_ONE or EXCLUDED_TWO; shape (T, M).
-    #: Channels of the passing subset that leaves the least statistic; -1 where none; INSEPARABLE too; shape (T, 2).
+    #: Channels of the passing subset with the least statistic; -1 where none; INSEPARABLE too; shape (T, 2).
     best: Indices
     #: The next such subset of as many channels: the closest competing exclusion; -1 where none; shape (T, 2).
     alternative: Indices
@@ -225,7 +225,7 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     failing = np.flatnonzero(detection.detected)
     result.outcome[failing] = Outcome.UNRESOLVED
     used = np.count_nonzero(model.used[failing], axis=1)
-    # Epochs of like numbers of satellites together: no block is wider than it must be.
+    # Epochs are grouped by numbers of satellites: no block is wider than necessary.
     failing = failing[np.argsort(used, kind="stable")]
     widest = int(used.max(initial=1))
     size = max(1, _BLOCK_SIZE // (widest * widest))

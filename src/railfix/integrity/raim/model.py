@@ -128,7 +128,7 @@ class LinearModel:
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
-        """Return the covariance of the wanted components, shape (T, interest, interest) [m^2].
+        """Return the covariance of the components of interest, shape (T, interest, interest) [m^2].
 
         `scale` multiplies the sigmas of the ranges (and ties), not the map error: of the covariance Q, ``Q P Q`` comes
         from the prior P and ``Q - Q P Q`` from the ranges.
@@ -141,7 +141,7 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact(RowArrays):
-    """Residuals and their projector of the used channels alone, side by side: T epochs by n."""
+    """Residuals and their projector of the used channels alone, adjacent: T epochs by n."""
 
     channel: Indices  #: Channel of the model at each index, shape (T, n).
     used: Masks  #: False at indices beyond the epoch's own channels, shape (T, n).

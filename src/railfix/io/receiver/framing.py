@@ -199,7 +199,7 @@ _CRC24: Final = _crc24_table()
 
 
 def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
-    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all together."""
+    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all stretches."""
     crc = np.zeros(len(start), dtype=np.int64)
     order = np.argsort(start - end, kind="stable")  # longest first: the ones still running are a prefix
     first, length = start[order], (end - start)[order]
@@ -245,7 +245,7 @@ def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     valid[complete] = (sums[stop] ^ sums[first]) == (_HEX[data[stop + 1]] << 4 | _HEX[data[stop + 2]])
     line_end = end + 3 + (_at(data, end + 3) == ord("\r"))
     frame_end = line_end + (_at(data, line_end) == ord("\n"))
-    if not at_end:  # a sentence whose line may go on waits for the rest of it
+    if not at_end:  # a sentence whose line may continue waits for the rest of it
         frame_end = np.where(line_end >= len(data), len(data) + 1, frame_end)
     return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 

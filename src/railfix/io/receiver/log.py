@@ -279,8 +279,10 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
 
 
 def _of_old_kinds(frames: Frames) -> dict[str, int]:
-    """Return messages with observations that are not read, counted by kind: RTCM 3 before MSM, u-blox before the M8."""
-    counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in (*range(1001, 1005), *range(1009, 1013))}
+    """Return messages with observations that are not read, by kind: RTCM 3 before MSM4, u-blox before the M8."""
+    small = (start + n for start in range(1070, 1140, 10) for n in (1, 2, 3))
+    kinds = (*range(1001, 1005), *range(1009, 1013), *small)
+    counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in kinds}
     counts["UBX RXM-RAW"] = len(frames.of("ubx", ubx.RXM_RAW))
     return {what: number for what, number in counts.items() if number}
 
@@ -432,7 +434,7 @@ def scan_receiver_log(
         )
         if old:
             has = ", ".join(f"{what} ({number})" for what, number in sorted(old.items()))
-            why += f"; its {has} are of unsupported kinds: give a RINEX file made from them (RTKLIB's convbin)"
+            why += f"; its {has} are of unsupported kinds: log MSM4 to MSM7, or give a RINEX file made from them"
         raise InputFileError(path, why)
 
 

@@ -17,7 +17,10 @@ from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
 from railfix.io.rinex.navigation_records import RawRecord, list_fields
 
-_SLIP, _HALF_CYCLE = 1, 2  #: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
+_SLIP, _HALF_CYCLE = (
+    1,
+    2,
+)  #: RINEX loss-of-lock bits: lock lost since the previous epoch; half-cycle ambiguity possible.
 
 
 @dataclass(frozen=True, kw_only=True)

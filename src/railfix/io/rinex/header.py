@@ -119,7 +119,7 @@ def apply_records(
 
 
 class _HeaderRecords:
-    """Reader of header records into a copy of a header: by columns, else by words, with a note."""
+    """Reader of header records into a copy of a header: by columns, otherwise by words, with a note."""
 
     def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path
@@ -229,6 +229,9 @@ class _HeaderRecords:
 
     def scale_factor(self, text: str) -> None:
         """SYS / SCALE FACTOR."""
+        if re.match(r" +[A-Z] +\d+( |$)", text):
+            self._remark("SYS / SCALE FACTOR")
+            text = f"{text.lstrip():<60}"
         names = [text[k : k + 3].strip() for k in range(11, 59, 4)]
         names = [name for name in names if name]
         if text[0] != " ":

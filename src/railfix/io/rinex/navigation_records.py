@@ -78,7 +78,7 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
 _BLANK: Final = float("nan")
 _UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.
-_TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times further than this from toe are invalid [s].
+_TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times farther than this from toe are invalid [s].
 
 
 @dataclass(frozen=True)

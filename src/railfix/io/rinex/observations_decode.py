@@ -52,7 +52,7 @@ class Fields:
 
 
 def join_fields(parts: Sequence[Fields]) -> Fields:
-    """Return the fields of the same satellites side by side."""
+    """Return the fields of the same satellites adjacent."""
     arrays = ([getattr(part, name) for part in parts] for name in ("value", "lock", "bad"))
     return Fields(*(np.concatenate(some, axis=1) for some in arrays))
 

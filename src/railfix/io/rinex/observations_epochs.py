@@ -310,7 +310,7 @@ class _Walk:
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
     def _header_records(self, position: int, *, at_end: bool) -> int:
-        """Take header records among the epochs as one event; they may go on after the end of the block."""
+        """Take header records among the epochs as one event; they may continue after the end of the block."""
         end = position
         while end < len(self._lines) and _is_record(self._lines, end):
             end += 1

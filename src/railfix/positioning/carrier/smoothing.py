@@ -33,13 +33,13 @@ _COMMON: Final = 3  #: Channels required for a median to represent the clock.
 
 
 class SlipReason(IntFlag):
-    """Why the phase of an epoch and channel restarts. 0 = joined to the epoch before."""
+    """Why the phase of an epoch and channel restarts. 0 = joined to the previous epoch."""
 
     JOINED = 0
     NO_PHASE = 1 << 0  #: No phase at this epoch: nothing begins.
-    FIRST = 1 << 1  #: A phase, but none of this channel at the epoch before.
+    FIRST = 1 << 1  #: A phase, but none of this channel at the previous epoch.
     LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator.
-    HALF_CYCLE = 1 << 3  #: Its bit 1 (half-cycle ambiguity) differs from the epoch before.
+    HALF_CYCLE = 1 << 3  #: Its bit 1 (half-cycle ambiguity) differs from the previous epoch.
     GAP = 1 << 4  #: The epoch before is longer ago than the limit.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
     DOPPLER = 1 << 6  #: The phase's change disagrees with the Dopplers.
@@ -51,8 +51,8 @@ class CycleSlipLimits(Settings):
 
     The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise of the phases,
     noise of the mean Doppler, and the error of the trapezoidal rule for a motion with that jerk. One cycle on L1 (0.19
-    m) is seen up to intervals of about 1 s, two to 1.5 s; a test on the track (`continuity.track_jumps`) has no such
-    end.
+    m) is detected up to intervals of about 1 s, two to 1.5 s; a test on the track (`continuity.track_jumps`) has no
+    such limit.
     """
 
     #: Longest interval that is bridged: the interval of a station's log, 30 s.
@@ -83,16 +83,16 @@ class CycleSlipState:
 class Slips:
     """Phases and where their arcs begin, T epochs by M channels."""
 
-    slip: Masks  #: True where there is a phase that may not be joined to the epoch before, shape (T, M).
+    slip: Masks  #: True where there is a phase that may not be joined to the previous epoch, shape (T, M).
     reason: Integers  #: `SlipReason` bits, shape (T, M).
     #: Phase times wavelength on the clock of the codes: whole milliseconds that only the codes stepped are added. NaN
     #: where the phase is missing or its wavelength is unknown; shape (T, M).
     phase_m: Floats
-    #: Metrics of the two tests; NaN where they cannot judge; shape (T, M).
+    #: Metrics of the two tests; NaN where they cannot be used; shape (T, M).
     doppler_metric_m: Floats
     code_metric_m: Floats
     doppler_limit_m: Floats  #: Shape (T,).
-    #: Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen; shape (T,).
+    #: Step of the receiver's clock into the epoch from the codes; 0 where none is detected; shape (T,).
     clock_step_m: Floats
     half_cycle: Masks  #: The receiver reports an unresolved half cycle: harmless to a float ambiguity; shape (T, M).
 
@@ -124,7 +124,7 @@ def find_slips(
     observations : Observations
         T epochs, M channels.
     state : CycleSlipState, optional
-        Left by the chunk before; None at the start of a log.
+        Left by the previous chunk; None at the start of a log.
     frequency_hz : ndarray, shape (M,), optional [Hz]
         Carrier of each channel; by default from the log's header alone, where GLONASS may lack its
         channels.
@@ -196,8 +196,8 @@ def slip_metrics(
 ) -> tuple[Floats, Integers, Floats, Floats]:
     """Compute the clock step of the codes [m], its whole milliseconds that phases lack, and the metrics of both tests.
 
-    `dt`, shape (T,), is the time since the epoch before; `code_m` and `phase_m`, shape (T, M), are changes since then,
-    `range_mps` the range rate by the Dopplers.
+    `dt`, shape (T,), is the time since the previous epoch; `code_m` and `phase_m`, shape (T, M), are changes since
+    then, `range_mps` the range rate by the Dopplers.
     """
     moved = np.where(np.isnan(range_mps), 0.0, range_mps) * dt[:, None]
     step = median_or_zero(code_m - moved)

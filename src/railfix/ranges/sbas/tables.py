@@ -203,7 +203,7 @@ class SatelliteTables:
         )
 
     def _fast_degradation(self, messages: SbasMessages) -> Series:
-        """Type 7, one row a satellite."""
+        """Type 7, one row per satellite."""
         seven = decode(messages, 7)
         count = len(seven["row"])
         rows = {name: np.repeat(seven[name], SLOTS) for name in ("row", "iodp", "latency_s")}
@@ -224,7 +224,7 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """Add the row where each series begins: the first of its satellite, or one after a row that was not monitored."""
+    """Add the row where each series begins: the first of its satellite, or one after per row that was not monitored."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))

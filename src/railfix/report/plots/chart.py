@@ -217,7 +217,7 @@ __all__ = ["find_start", "floats", "nice_step", "points", "since", "words"]
 
 
 def points(table: pl.DataFrame, *names: str) -> Floats:
-    """Return columns side by side, shape (rows, columns)."""
+    """Return columns adjacent, shape (rows, columns)."""
     return np.stack([floats(table, name) for name in names], axis=1)
 
 

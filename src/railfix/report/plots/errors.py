@@ -312,7 +312,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     """Return levels over the time since `start`, or over the chainage without one."""
     layers: list[Layer] = []
     shown = total = 0
-    # levels matter near the alarm limit: a few far beyond it do not set the axis
+    # levels are of interest near the alarm limit: a few far beyond it do not set the axis
     top = 2.0 * alarm_limit_m
     epoch = since(positions, find_start(positions))
     x = floats(positions, "chainage_m") if start is None else epoch
