@@ -53,17 +53,18 @@ def test_a_map_with_an_error_ends_with_6_and_says_which(tmp_path: Path) -> None:
     assert (tmp_path / "map_check.png").is_file(), "the picture shows what is wrong"
 
 
-def test_duplicates_are_shown_by_the_check_that_the_reader_names(tmp_path: Path) -> None:
+def test_points_that_repeat_the_one_before_are_read_once_and_shown(tmp_path: Path) -> None:
     path = line(tmp_path)
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[-1]]) + "\n")
     code, printed = call("check", path)
-    assert code == 6
+    assert code == 0
     assert "duplicate" in printed
+    assert any("1 repeated point left out" in note for note in read_track(path).provenance.notes)
     path.write_text("latitude_deg,longitude_deg,height_m\n" + 5 * "50.0,10.0,300\n")
     code, printed = call("check", path)
-    assert code == 6
-    assert "no mid-chord deviation" in printed
+    assert code == 3
+    assert "at least two different points" in printed
 
 
 def test_the_limit_of_the_mid_chord_deviation_is_an_option(tmp_path: Path) -> None:
@@ -76,7 +77,7 @@ def test_the_limit_of_the_mid_chord_deviation_is_an_option(tmp_path: Path) -> No
     ("arguments", "code", "said"),
     [
         (["check", "none.csv"], 3, "no such file"),
-        (["check", "."], 3, "ends in .csv"),
+        (["check", "."], 3, "is a folder"),
         (["check", "line.csv", "--geoid", "japan"], 4, "ellipsoidal already"),
         (["check", "line.csv", "--mid-chord", "0"], 4, "must be positive"),
         (["check", "line.csv", "--crs", "EPSG:0"], 4, "unknown"),

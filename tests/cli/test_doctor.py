@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 from pathlib import Path
 from random import Random
 
@@ -60,6 +61,29 @@ def test_a_log_without_a_date_is_a_log_that_needs_one(recordings: Path, tmp_path
     (finding,) = examine_files([path]).findings
     assert finding.kind == "observations"
     assert "its observations (RTCM 3) carry no date; give one with --date" in finding.problems[0]
+    result = RUNNER.invoke(app, ["doctor", str(path), "--date", "2024-08-18T12:00", "--json"])
+    (found,) = json.loads(result.stdout)["files"]
+    assert found["first"].startswith("2024-08-18T21:14:25")
+    assert not any("--date" in problem for problem in json.loads(result.stdout)["problems"])
+
+
+@pytest.mark.requirement("G5")
+def test_networks_orbits_and_maps_without_heights_are_no_problem(desk: Path, tmp_path: Path) -> None:
+    """Each as a run takes it: a network, of which it finds the route; heights of the log; orbits beside ephemerides."""
+    lines = [[[8.0, 47.0], [8.001, 47.0], [8.002, 47.0]], [[8.001, 47.001], [8.002, 47.001]]]
+    features = [
+        {"type": "Feature", "properties": {}, "geometry": {"type": "LineString", "coordinates": line}} for line in lines
+    ]
+    net = tmp_path / "net"
+    net.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    found = examine_files([desk / "front.obs", desk / "brdc.nav", net])
+    assert found.findings[2].facts[:3] == (
+        "5 points, 228 m",
+        "without heights: those of the log's own positions are taken (--heights log)",
+        "a network of 2 tracks, of which a run finds the route",
+    )
+    assert all("km from the place in the header" in problem for problem in found.problems)
+    assert "--heights log" in found.command
 
 
 @pytest.mark.requirement("A6")
@@ -73,12 +97,13 @@ def test_a_map_with_errors_is_named_as_map_check_names_it(desk: Path, tmp_path: 
 
 
 def test_what_is_missing_or_does_not_fit_is_named(desk: Path, tmp_path: Path) -> None:
-    (tmp_path / "notes.md").write_text("notes\n")
+    notes = tmp_path / "notes[maps].md"
+    notes.write_text("notes\n")
     far = tmp_path / "far.csv"
     far.write_text("latitude_deg,longitude_deg,height_m\n47,8,400\n47.001,8,400\n")
-    result = RUNNER.invoke(app, ["doctor", *(str(path) for path in (desk / "front.obs", far, tmp_path / "notes.md"))])
+    result = RUNNER.invoke(app, ["doctor", *(str(path) for path in (desk / "front.obs", far, notes))])
     assert result.exit_code == 5, result.output
-    for words in ("notes.md: not recognised", "there is no navigation file", "km from the place in the header"):
+    for words in ("notes[maps].md: not recognised", "no navigation file", "km from the place in the header"):
         assert words in result.output
     assert "run: railfix" not in result.output
     assert RUNNER.invoke(app, ["doctor", str(tmp_path / "none.obs")]).exit_code == 3

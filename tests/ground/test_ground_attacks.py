@@ -113,7 +113,7 @@ def test_a_length_of_nothing_stops_the_train(state: Interlocking) -> None:
         ({"front_m": 3050.0, "line": 2}, "line 2, the train is on line 1"),
         ({"front_m": 3050.0, "speed_cmps": 190_000}, "speed"),
         ({"front_m": 3050.0, "over_cm": 90_000_000}, "bounds"),
-        ({"front_m": 3050.0, "time_ns": 1}, "older than that"),
+        ({"front_m": 3050.0, "time_ns": 1}, "older than in the"),
     ],
 )  # fmt: skip
 def test_a_contradiction_stops_the_train_and_its_neighbours(
@@ -221,7 +221,7 @@ def test_a_train_is_stopped_and_released_from_the_page(tmp_path: Path) -> None:
         now = [10.0]
         control = centre(store, judged=False, clock=lambda: now[0])
         orders = list_orders(control)
-        assert orders["stop"]({"train": 9}) == "there is no train 9"
+        assert orders["stop"]({"train": 9}) == "no such train: 9"
         assert orders["stop"]({"train": 1}) is None
         assert control.snapshot()["trains"][0]["stop"] == "stopped by hand; not sent"
         control.step()

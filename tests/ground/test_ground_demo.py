@@ -66,7 +66,7 @@ def test_the_story_of_the_demonstration(demo: tuple[dict[str, Any], dict[str, An
     log = state["log"]
     order = [k for k, line in enumerate(log) if line.endswith(("suspend satellite positioning", "triangle: stop"))]
     assert [log[k].split(": ")[-1] for k in order] == ["stop", "suspend satellite positioning"]  # newest first
-    assert any("heard again" in line for line in log)
+    assert any("reports again" in line for line in log)
 
 
 @contextmanager
@@ -397,6 +397,6 @@ def test_the_page_on_paper(demo: tuple[dict[str, Any], dict[str, Any]], tmp_path
     assert len(data) < 1_000_000
     if program := shutil.which("pdftotext"):
         text = subprocess.run([program, paper, "-"], capture_output=True, text=True, check=True).stdout
-        for word in ("STOP: satellites or jamming", "Trains", "Links", "Points", "Log", "heard again"):
+        for word in ("STOP: satellites or jamming", "Trains", "Links", "Points", "Log", "reports again"):
             assert word in text
         assert "Log in" not in text

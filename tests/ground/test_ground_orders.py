@@ -297,11 +297,11 @@ def test_nothing_is_granted_after_a_start_until_every_train_is_heard(desk: Desk)
     assert desk.centre.supervision.awaited == {1, 2}  # the report may be late: it names no order of this start
     desk.report(2, 2900.0, authority=desk.state.granted)
     desk.steps(2.0)
-    assert desk.orders["route"]({"train": 2}) == "not heard since the start: train 1"
+    assert desk.orders["route"]({"train": 2}) == "no report since the start: train 1"
     ends = {number: known.end_m for number, known in desk.state.trains.items()}
     desk.steps(2.0)
     assert {number: known.end_m for number, known in desk.state.trains.items()} == ends
-    assert any("nothing is granted until heard" in alarm for alarm in desk.centre.alarms)
+    assert any("nothing is granted until" in alarm for alarm in desk.centre.alarms)
     desk.report(1, 1500.0, authority=900, authority_end_cm=245_000, speed_cmps=1000, direction=1, standstill=False)
     assert "the centre's database ends at" in (desk.state.trains[1].stop or "")
     assert desk.state.trains[1].interval_m[1] == 2450.0  # what it may still run to is occupied

@@ -62,7 +62,7 @@ def test_a_roll_back_counts_whatever_the_clock_of_the_report(
     ahead = report(1, 3000.0, time_ns=hour, sent_ns=hour, **standing)
     back = [report(k, 2700.0, **standing) for k in (2, 3, 4)]
     found = after(state, ahead, back[0])
-    assert found.trains[1].stop == "the place is older than that of the report before"
+    assert found.trains[1].stop == "the position is older than in the previous report"
     assert found.trains[1].rear_m == 2495.0
     released, reason = release_train(found, 1, TWO)
     assert reason is None

@@ -377,7 +377,7 @@ def test_routes_and_the_release_by_hand(
     assert not sent[-1].stopped
     assert {a.train: a.end_cm for a in sent[-2:]} == {1: 42_000, 2: 308_000}  # no route without an order
     assert orders["route"]({"train": "1"}) == "train: a number was expected"
-    assert orders["route"]({"train": 5}) == "there is no train 5"
+    assert orders["route"]({"train": 5}) == "no such train: 5"
     assert orders["route"]({"train": 1}) is None
     seconds(1, TriangleVerdict.HEALTHY)
     assert sent[-2].end_cm == 192_000
@@ -439,7 +439,7 @@ def test_an_order_to_stop_is_acknowledged_and_timed(
 
     second(delivered=True)
     orders = list_orders(control)
-    assert orders["close-section"]({"section": "Q"}) == "there is no section 'Q'"
+    assert orders["close-section"]({"section": "Q"}) == "no such section: 'Q'"
     assert orders["open-section"]({"section": "A"}) == "'A' is not closed"
     assert orders["close-section"]({"section": "A"}) is None
     assert second(delivered=False)["stop"] == "A is closed; not acknowledged"

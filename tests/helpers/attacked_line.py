@@ -42,7 +42,9 @@ class AttackedTrain:
     on_board: OnBoard
     wagons: list[Piece] = field(default_factory=list)
     whole_m: float = LENGTH_M
+    cut_m: float = 0.0  #: Where its wagons begin, once it has lost some.
     divided: bool = False  #: Its wagons are another train, by order.
+    astray: bool = False  #: It has moved by nothing that was granted: others may run into it before they can stop.
     sequence: int = 0
     lies: int = 0
     kind: str = ""
@@ -91,6 +93,7 @@ class AttackedLine:
     violations: Counter[str] = field(default_factory=Counter)
     seen: Counter[str] = field(default_factory=Counter)
     now_s: float = 0.0
+    calm: float = 1.0  #: Share of the disturbances that happen.
 
     def __post_init__(self) -> None:
         rng = self.rng = random.Random(self.seed)
@@ -141,7 +144,7 @@ class AttackedLine:
         for train in self.trains.values():
             self.act(train)
         self.deliver()
-        if self.rng.random() < 0.03:
+        if self.rng.random() < 0.03 * self.calm:
             self.centre.state = from_documents(to_documents(self.centre.state))
             self.centre._clocks.clear()
             moving = set(self.moving)
@@ -160,13 +163,17 @@ class AttackedLine:
                 self.centre.set_detected(point, track)
                 break
         before = self.centre.state
-        for authority in self.centre.advance(self.now_s):
-            if authority.train not in self.trains:
+        for message in self.sent():
+            if message.train not in self.trains:
                 continue  # what reports nothing
-            self.post(partial(self.trains[authority.train].receive, authority))
-            self.check_grant(before.trains[authority.train].end_m, authority)
+            self.post(partial(self.trains[message.train].receive, message))
+            self.check_grant(before.trains[message.train].end_m, message)
         self.deliver()
         self.check_held()
+
+    def sent(self) -> list[Authority]:
+        """Return what the centre sends in a step; here all orders to brake are lost."""
+        return self.centre.advance(self.now_s)
 
     def dispatch(self, train: AttackedTrain) -> None:
         """What is done by hand: a train is released after a look at it, asked for its route, given one."""
@@ -178,7 +185,7 @@ class AttackedLine:
             self.centre.state, reason = release_train(self.centre.state, number, LINE)
             self.seen["release"] += reason is None
             if reason is None:  # what it reported before its stop tells nothing of the way after it
-                self.taken[number].sent_s = None
+                self.taken[number].sent_s, train.astray = None, False
         elif event < 0.35:
             self.seen["asked back"] += self.centre.ask_route_back(number) is None
         elif event < 0.45 and known.held:
@@ -187,16 +194,17 @@ class AttackedLine:
     def act(self, train: AttackedTrain) -> None:
         rng = self.rng
         event = rng.random()
+        event = event if event > 0.09 or self.calm == 1.0 or rng.random() < self.calm else 0.5
         speed = 0.0
         station = LINE.station_at(*sorted((train.front_m, train.rear_m)))
         if event < 0.01 and not train.wagons:
             self.seen["split"] += 1
-            cut = train.front_m - train.direction * 30.0
-            train.wagons, train.whole_m = LINE.pieces(cut, train.rear_m, train.tracks), 30.0
-        elif event < 0.02:
+            train.cut_m = train.front_m - train.direction * 30.0
+            train.wagons, train.whole_m = LINE.pieces(train.cut_m, train.rear_m, train.tracks), 30.0
+        elif event < 0.02 and self.is_clear(train, back_m := rng.uniform(60.0, 300.0)):
             self.seen["roll-back"] += 1
-            train.front_m -= train.direction * rng.uniform(60.0, 300.0)
-            train.lies = 0  # the report of a roll-back is right
+            train.front_m -= train.direction * back_m
+            train.lies, train.astray = 0, True  # the report of a roll-back is right
             self.report(train, 0.0, certain=True)
             return
         elif event < 0.08 and station is not None and not train.wagons:
@@ -218,6 +226,10 @@ class AttackedLine:
             self.lead(train, way)
             speed = SPEED_MPS if way > 0.0 else 0.0
         self.report(train, speed)
+
+    def is_clear(self, *_: Any) -> bool:
+        """Return whether a train may roll back so far."""
+        return True
 
     def lead(self, train: AttackedTrain, way: float) -> None:
         """Let a train run, and points lead it where they are."""
@@ -250,7 +262,7 @@ class AttackedLine:
 
     def report(self, train: AttackedTrain, speed: float, *, certain: bool = False) -> None:
         rng = self.rng
-        if train.lies == 0 and not certain and rng.random() < 0.04:
+        if train.lies == 0 and not certain and rng.random() < 0.04 * self.calm:
             self.lie(train)
         lied = train.lies > 0
         train.lies = max(train.lies - 1, 0)
@@ -283,11 +295,11 @@ class AttackedLine:
         if reason is not None:
             return
         known = self.centre.state.trains[number]
-        if known.stop is not None or known.sequence != message.sequence:
+        if known.stop is not None or known.sequence != message.sequence or known.direction != message.facing:
             self.taken[number].right = not wrong
             return
         place = (message.chainage_cm or 0) / 100.0
-        if before.sent_s is not None and message.facing == known.direction:
+        if before.sent_s is not None:
             way = message.facing * (place - before.place_m) - 4.0 * BOUND_M
             if way > 60.0 * (sent_s - before.sent_s + 1.1):
                 self.violations["impossible way believed"] += 1

@@ -49,7 +49,7 @@ def track_binary(bench: Bench) -> Options:
     return {"track": bench.write("random.csv", random.Random(3).randbytes(3000))}
 
 
-@broken(INPUT, "front.obs", ".csv")
+@broken(INPUT, "is a RINEX observation file", "a track map (a table")
 def track_is_observations(bench: Bench) -> Options:
     return {"track": bench.front}
 
@@ -59,7 +59,7 @@ def track_is_observations_under_another_name(bench: Bench) -> Options:
     return {"track": bench.write("obs.csv", bench.front.read_bytes())}
 
 
-@broken(INPUT, "rtk.pos", ".csv")
+@broken(INPUT, "rtk.pos", "a track map (a table")
 def track_is_positions(bench: Bench) -> Options:
     text = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns\n2026/05/12 03:00:00.000 35.0 135.0 100.0 1 9\n"
     return {"track": bench.write("rtk.pos", text)}

@@ -113,7 +113,7 @@ MORE: Final[dict[str, Mistake]] = {
     "probability_of_two": ({}, _RUN + " --set risk.local_prior=2", 4, "Input should be less than 1, got 2"),
     "alarm_limit_negative": ({}, _RUN + " --set alarm_limit_m=-1", 4, "Input should be greater than 0, got -1"),
     "reference_point_unknown": ({}, _RUN + " --reference middle", 2, "is not one of 'antenna', 'centre'"),
-    "centre_without_vehicle": ({}, _RUN + " --reference centre", 4, "which only a vehicle file can give"),
+    "centre_without_vehicle": ({}, _RUN + " --reference centre", 4, "which needs a vehicle file"),
     "datum_unknown": ({}, _RUN + " --height-datum sea", 4, "expected 'ellipsoidal' or 'orthometric'"),
     "frame_unknown": ({}, _RUN + " --crs EPSG:999999", 4, "the CRS 'EPSG:999999' is unknown"),
     # -- a vehicle
@@ -137,7 +137,7 @@ MORE: Final[dict[str, Mistake]] = {
         {"s.csv": "latitude_deg,longitude_deg\n35,135\n35.1,135\n"}, _TRACK, 3, "neither 'height_m' nor 'elevation_m'",
     ),
     "header_missing": ({"s.csv": "35,135,3\n35.1,135,3\n"}, _TRACK, 3, "numbers where a header line"),
-    "points_equal": ({"s.csv": _HEAD + "35,135,3\n" * 3}, _TRACK, 3, "the same point as line 2"),
+    "points_equal": ({"s.csv": _HEAD + "35,135,3\n" * 3}, _TRACK, 3, "at least two different points"),
     "point_alone": ({"s.csv": _HEAD + "35,135,3\n"}, _TRACK, 3, "a track needs at least two"),
     "line_of_no_length": ({"s.csv": _HEAD + "35,135,3\n35.00000000001,135,3\n"}, _TRACK, 5, "m long; give the track"),
     "datum_contradicts": (
@@ -257,7 +257,7 @@ MORE: Final[dict[str, Mistake]] = {
     "prior_without_weight": ({}, _WHICH + " --prior T3", 4, "expected NAME=WEIGHT"),
     "prior_of_another_track": ({}, _WHICH + " --prior T3=0.5", 4, "there is no track 'T3' in the network"),
     "moved_back": ({}, _WHICH + " --moved -1", 4, "--moved: Input should be greater than or equal to 0"),
-    "moved_from_nowhere": ({}, _WHICH + " --moved 0", 4, "the last place needs --last and --moved"),
+    "moved_from_nowhere": ({}, _WHICH + " --moved 0", 4, "the last position needs --last and --moved"),
     "last_place_of_nothing": ({"s.json": "{}"}, _WHICH + " --moved 0 --last {desk}/s.json", 3, "s.json"),
     "last_place_over_the_log": ({}, _WHICH + " --save-last {desk}/front.obs", 8, "is an input"),
     "base_without_place": ({}, _WHICH + " --base {desk}/rear.obs", 4, "needs both --base and --base-place"),

@@ -145,7 +145,14 @@ def _satellites_missing(lines: list[str], rng: Random) -> list[str]:
 
 
 def _column_off(lines: list[str], rng: Random) -> list[str]:
-    labels = ("TIME OF FIRST OBS", "APPROX POSITION XYZ", "ANT # / TYPE", "MARKER NAME", "INTERVAL")
+    labels = (
+        "TIME OF FIRST OBS",
+        "APPROX POSITION XYZ",
+        "ANT # / TYPE",
+        "MARKER NAME",
+        "INTERVAL",
+        "SYS / # / OBS TYPES",
+    )
     chosen = [k for k, line in enumerate(lines) if line[60:].strip() in labels]
     if not chosen:
         return lines

@@ -212,7 +212,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("heights_in_millimetres.csv", csv(LINE * [1, 1, 1000]), "found", "is it in millimetres"),
     Odd("column_in_feet.csv", csv(LINE / [1, 1, _FOOT]).replace("t_m", "t_ft"), "refused", "is in feet"),
     Odd("two_datums.csv", csv(np.vstack([LINE[:20], LINE[20:] - [0, 0, 47]])), "found", "the height deviates from"),
-    Odd("repeated.csv", csv(np.repeat(LINE, 2, axis=0)), "refused", "the same point as line 3"),
+    Odd("repeated.csv", csv(np.repeat(LINE, 2, axis=0)), "right"),
     Odd("out_of_order.csv", csv(LINE[np.random.default_rng(0).permutation(N)]), "found", "the direction turns by"),
     Odd("back_and_on.csv", csv(np.vstack([LINE[:25], LINE[15:]])), "found", "turns by 179.[0-9] degrees"),
     Odd("piece_missing.csv", csv(np.vstack([LINE[:10], LINE[35:]])), "found", "a curve in between would be missed"),

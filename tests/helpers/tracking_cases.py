@@ -103,6 +103,7 @@ def ride(
     epochs = GnssEpochs(
         time=START + timedelta(t),
         satellite=names,
+        signal=np.full(len(names), "1C"),
         clock=names.astype("<U1"),
         sat_ecef_m=sats,
         sat_velocity_mps=np.zeros((*shape, 3)),

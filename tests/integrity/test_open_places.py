@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import norm
 
 import integrity_tables
-import raim_oracle as oracle
+import raim_cases
 from integrity_recordings import ranges_of
 from plain_kernels import plain
 from railfix import kernels
@@ -210,8 +210,8 @@ def test_bounds_are_the_same_compiled(
 def test_forms_are_those_of_least_squares_without_the_channels(systems: str) -> None:
     """None, each channel, each pair and each side left out: generalised least squares with the map error as noise."""
     arc, scale, sigma_m, n = np.array([731.0, 1420.0]), np.array([1.0, 2.5]), (0.7, 4.0), len(systems)
-    ranges = oracle.made(arc, systems, seed=6, noise=2.0)
-    model = linear_model(ranges, oracle.LINE, arc)
+    ranges = raim_cases.made(arc, systems, seed=6, noise=2.0)
+    model = linear_model(ranges, raim_cases.LINE, arc)
     likely, of_side = np.linspace(1e-5, 7e-5, n), 3e-6
     sides = np.zeros((2, 3, n), dtype=bool)
     sides[:, 0, [0, 2, 3]] = sides[:, 1, [1, 4]] = sides[:, 2, 5] = True
@@ -223,8 +223,8 @@ def test_forms_are_those_of_least_squares_without_the_channels(systems: str) -> 
     expected = [2.0, *(float(np.prod(likely[list(out)])) for out in left_out[1:-3]), of_side, of_side, 0.0]
     np.testing.assert_allclose(prior, [expected] * 2, rtol=1e-12)
     clocks = np.array([[letter == other for other in dict.fromkeys(systems)] for letter in systems], dtype=float)
-    for t, place in enumerate(oracle.LINE.at_arc(arc)):
-        axes = oracle.LINE.get_axes(oracle.LINE.segment_at(arc[t : t + 1])[0])[0]
+    for t, place in enumerate(raim_cases.LINE.at_arc(arc)):
+        axes = raim_cases.LINE.get_axes(raim_cases.LINE.segment_at(arc[t : t + 1])[0])[0]
         distance, sight = range_with_rotation(ranges.sat_ecef_m[t], place)
         y, rows = ranges.code_m[t] - distance, -sight @ axes.T
         errors = rows * [sigma_m[0], sigma_m[0], sigma_m[1]]

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 
 import protection_oracle
+import raim_cases
 import raim_oracle as oracle
 from protection_hand_case import HAND, hand_model
 from railfix.integrity.protection import (
@@ -25,7 +26,7 @@ from railfix.integrity.protection import (
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, linear_model
 from railfix.positioning.range_arrays import UNTIED_M
-from raim_oracle import point_model
+from raim_cases import point_model
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -127,8 +128,8 @@ def test_case_worked_by_hand_against_rows_and_columns():
 @settings(max_examples=25)
 def test_level_equals_solving_every_subset_again(seed, system, scale, biased, shared, risk, fault):
     systems, ties = system
-    ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault})
-    model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    ranges = raim_cases.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault})
+    model, case = linear_model(ranges, raim_cases.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0], raim_cases.LINE)
     budget = HAND.replaced(risk_per_hour=risk, constellation_prior={"E": 1e-5, "C": 1e-4} if shared else {})
     bias = np.random.default_rng(seed).uniform(0.0, 1.0, len(systems)) if biased else None
     events = [
@@ -169,8 +170,8 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
 
 def test_noise_scale_multiplies_the_ranges_not_the_map():
     """The level grows with the noise, but by less: the map error stays what it is."""
-    ranges = oracle.made(ARC, "GGGGGEEE", seed=3)
-    model = linear_model(ranges, oracle.LINE, ARC)
+    ranges = raim_cases.made(ARC, "GGGGGEEE", seed=3)
+    model = linear_model(ranges, raim_cases.LINE, ARC)
     one, two = (protection_level(model, list("GGGGGEEE"), scale=s) for s in (1.0, 2.0))
     assert one.level_m[0] < two.level_m[0] < 2.0 * one.level_m[0]
     assert two.sigma_m[0] == pytest.approx(np.sqrt(model.position_covariance_m2(np.array([2.0]))[0, 0, 0]), rel=1e-12)
@@ -178,10 +179,10 @@ def test_noise_scale_multiplies_the_ranges_not_the_map():
 
 def test_batch_equals_epoch_by_epoch_and_gaps_stay_empty():
     arc = np.linspace(200.0, 1800.0, 40)
-    ranges = oracle.made(arc, "GGGGGGEEEECC", seed=8)
+    ranges = raim_cases.made(arc, "GGGGGGEEEECC", seed=8)
     weight = ranges.weight * (np.random.default_rng(1).random(ranges.weight.shape) > 0.25)
     arc = np.where(np.arange(40) % 7 == 3, np.nan, arc)
-    model = linear_model(replace(ranges, weight=weight), oracle.LINE, arc)
+    model = linear_model(replace(ranges, weight=weight), raim_cases.LINE, arc)
     scale = np.linspace(0.5, 2.0, 40)
     out = np.arange(40) % 4
     whole = protection_level(model, list("GGGGGGEEEECC"), scale=scale, n_excluded=out)
@@ -206,9 +207,9 @@ def test_batch_equals_epoch_by_epoch_and_gaps_stay_empty():
 def kinds_of_faults(systems: str) -> tuple[LinearModel, dict[str, Any]]:
     """Twelve epochs with every kind of hypothesis: some with sides, pairs of sides, triples, a known map offset."""
     arc, n, rng = np.linspace(200.0, 1800.0, 12), len(systems), np.random.default_rng(4)
-    ranges = oracle.made(arc, systems, seed=8, faults_m={1: 9.0})
+    ranges = raim_cases.made(arc, systems, seed=8, faults_m={1: 9.0})
     weight = ranges.weight * (rng.random(ranges.weight.shape) > 0.15)
-    model = linear_model(replace(ranges, weight=weight), oracle.LINE, arc)
+    model = linear_model(replace(ranges, weight=weight), raim_cases.LINE, arc)
     sides = rng.random((12, 2, n)) > 0.7
     sides[::3] = False
     options: dict[str, Any] = {
@@ -288,12 +289,12 @@ def test_levels_have_the_unit_of_the_sigmas(systems, factor):
 
 
 def test_the_worst_hypothesis_is_named_by_its_channels_or_its_constellation():
-    few = linear_model(oracle.made(ARC, "GGGGGCCEE", seed=5), oracle.LINE, ARC)
+    few = linear_model(raim_cases.made(ARC, "GGGGGCCEE", seed=5), raim_cases.LINE, ARC)
     of_one = protection_level(few, list("GGGGGCCEE"), risk=RiskBudget(constellation_prior={"C": 1e-12, "E": 1e-12}))
     assert of_one.worst_one[0] >= 0
     assert of_one.worst_constellation[0] == ""
-    model = linear_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
-    many = linear_model(oracle.made(ARC, "GGGGGGGEEE", seed=5), oracle.LINE, ARC)
+    model = linear_model(raim_cases.made(ARC, "GGGGGEEEEE", seed=5), raim_cases.LINE, ARC)
+    many = linear_model(raim_cases.made(ARC, "GGGGGGGEEE", seed=5), raim_cases.LINE, ARC)
     of_all = protection_level(many, list("GGGGGGGEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
     assert (of_all.worst_one[0], of_all.worst_constellation[0]) == (-1, "G")
     rare = RiskBudget(satellite_prior=dict.fromkeys("GE", 1e-8), local_prior=0.0)
@@ -302,8 +303,8 @@ def test_the_worst_hypothesis_is_named_by_its_channels_or_its_constellation():
 
 def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligible():
     # Two satellites of one clock fix the position: either fault is invisible.
-    ranges = oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 3])
-    model = linear_model(oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 1]), oracle.LINE, ARC)
+    ranges = raim_cases.only(raim_cases.made(ARC, "GGGEEE", seed=2), [0, 3])
+    model = linear_model(raim_cases.only(raim_cases.made(ARC, "GGGEEE", seed=2), [0, 1]), raim_cases.LINE, ARC)
     got = protection_level(model, list("GGGEEE"))
     assert np.isinf(got.level_m[0])
     assert got.cause[0] == Cause.UNCHECKED
@@ -312,7 +313,7 @@ def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligibl
     assert small.level_m[0] <= small.fault_free_m[0] < np.inf
     assert small.level_m[0] > small.sigma_m[0] * norm.isf(1e-4 / 2.0)  # the whole risk spent on noise
     assert small.k_one_fault[0] == -np.inf
-    nothing = protection_level(linear_model(ranges, oracle.LINE, ARC), list("GGGEEE"))
+    nothing = protection_level(linear_model(ranges, raim_cases.LINE, ARC), list("GGGEEE"))
     assert np.isnan(nothing.level_m[0])
 
 
@@ -324,8 +325,8 @@ def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligibl
     ],
 )
 def test_what_nothing_checks_is_taken_off_the_risk(systems, common):
-    ranges = oracle.made(ARC, systems, seed=4)
-    model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    ranges = raim_cases.made(ARC, systems, seed=4)
+    model, case = linear_model(ranges, raim_cases.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0], raim_cases.LINE)
     budget = HAND.replaced(satellite_prior={"G": common, "E": 0.3}, local_prior=0.0)
     expected = protection_oracle.level(
         case,
@@ -339,8 +340,8 @@ def test_what_nothing_checks_is_taken_off_the_risk(systems, common):
 
 
 def test_excluded_satellites_raise_the_level():
-    ranges = oracle.made(ARC, "GGGGGEEEE", seed=5)
-    model = linear_model(ranges, oracle.LINE, ARC)
+    ranges = raim_cases.made(ARC, "GGGGGEEEE", seed=5)
+    model = linear_model(ranges, raim_cases.LINE, ARC)
     levels = [protection_level(model, list("GGGGGEEEE"), n_excluded=e) for e in range(4)]
     assert levels[0].level_m[0] < levels[1].level_m[0] < levels[2].level_m[0] < np.inf
     assert np.isinf(levels[3].level_m[0])
@@ -350,34 +351,34 @@ def test_excluded_satellites_raise_the_level():
 
 def test_constellation_fault_that_nothing_checks():
     """All satellites of one constellation: without it there is no position."""
-    model = linear_model(oracle.made(ARC, "GGGGGG", seed=5), oracle.LINE, ARC)
+    model = linear_model(raim_cases.made(ARC, "GGGGGG", seed=5), raim_cases.LINE, ARC)
     got = protection_level(model, list("GGGGGG"), risk=RiskBudget(constellation_prior={"G": 1e-4}))
     assert got.cause[0] == Cause.UNCHECKED_CONSTELLATION
     assert got.worst_constellation[0] == "G"
     # Without the map six satellites of one constellation are enough, five less one are not: a map and a satellite.
     known = (np.zeros((1, 2)), np.zeros((1, 2, 2)))
-    few = linear_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
+    few = linear_model(raim_cases.made(ARC, "GGGGG", seed=5), raim_cases.LINE, ARC)
     free = protection_level(
         few, list("GGGGG"), risk=RiskBudget(map_prior=1e-2, local_prior=1e-4), map_error=MapDeviation(seen=known)
     )
     assert free.cause[0] == Cause.UNCHECKED_MAP
-    wide = linear_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    wide = linear_model(raim_cases.made(ARC, "GGGGGEEEEE", seed=5), raim_cases.LINE, ARC)
     priors = RiskBudget(map_prior=1e-2, constellation_prior={"G": 1e-5}, unchecked_share=1e-3)
-    four = oracle.only(oracle.made(ARC, "GGGGGEEEEE", seed=5), [0, 1, 2, 3, 4, 5, 6, 7])
+    four = raim_cases.only(raim_cases.made(ARC, "GGGGGEEEEE", seed=5), [0, 1, 2, 3, 4, 5, 6, 7])
     both = protection_level(
-        linear_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)
+        linear_model(four, raim_cases.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)
     )
     assert both.cause[0] == Cause.UNCHECKED_TOGETHER
     assert np.isfinite(
         protection_level(wide, list("GGGGGEEEEE"), risk=priors, map_error=MapDeviation(seen=known)).level_m[0]
     )
-    both = linear_model(oracle.made(ARC, "GGGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    both = linear_model(raim_cases.made(ARC, "GGGGGGEEEEE", seed=5), raim_cases.LINE, ARC)
     ok = protection_level(both, list("GGGGGGEEEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
     assert np.isfinite(ok.level_m[0])
 
 
 def test_refusals():
-    model = linear_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
+    model = linear_model(raim_cases.made(ARC, "GGGGG", seed=5), raim_cases.LINE, ARC)
     with pytest.raises(ValueError, match="5 channels, got 4"):
         protection_level(model, list("GGGG"))
     with pytest.raises(ValueError, match="constellation 'X'"):
@@ -386,7 +387,7 @@ def test_refusals():
         protection_level(model, list("GGGGG"), scale=0.0)
     with pytest.raises(ValueError, match="got a negative one"):
         protection_level(model, list("GGGGG"), n_excluded=-1)
-    space = point_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE.at_arc(ARC))
+    space = point_model(raim_cases.made(ARC, "GGGGG", seed=5), raim_cases.LINE.at_arc(ARC))
     with pytest.raises(ValueError, match="a model on the line"):
         protection_level(space, list("GGGGG"))
 

@@ -8,12 +8,12 @@ from math import comb, prod
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
-import raim_oracle as oracle
+import raim_cases
 from protection_oracle import Event, hypotheses, kind_of, products
 from railfix.core.errors import SettingsError
-from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
+from railfix.integrity.protection import MOST_EXCLUDED, RiskBudget, k_factor
 from railfix.integrity.protection.risk import FEW, allocate, set_sums
 
 pytestmark = pytest.mark.requirement("C2")
@@ -29,13 +29,11 @@ def test_k_of_a_risk_on_both_sides_of_a_line():
             k_factor(risk)
 
 
-def test_constants_of_do_229():
-    """V: 1e-7 in one dimension; H, PA: 2e-9 in one; H, NPA: 5e-9 in two, that is 1e-7 an hour, half, 10 samples."""
-    assert round(k_factor(1e-7), 2) == K_V
-    assert round(k_factor(2e-9), 1) == K_H_PA
-    assert round(float(np.sqrt(chi2.isf(0.5e-7 / 10.0, 2))), 2) == K_H_NPA
-    # Along a line it would be less.
-    assert k_factor(0.5e-7 / 10.0) < K_H_NPA - 0.3
+def test_k_along_a_line_is_that_of_do_229_in_one_dimension():
+    """Appendix J: 5.33 vertical (1e-7), 6.0 horizontal, precision approach (2e-9); 6.18 is of two dimensions."""
+    assert round(k_factor(1e-7), 2) == 5.33
+    assert round(k_factor(2e-9), 1) == 6.0
+    assert k_factor(0.5e-7 / 10.0) < 6.18 - 0.3
 
 
 def test_risk_of_an_hour_is_divided_among_its_samples():
@@ -116,10 +114,10 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(
 ) -> None:
     """Faults that no hypothesis covers are taken off; the rest is shared; false alarms among all separations."""
     systems = "GGGEEECC"
-    ranges = oracle.made(np.array([700.0]), systems, seed=3)
+    ranges = raim_cases.made(np.array([700.0]), systems, seed=3)
     weight = ranges.weight.copy()
     weight[0, 1] = 0.0
-    _, model = oracle.solved(replace(ranges, weight=weight), np.array([700.0]))
+    _, model = raim_cases.solved(replace(ranges, weight=weight), np.array([700.0]))
     risk = RiskBudget(
         risk_per_hour=1e-4,
         samples_per_hour=100.0,
@@ -179,7 +177,7 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(
 def test_more_hypotheses_are_asked_for_only_where_the_rest_is_too_likely() -> None:
     """The usual priors: satellites, pairs, sides with one, both sides, a wrong map with one or a side, and no more."""
     systems = "G" * 9 + "E" * 9
-    _, model = oracle.solved(oracle.made(np.array([700.0]), systems, seed=3), np.array([700.0]))
+    _, model = raim_cases.solved(raim_cases.made(np.array([700.0]), systems, seed=3), np.array([700.0]))
     sides = np.zeros((1, 2, 18), dtype=bool)
     sides[0, 0, :5], sides[0, 1, 9:14] = True, True
 
@@ -203,10 +201,10 @@ def test_the_risk_of_an_epoch_is_divided_alike_alone_and_among_others(length: in
     systems, count = "GGGGEEEEC", 24
     random = np.random.default_rng(4)
     arc = np.full(count, 700.0)
-    ranges = oracle.made(arc, systems, seed=3)
+    ranges = raim_cases.made(arc, systems, seed=3)
     weight = ranges.weight.copy()
     weight[random.random(count) < 0.3, 1] = 0.0
-    _, model = oracle.solved(replace(ranges, weight=weight), arc)
+    _, model = raim_cases.solved(replace(ranges, weight=weight), arc)
     out = random.integers(0, 3, count)
     sides = np.zeros((count, 2, len(systems)), dtype=bool)
     sides[:, 0, [0, 2]] = True

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import protection_oracle
+import raim_cases
 import raim_oracle as oracle
 from railfix.integrity.protection import Cause, RiskBudget, protection_level
 from railfix.integrity.protection.level import MapDeviation, RangeBounds
@@ -54,8 +55,8 @@ def without_the_map(case: oracle.Problem, seen_m: tuple[float, float] | None, sc
 @settings(max_examples=15)
 def test_tails_of_all_hypotheses_use_up_the_risk(seed, side_prior, of_constellation, common, scale, biased, seen):
     """Satellites, sides, constellations, a wrong map, and as many of them together as their priors ask for."""
-    ranges = oracle.made(ARC, SYSTEMS, seed=seed, faults_m={1: 9.0})
-    model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    ranges = raim_cases.made(ARC, SYSTEMS, seed=seed, faults_m={1: 9.0})
+    model, case = linear_model(ranges, raim_cases.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0], raim_cases.LINE)
     members = np.zeros((1, len(SIDES), len(SYSTEMS)), dtype=bool)
     for number, side in enumerate(SIDES):
         members[0, number, list(side)] = True

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import raim_cases
 import raim_oracle as oracle
 from railfix.core.geodesy import range_with_rotation
 from railfix.integrity.protection import RiskBudget, protection_level, risk
@@ -53,21 +54,21 @@ def hidden(ranges: Ranges, systems: str, arc: np.ndarray, members: tuple[int, ..
     faults = np.zeros((len(arc), len(systems) + 2))
     rows = [*members, *((len(systems), len(systems) + 1) if wrong_map else ())]
     for t in range(len(arc)):
-        case = oracle.problem_on_line(ranges, t, arc[t])
+        case = oracle.problem_on_line(ranges, t, arc[t], raim_cases.LINE)
         inverse = np.linalg.pinv(case.design, rcond=1e-12)
         projector, gain = np.eye(len(case.observed)) - case.design @ inverse, inverse[0] * case.scale_of[0]
         own = np.linalg.pinv(projector[np.ix_(rows, rows)], rcond=1e-9, hermitian=True) @ gain[rows]
         faults[t, rows] = own / np.sqrt(own @ gain[rows])
-    return faults * np.concatenate([case.sigma_m, [oracle.LINE.sigma_plan_m, oracle.LINE.sigma_height_m]])
+    return faults * np.concatenate([case.sigma_m, [raim_cases.LINE.sigma_plan_m, raim_cases.LINE.sigma_height_m]])
 
 
 def exceeded(systems: str, members: tuple[int, ...], *, wrong_map: bool) -> float:
     """Share of epochs with an error over the level and no separation over its threshold, at the worst of some sizes."""
     arc, rng = np.linspace(100.0, 1900.0, EPOCHS), np.random.default_rng(5)
-    ranges = oracle.made(arc, systems, seed=7, sigma_m=np.linspace(0.7, 2.5, len(systems)))
-    _, los = range_with_rotation(ranges.sat_ecef_m, oracle.LINE.at_arc(arc)[:, None, :])
-    section = oracle.LINE.segment_at(arc)[0]
-    axes = np.stack([oracle.LINE.across[section], oracle.LINE.up[section]], axis=1)
+    ranges = raim_cases.made(arc, systems, seed=7, sigma_m=np.linspace(0.7, 2.5, len(systems)))
+    _, los = range_with_rotation(ranges.sat_ecef_m, raim_cases.LINE.at_arc(arc)[:, None, :])
+    section = raim_cases.LINE.segment_at(arc)[0]
+    axes = np.stack([raim_cases.LINE.across[section], raim_cases.LINE.up[section]], axis=1)
     faults = hidden(ranges, systems, arc, members, wrong_map=wrong_map)
     sigma, drawn = np.array([1.0, 2.0]), rng.normal(size=(EPOCHS, 2))
     sides = np.tile(np.isin(np.arange(len(systems)), SIDE), (EPOCHS, 1, 1))
@@ -76,7 +77,7 @@ def exceeded(systems: str, members: tuple[int, ...], *, wrong_map: bool) -> floa
         # A map that is wrong by some metres: the antenna is beside it by as much the other way.
         beside = -size * faults[:, -2:]
         code = ranges.code_m + size * faults[:, :-2] - np.einsum("tmi,tai,ta->tm", los, axes, beside)
-        moved = linear_model(replace(ranges, code_m=code), oracle.LINE, arc)
+        moved = linear_model(replace(ranges, code_m=code), raim_cases.LINE, arc)
         known = (beside + sigma * drawn, np.tile(np.diag(sigma**-2.0), (EPOCHS, 1, 1)))
         got = protection_level(moved, list(systems), risk=RISK, map_error=MapDeviation(seen=known), sides=sides)
         over = (np.abs(moved.step_m[:, 0]) > got.level_m) & got.consistent

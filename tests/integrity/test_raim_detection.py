@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-import raim_oracle as oracle
+import raim_cases
 from railfix.core.errors import SettingsError
 from railfix.integrity.raim import RaimLimits, detect, threshold
 
@@ -96,11 +96,11 @@ def test_limits_out_of_range(setting, words):
 def false_alarms_are_as_set(systems: str, ties: tuple[float, ...] | None, epochs: int, rates: list[float]) -> None:
     """Binomial interval of 99.99 % around each set rate, on the line and in space, noise and map error as assumed."""
     arc = np.random.default_rng(7).uniform(50.0, 1950.0, epochs)
-    ranges = oracle.made(arc, systems, seed=len(systems), tie_sigma_m=ties)
-    got, line = oracle.solved(ranges, arc)
+    ranges = raim_cases.made(arc, systems, seed=len(systems), tie_sigma_m=ties)
+    got, line = raim_cases.solved(ranges, arc)
     cases = [(got.wsse, got.residual_m, line.freedom)]
     if line.freedom[0] >= 3:
-        space = oracle.in_space(ranges)
+        space = raim_cases.in_space(ranges)
         cases.append((space.wsse, space.residual_m, space.freedom))
     for wsse, residual_m, freedom in cases:
         found = np.isfinite(wsse)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import raim_cases
 import raim_oracle as oracle
 import synthetic
 from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, exclude, linear_model, reliability
@@ -69,10 +70,10 @@ def check_against_trying(case: oracle.Problem, model: LinearModel, limits: RaimL
 def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
     systems, ties = system
     arc = np.array([731.0])
-    ranges = oracle.made(arc, systems, seed=seed, tie_sigma_m=ties, faults_m=faults)
-    model = linear_model(ranges, oracle.LINE, arc)
+    ranges = raim_cases.made(arc, systems, seed=seed, tie_sigma_m=ties, faults_m=faults)
+    model = linear_model(ranges, raim_cases.LINE, arc)
     if np.isfinite(model.wsse[0]):
-        check_against_trying(oracle.problem_on_line(ranges, 0, arc[0]), model, limits, scale)
+        check_against_trying(oracle.problem_on_line(ranges, 0, arc[0], raim_cases.LINE), model, limits, scale)
 
 
 @given(
@@ -84,9 +85,9 @@ def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
 @settings(max_examples=40)
 def test_space_equals_trying_every_subset(seed, system, faults, limits):
     systems, ties = system
-    ranges = oracle.made(np.array([731.0]), systems, seed=seed, tie_sigma_m=ties, faults_m=faults)
-    place = oracle.LINE.at_arc(np.array([731.0]))
-    model = oracle.point_model(ranges, place)
+    ranges = raim_cases.made(np.array([731.0]), systems, seed=seed, tie_sigma_m=ties, faults_m=faults)
+    place = raim_cases.LINE.at_arc(np.array([731.0]))
+    model = raim_cases.point_model(ranges, place)
     if np.isfinite(model.wsse[0]):
         check_against_trying(oracle.problem_in_space(ranges, 0, place[0]), model, limits, 1.0)
 
@@ -99,9 +100,9 @@ def test_own_errors_about_the_limit_of_noise():
     outcomes = []
     for seed in range(75):
         faults = {1: 80.0, 5: 2.0 + 0.2 * seed}
-        ranges = oracle.made(arc, "GGGGGEEE", seed=seed, faults_m=faults, sigma_m=np.linspace(0.5, 3.0, 8))
-        model = linear_model(ranges, oracle.LINE, arc)
-        check_against_trying(oracle.problem_on_line(ranges, 0, arc[0]), model, limits, scale)
+        ranges = raim_cases.made(arc, "GGGGGEEE", seed=seed, faults_m=faults, sigma_m=np.linspace(0.5, 3.0, 8))
+        model = linear_model(ranges, raim_cases.LINE, arc)
+        check_against_trying(oracle.problem_on_line(ranges, 0, arc[0], raim_cases.LINE), model, limits, scale)
         outcomes.append(exclude(model, limits=limits).outcome[0])
     assert min(outcomes.count(Outcome.EXCLUDED_ONE), outcomes.count(Outcome.EXCLUDED_TWO)) > 5
 
@@ -112,10 +113,10 @@ def test_every_outcome_is_reached_by_the_cases():
     arc = np.full(200, 731.0)
     for systems, ties in SYSTEMS:
         for faults in ({}, {0: 60.0}, {0: 60.0, 2: -90.0}, {0: 60.0, 1: 80.0, 2: -90.0, 3: 150.0}):
-            ranges = oracle.made(arc, systems, seed=6, tie_sigma_m=ties, faults_m=faults)
-            reached |= set(exclude(linear_model(ranges, oracle.LINE, arc)).outcome.tolist())
-    only_three = oracle.only(oracle.made(arc, "GGGEEE", seed=6), [0, 3])
-    reached |= set(exclude(linear_model(only_three, oracle.LINE, arc)).outcome.tolist())
+            ranges = raim_cases.made(arc, systems, seed=6, tie_sigma_m=ties, faults_m=faults)
+            reached |= set(exclude(linear_model(ranges, raim_cases.LINE, arc)).outcome.tolist())
+    only_three = raim_cases.only(raim_cases.made(arc, "GGGEEE", seed=6), [0, 3])
+    reached |= set(exclude(linear_model(only_three, raim_cases.LINE, arc)).outcome.tolist())
     assert reached == {o.value for o in Outcome}
 
 
@@ -126,14 +127,14 @@ def test_faults_of_one_and_two_satellites_are_found(mode, size):
     systems = "GGGGGGEEEEE"
     pairs = [(i, j) for i in range(11) for j in range(11) if i != j] if len(size) == 2 else [(i,) for i in range(11)]
     arc = np.repeat(np.linspace(100.0, 1900.0, 6), len(pairs))
-    clean = oracle.made(arc, systems, seed=3, sigma_m=np.full(11, 0.8))
+    clean = raim_cases.made(arc, systems, seed=3, sigma_m=np.full(11, 0.8))
     code, truth = clean.code_m.copy(), np.zeros(clean.code_m.shape, dtype=bool)
     for t in range(len(arc)):
         members = list(pairs[t % len(pairs)])
         code[t, members] += size
         truth[t, members] = True
     ranges = replace(clean, code_m=code)
-    got, model = oracle.solved(ranges, arc)
+    got, model = raim_cases.solved(ranges, arc)
     found = exclude(model, limits=RaimLimits(mode=mode))
     right = (found.excluded == truth).all(axis=1)
     done = found.outcome <= Outcome.EXCLUDED_TWO
@@ -141,7 +142,7 @@ def test_faults_of_one_and_two_satellites_are_found(mode, size):
     assert right[done].all()
     assert np.nanmax(np.abs(np.where(truth, found.own_error_m - (code - clean.code_m), np.nan)[right])) < 10.0
     # What it says of the position and of the statistic is what a new solution finds.
-    after, rest = oracle.solved(replace(ranges, weight=np.where(found.excluded, 0.0, ranges.weight)), arc)
+    after, rest = raim_cases.solved(replace(ranges, weight=np.where(found.excluded, 0.0, ranges.weight)), arc)
     assert got.arc_m + found.position_change_m[:, 0] == pytest.approx(after.arc_m, abs=1e-3)
     statistic = after.wsse if mode == "chi_square" else (rest.residual_m**2).sum(axis=1)
     # Lines of sight turn by 1e-6 while the position moves by tens of metres.
@@ -155,23 +156,23 @@ def parallel_case(along: int) -> Ranges:
     los = np.stack(
         [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=1
     )
-    place = oracle.LINE.at_arc(np.array([1000.0]))[0]
+    place = raim_cases.LINE.at_arc(np.array([1000.0]))[0]
     sat = place + synthetic.enu_to_ecef(2.2e7 * los) - synthetic.enu_to_ecef(np.zeros(3))
     sigma = np.full(len(azimuth), 0.5)
-    return oracle.made(
+    return raim_cases.made(
         np.array([1000.0]), "G" * len(azimuth), seed=2, faults_m={0: 100.0}, sat_ecef_m=sat[None], sigma_m=sigma
     )
 
 
 def test_parallel_lines_of_sight_that_alone_tell_the_place_cannot_be_separated():
-    model = linear_model(parallel_case(2), oracle.LINE, np.array([1000.0]))
+    model = linear_model(parallel_case(2), raim_cases.LINE, np.array([1000.0]))
     got = exclude(model)
     assert got.outcome[0] == Outcome.INSEPARABLE
     assert not got.excluded.any()
     assert {got.best[0, 0], got.alternative[0, 0]} == {0, 1}
     assert got.alternative_shift_m[0] == pytest.approx(100.0 / np.cos(np.radians(30.0)), rel=0.03)
     # A third satellite ahead tells which.
-    got = exclude(linear_model(parallel_case(3), oracle.LINE, np.array([1000.0])))
+    got = exclude(linear_model(parallel_case(3), raim_cases.LINE, np.array([1000.0])))
     assert got.outcome[0] == Outcome.EXCLUDED_ONE
     assert got.best[0].tolist() == [0, -1]
     assert got.own_error_m[0, 0] == pytest.approx(100.0, abs=3.0)
@@ -180,8 +181,8 @@ def test_parallel_lines_of_sight_that_alone_tell_the_place_cannot_be_separated()
 def test_two_satellites_of_a_clock_of_their_own():
     """Which of them is wrong cannot be told, but the position without either is the same."""
     arc = np.array([731.0])
-    ranges = oracle.made(arc, "GGGGGGEE", seed=11, faults_m={7: 50.0})
-    model = linear_model(ranges, oracle.LINE, arc)
+    ranges = raim_cases.made(arc, "GGGGGGEE", seed=11, faults_m={7: 50.0})
+    model = linear_model(ranges, raim_cases.LINE, arc)
     got = exclude(model)
     assert got.outcome[0] == Outcome.INSEPARABLE
     assert {got.best[0, 0], got.alternative[0, 0]} == {6, 7}
@@ -246,7 +247,7 @@ def test_fixed_limit_by_hand():
 def mixed_case() -> tuple[Ranges, np.ndarray]:
     """Epochs of all kinds: clean, one fault, two, three, few satellites, channels without weight."""
     arc = np.linspace(100.0, 1900.0, 120)
-    ranges = oracle.made(arc, "GGGGGGEEEECC", seed=21, tie_sigma_m=(0.0, 1.0, UNTIED_M))
+    ranges = raim_cases.made(arc, "GGGGGGEEEECC", seed=21, tie_sigma_m=(0.0, 1.0, UNTIED_M))
     rng = np.random.default_rng(5)
     code, weight = ranges.code_m.copy(), ranges.weight.copy()
     for t in range(120):
@@ -259,7 +260,7 @@ def mixed_case() -> tuple[Ranges, np.ndarray]:
 
 def test_all_epochs_at_once_is_epoch_by_epoch():
     ranges, arc = mixed_case()
-    model = linear_model(ranges, oracle.LINE, arc)
+    model = linear_model(ranges, raim_cases.LINE, arc)
     scale = np.linspace(0.7, 2.0, len(arc))
     whole = exclude(model, scale=scale)
     assert len(set(whole.outcome.tolist())) >= 5
@@ -273,7 +274,7 @@ def test_all_epochs_at_once_is_epoch_by_epoch():
 
 def test_unused_channels_are_never_named():
     ranges, arc = mixed_case()
-    got = exclude(linear_model(ranges, oracle.LINE, arc), limits=RaimLimits(separation_risk=1.0))
+    got = exclude(linear_model(ranges, raim_cases.LINE, arc), limits=RaimLimits(separation_risk=1.0))
     unused = ranges.weight == 0
     assert not (got.excluded & unused).any()
     assert np.isnan(got.own_error_m[unused]).all()
@@ -292,7 +293,7 @@ def test_order_of_satellites_changes_nothing():
         code_m=ranges.code_m[:, order],
         weight=ranges.weight[:, order],
     )
-    one, two = (exclude(linear_model(r, oracle.LINE, arc)) for r in (ranges, shuffled))
+    one, two = (exclude(linear_model(r, raim_cases.LINE, arc)) for r in (ranges, shuffled))
     assert np.array_equal(one.outcome, two.outcome)
     assert np.array_equal(one.excluded[:, order], two.excluded)
     clear = one.outcome != Outcome.INSEPARABLE  # of equals, the first channel
@@ -301,28 +302,28 @@ def test_order_of_satellites_changes_nothing():
 
 def test_epochs_that_cannot_be_tested():
     arc = np.array([500.0, np.nan, 700.0, 900.0])
-    ranges = oracle.made(np.nan_to_num(arc, nan=500.0), "GGGGGG", seed=5, faults_m={2: 300.0})
+    ranges = raim_cases.made(np.nan_to_num(arc, nan=500.0), "GGGGGG", seed=5, faults_m={2: 300.0})
     weight = ranges.weight.copy()
     weight[2, 2:] = 0.0
     weight[3] = 0.0
-    got = exclude(linear_model(replace(ranges, weight=weight), oracle.LINE, arc))
+    got = exclude(linear_model(replace(ranges, weight=weight), raim_cases.LINE, arc))
     assert got.outcome.tolist() == [Outcome.EXCLUDED_ONE] + [Outcome.UNTESTABLE] * 3
     assert got.position_change_m[1:].tolist() == [[0.0]] * 3
-    nothing = exclude(linear_model(ranges, oracle.LINE, arc).take(np.zeros(4, dtype=bool)))
+    nothing = exclude(linear_model(ranges, raim_cases.LINE, arc).take(np.zeros(4, dtype=bool)))
     assert nothing.excluded.shape == (0, 6)
 
 
 def test_two_faults_of_forty_satellites_are_excluded():
     """Failing epochs, all pairs."""
     arc = np.linspace(50.0, 1950.0, 3000)
-    ranges = oracle.made(arc, "G" * 12 + "E" * 10 + "C" * 10 + "R" * 8, seed=1, faults_m={3: 100.0, 20: -60.0})
-    got = exclude(linear_model(ranges, oracle.LINE, arc))
+    ranges = raim_cases.made(arc, "G" * 12 + "E" * 10 + "C" * 10 + "R" * 8, seed=1, faults_m={3: 100.0, 20: -60.0})
+    got = exclude(linear_model(ranges, raim_cases.LINE, arc))
     assert (got.outcome == Outcome.EXCLUDED_TWO).mean() > 0.95
 
 
 def test_arrays_of_the_caller_are_left_alone():
     ranges, arc = mixed_case()
-    model = linear_model(ranges, oracle.LINE, arc)
+    model = linear_model(ranges, raim_cases.LINE, arc)
     frozen = {f.name: getattr(model, f.name) for f in fields(model)}
     before = {name: np.copy(value) for name, value in frozen.items()}
     for value in frozen.values():

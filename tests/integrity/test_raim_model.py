@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import raim_cases
 import raim_oracle as oracle
 import synthetic
 from railfix import kernels
@@ -16,7 +17,7 @@ from railfix.integrity.raim import linear_model
 from railfix.integrity.raim.model import _model, compact
 from railfix.positioning.normal_equations import point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases
-from raim_oracle import point_model
+from raim_cases import point_model
 
 pytestmark = pytest.mark.requirement("B6")
 
@@ -37,14 +38,14 @@ CASES = [
 def test_model_is_the_solvers_own(systems, ties):
     """WSSE and sigma of the constrained position and of the 3-D one."""
     arc = np.linspace(100.0, 1900.0, 30)
-    ranges = oracle.made(arc, systems, seed=4, tie_sigma_m=ties)
-    got, model = oracle.solved(ranges, arc)
+    ranges = raim_cases.made(arc, systems, seed=4, tie_sigma_m=ties)
+    got, model = raim_cases.solved(ranges, arc)
     assert model.wsse == pytest.approx(got.wsse, rel=1e-4, abs=1e-4)
     assert np.sqrt(model.covariance_m2[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-6)
     assert np.sqrt(model.position_covariance_m2(np.ones(30))[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-6)
     assert (model.freedom == ranges.n_used - ranges.n_clocks - 1).all()
 
-    point = point_position(ranges, np.broadcast_to(oracle.LINE.ecef_m[0], (30, 3)))
+    point = point_position(ranges, np.broadcast_to(raim_cases.LINE.ecef_m[0], (30, 3)))
     model = point_model(ranges, point.ecef_m)
     solved = np.isfinite(point.wsse)
     assert solved.all() == (len(systems) > 3 + ranges.n_clocks[0] - 1)
@@ -58,14 +59,17 @@ def test_model_is_the_solvers_own(systems, ties):
 def test_model_is_least_squares_with_all_columns(seed, case, space):
     systems, ties = case
     arc = np.array([731.0])
-    ranges = oracle.made(arc, systems, seed=seed, tie_sigma_m=ties)
+    ranges = raim_cases.made(arc, systems, seed=seed, tie_sigma_m=ties)
     if space:
-        place = oracle.LINE.at_arc(arc) + 0.3
+        place = raim_cases.LINE.at_arc(arc) + 0.3
         model, full = point_model(ranges, place), oracle.problem_in_space(ranges, 0, place[0])
         if full.freedom < 0:
             return
     else:
-        model, full = linear_model(ranges, oracle.LINE, arc), oracle.problem_on_line(ranges, 0, arc[0])
+        model, full = (
+            linear_model(ranges, raim_cases.LINE, arc),
+            oracle.problem_on_line(ranges, 0, arc[0], raim_cases.LINE),
+        )
     step, cofactors, residual = full.solve()
     covariance = cofactors[:3, :3] * np.outer(full.scale_of[:3], full.scale_of[:3])
     size = float(np.sqrt(np.trace(covariance)))
@@ -80,8 +84,8 @@ def test_model_is_least_squares_with_all_columns(seed, case, space):
 def test_projector_gives_residuals_and_redundancy(systems, ties):
     """nu = S y, its diagonal the redundancy; the redundancies add up to the degrees of freedom, priors apart."""
     arc = np.linspace(100.0, 1900.0, 20)
-    ranges = oracle.made(arc, systems, seed=8, tie_sigma_m=ties)
-    for model in (linear_model(ranges, oracle.LINE, arc), point_model(ranges, oracle.LINE.at_arc(arc))):
+    ranges = raim_cases.made(arc, systems, seed=8, tie_sigma_m=ties)
+    for model in (linear_model(ranges, raim_cases.LINE, arc), point_model(ranges, raim_cases.LINE.at_arc(arc))):
         if model.freedom[0] < 0:
             continue
         parts = compact(model)
@@ -97,8 +101,8 @@ def test_map_error_is_carried_once_and_not_scaled():
     arc = np.full(20_000, 731.0)
     sat = np.broadcast_to(synthetic.satellites(np.random.default_rng(2), 1, "GGGGG"), (20_000, 5, 3))
     sigma = np.array([0.4, 0.5, 0.3, 0.6, 0.5])
-    ranges = oracle.made(arc, "GGGGG", seed=2, noise=3.0, sat_ecef_m=sat.copy(), sigma_m=sigma)
-    got, model = oracle.solved(ranges, arc)
+    ranges = raim_cases.made(arc, "GGGGG", seed=2, noise=3.0, sat_ecef_m=sat.copy(), sigma_m=sigma)
+    got, model = raim_cases.solved(ranges, arc)
     expected = model.position_covariance_m2(np.full(len(arc), 3.0))[0, 0, 0] ** 0.5
     assert np.std(got.arc_m - arc) == pytest.approx(expected, rel=0.02)
     assert expected < 2.95 * got.sigma_m[0]
@@ -106,16 +110,16 @@ def test_map_error_is_carried_once_and_not_scaled():
 
 def test_unused_channels_leave_no_trace():
     arc = np.linspace(100.0, 1900.0, 10)
-    whole = oracle.made(arc, "GGGGGEEEE", seed=5)
-    part = oracle.only(whole, [0, 1, 3, 4, 6, 8])
+    whole = raim_cases.made(arc, "GGGGGEEEE", seed=5)
+    part = raim_cases.only(whole, [0, 1, 3, 4, 6, 8])
     code = part.code_m.copy()
     code[:, [2, 5, 7]] = 0.0
-    model, other = (linear_model(r, oracle.LINE, arc) for r in (part, replace(part, code_m=code)))
+    model, other = (linear_model(r, raim_cases.LINE, arc) for r in (part, replace(part, code_m=code)))
     assert np.array_equal(model.residual, other.residual)
     assert (model.residual[:, [2, 5, 7]] == 0).all()
     assert (model.redundancy[:, [2, 5, 7]] == 0).all()
     assert np.isnan(model.sigma_m[:, [2, 5, 7]]).all()
-    _, _, rows, _ = kernels.ranges.reduced_equations(part.arrays, oracle.LINE.at_arc(arc))
+    _, _, rows, _ = kernels.ranges.reduced_equations(part.arrays, raim_cases.LINE.at_arc(arc))
     assert (rows[:, :, [2, 5, 7]] == 0).all()
     parts = compact(model)
     assert parts.projector.shape == (10, 6, 6)
@@ -124,10 +128,10 @@ def test_unused_channels_leave_no_trace():
 
 def test_epochs_without_a_position_are_nan():
     arc = np.array([500.0, np.nan, 700.0])
-    ranges = oracle.made(np.full(3, 500.0), "GGGGGG", seed=5)
+    ranges = raim_cases.made(np.full(3, 500.0), "GGGGGG", seed=5)
     for model in (
-        linear_model(ranges, oracle.LINE, arc, section=np.array([25, -1, 35])),
-        point_model(ranges, oracle.LINE.at_arc(arc)),
+        linear_model(ranges, raim_cases.LINE, arc, section=np.array([25, -1, 35])),
+        point_model(ranges, raim_cases.LINE.at_arc(arc)),
     ):
         assert np.isnan(model.wsse).tolist() == [False, True, False]
         assert np.isnan(model.covariance_m2[1]).all()
@@ -146,17 +150,17 @@ def test_section_of_a_shared_point():
 
 def test_ties_of_some_epochs_go_with_them():
     arc = np.linspace(100.0, 1900.0, 6)
-    ranges = oracle.made(arc, "GGGEEE", seed=1)
+    ranges = raim_cases.made(arc, "GGGEEE", seed=1)
     sigma = np.tile([0.0, 1.0], (6, 1))
     sigma[3:, 1] = UNTIED_M
     tied = replace(ranges, ties=InterSystemBiases(offset_m=np.zeros((6, 2)), sigma_m=sigma))
-    got = position_on_line(tied, oracle.LINE, np.argmin(np.abs(oracle.LINE.arc_m - arc[:, None]), axis=1))
-    model = linear_model(tied, oracle.LINE, got.arc_m)
+    got = position_on_line(tied, raim_cases.LINE, np.argmin(np.abs(raim_cases.LINE.arc_m - arc[:, None]), axis=1))
+    model = linear_model(tied, raim_cases.LINE, got.arc_m)
     assert model.freedom.tolist() == [4, 4, 4, 3, 3, 3]
     assert np.array_equal(model.take(np.array([4, 1])).wsse, model.wsse[[4, 1]])
     for t in range(6):
         own = tied.take(np.array([t]))
-        alone = linear_model(own, oracle.LINE, got.arc_m[t : t + 1])
+        alone = linear_model(own, raim_cases.LINE, got.arc_m[t : t + 1])
         for name in ("clock_covariance_m2", "covariance_m2", "misfit", "residual", "redundancy"):
             np.testing.assert_allclose(getattr(model, name)[t], getattr(alone, name)[0], atol=1e-12, err_msg=name)
 
@@ -164,8 +168,8 @@ def test_ties_of_some_epochs_go_with_them():
 def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
     """The inverse does not depend on the unit of an axis; two axes that are one are singular."""
     arc = np.array([731.0])
-    ranges = oracle.made(arc, "GGGGGG", seed=3, sigma_m=np.full(6, 1e4))
-    place, axes = oracle.LINE.at_arc(arc), oracle.LINE.get_axes(oracle.LINE.segment_at(arc)[0])
+    ranges = raim_cases.made(arc, "GGGGGG", seed=3, sigma_m=np.full(6, 1e4))
+    place, axes = raim_cases.LINE.at_arc(arc), raim_cases.LINE.get_axes(raim_cases.LINE.segment_at(arc)[0])
     exact = _model(ranges, place, axes, np.diag([0.0, 1e8, 1e8]), unknowns=1)
     assert exact.covariance_m2[0, 1, 1] == pytest.approx(1e-8, rel=1e-6)
     information = (exact.design[0, :, 0] ** 2).sum()
@@ -177,13 +181,13 @@ def test_a_map_of_a_millimetre_beside_a_place_known_to_kilometres():
 def test_epochs_of_another_model_are_put_in_whole():
     """Ranges without one satellite of each system at some epochs: every field is that of the epoch's own ranges."""
     arc = np.linspace(100.0, 1900.0, 8)
-    ranges = oracle.made(arc, "GGGGEEEE", seed=5, tie_sigma_m=(0.0, 1.0))
+    ranges = raim_cases.made(arc, "GGGGEEEE", seed=5, tie_sigma_m=(0.0, 1.0))
     weight = ranges.weight.copy()
     weight[[2, 5], 1] = weight[[2, 5], 6] = 0.0
     fewer, rows = replace(ranges, weight=weight), np.array([2, 5])
-    whole = linear_model(fewer, oracle.LINE, arc)
-    before = linear_model(ranges, oracle.LINE, arc)
-    patched = before.patch(rows, linear_model(fewer.take(rows), oracle.LINE, arc[rows]))
+    whole = linear_model(fewer, raim_cases.LINE, arc)
+    before = linear_model(ranges, raim_cases.LINE, arc)
+    patched = before.patch(rows, linear_model(fewer.take(rows), raim_cases.LINE, arc[rows]))
     for item in fields(whole):
         found, expected = getattr(patched, item.name), getattr(whole, item.name)
         if isinstance(expected, np.ndarray):

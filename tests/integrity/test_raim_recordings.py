@@ -27,7 +27,7 @@ from railfix.positioning.normal_equations import Constrained, position_on_line
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.channels import clock_groups
 from railfix.track.trajectory import Trajectory
-from raim_oracle import point_model
+from raim_cases import point_model
 from recordings_score import geonet
 
 pytestmark = pytest.mark.requirement("B6")

@@ -11,11 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom, chi2, ncx2, norm
 
+import raim_cases
 import raim_oracle as oracle
 import synthetic
 from railfix.integrity.raim import RaimLimits, detect, linear_model, noncentrality, reliability
 from railfix.positioning.range_arrays import UNTIED_M
-from raim_oracle import point_model
+from raim_cases import point_model
 
 pytestmark = pytest.mark.requirement("B6")
 
@@ -63,11 +64,11 @@ def test_minimal_detectable_bias_is_missed_as_stated(systems, ties, channel):
     many = np.repeat(sat, epochs, axis=0)
     sigma = np.linspace(0.8, 2.0, len(systems))
     for scale in (1.0, 2.0):
-        probe = oracle.made(ARC, systems, seed=1, tie_sigma_m=ties, sat_ecef_m=sat, sigma_m=sigma)
-        model = linear_model(probe, oracle.LINE, ARC)
+        probe = raim_cases.made(ARC, systems, seed=1, tie_sigma_m=ties, sat_ecef_m=sat, sigma_m=sigma)
+        model = linear_model(probe, raim_cases.LINE, ARC)
         bias = reliability(model, limits=limits, scale=scale).minimal_detectable_bias_m[0, channel]
         assert 1.0 < bias < 100.0
-        ranges = oracle.made(
+        ranges = raim_cases.made(
             arc,
             systems,
             seed=3,
@@ -77,7 +78,7 @@ def test_minimal_detectable_bias_is_missed_as_stated(systems, ties, channel):
             sat_ecef_m=many,
             sigma_m=sigma,
         )
-        got, line = oracle.solved(ranges, arc)
+        got, line = raim_cases.solved(ranges, arc)
         verdict = detect(got.wsse, got.residual_m, line.freedom, limits=limits, scale=scale)
         low, high = binom.interval(0.9999, epochs, 0.1)
         slack = 0 if scale == 1.0 else 0.03 * epochs  # the map error does not grow with the noise
@@ -124,12 +125,15 @@ def worst_pair(case: oracle.Problem, noncentral: float) -> float:
 @given(seed=st.integers(0, 2**32 - 1), system=st.sampled_from(SYSTEMS), space=st.booleans())
 @settings(max_examples=40)
 def test_protection_level_is_the_worst_fault_found_by_search(seed, system, space):
-    ranges = oracle.made(ARC, system[0], seed=seed, tie_sigma_m=system[1])
-    place = oracle.LINE.at_arc(ARC)
+    ranges = raim_cases.made(ARC, system[0], seed=seed, tie_sigma_m=system[1])
+    place = raim_cases.LINE.at_arc(ARC)
     if space:
         model, case = point_model(ranges, place), oracle.problem_in_space(ranges, 0, place[0])
     else:
-        model, case = linear_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+        model, case = (
+            linear_model(ranges, raim_cases.LINE, ARC),
+            oracle.problem_on_line(ranges, 0, ARC[0], raim_cases.LINE),
+        )
     if case.freedom < 1 or not np.isfinite(model.wsse[0]):
         return
     value = float(noncentrality(case.freedom))
@@ -153,12 +157,12 @@ def test_a_fault_of_the_protection_level_moves_the_position_by_it():
     """Not in the linear model: ranges with the worst fault, solved again, without noise."""
     sat = synthetic.satellites(np.random.default_rng(9), 1, "GGGGEEE")
     sigma = np.full(7, 1.0)
-    clean = oracle.made(ARC, "GGGGEEE", seed=1, sat_ecef_m=sat, sigma_m=sigma, noise=0.0)
-    got, model = oracle.solved(clean, ARC)
+    clean = raim_cases.made(ARC, "GGGGEEE", seed=1, sat_ecef_m=sat, sigma_m=sigma, noise=0.0)
+    got, model = raim_cases.solved(clean, ARC)
     level = reliability(model)
     code = clean.code_m.copy()
     code[0, level.worst[0]] += level.minimal_detectable_bias_m[0, level.worst[0]]
-    moved, after = oracle.solved(replace(clean, code_m=code), ARC)
+    moved, after = raim_cases.solved(replace(clean, code_m=code), ARC)
     assert abs(moved.arc_m[0] - got.arc_m[0]) == pytest.approx(level.fault_level_m[0], rel=1e-3)
     assert after.wsse[0] == pytest.approx(level.noncentrality[0], rel=0.05)
 
@@ -169,12 +173,12 @@ def test_error_beyond_the_level_and_undetected_is_rarer_than_missed_detection():
     sat = synthetic.satellites(np.random.default_rng(12), 1, "GGGGG")
     sigma = np.array([1.0, 1.5, 0.7, 2.0, 1.0])
     arc = np.full(epochs, ARC[0])
-    probe = oracle.made(ARC, "GGGGG", seed=1, sat_ecef_m=sat, sigma_m=sigma)
-    level = reliability(linear_model(probe, oracle.LINE, ARC), limits=limits)
+    probe = raim_cases.made(ARC, "GGGGG", seed=1, sat_ecef_m=sat, sigma_m=sigma)
+    level = reliability(linear_model(probe, raim_cases.LINE, ARC), limits=limits)
     worst = int(level.worst[0])
     hazard = []
     for share in (0.6, 0.8, 1.0, 1.2, 1.5):
-        ranges = oracle.made(
+        ranges = raim_cases.made(
             arc,
             "GGGGG",
             seed=5,
@@ -182,7 +186,7 @@ def test_error_beyond_the_level_and_undetected_is_rarer_than_missed_detection():
             sat_ecef_m=np.repeat(sat, epochs, axis=0),
             sigma_m=sigma,
         )
-        got, line = oracle.solved(ranges, arc)
+        got, line = raim_cases.solved(ranges, arc)
         missed = ~detect(got.wsse, got.residual_m, line.freedom, limits=limits).detected
         hazard.append(np.mean(missed & (np.abs(got.arc_m - arc) > level.protection_level_m[0])))
     assert max(hazard) < 0.05
@@ -194,17 +198,17 @@ def test_noise_level():
     epochs = 20_000
     sat = np.repeat(synthetic.satellites(np.random.default_rng(3), 1, "GGGGGG"), epochs, axis=0)
     arc = np.full(epochs, ARC[0])
-    ranges = oracle.made(arc, "GGGGGG", seed=6, sat_ecef_m=sat, sigma_m=np.full(6, 1.0))
+    ranges = raim_cases.made(arc, "GGGGGG", seed=6, sat_ecef_m=sat, sigma_m=np.full(6, 1.0))
     limits = RaimLimits(noise_risk=0.05)
-    got, model = oracle.solved(ranges, arc)
+    got, model = raim_cases.solved(ranges, arc)
     level = reliability(model, limits=limits)
     beyond = int((np.abs(got.arc_m - arc) > level.noise_level_m).sum())
     low, high = binom.interval(0.9999, epochs, 0.05)
     assert low <= beyond <= high
     assert level.noise_level_m[0] == pytest.approx(1.959964 * got.sigma_m[0], rel=1e-6)
 
-    exact = oracle.made(ARC, "GGGGGG", seed=6, sat_ecef_m=sat[:1], sigma_m=np.full(6, 1.0), noise=0.0)
-    space = point_model(exact, oracle.LINE.at_arc(ARC))
+    exact = raim_cases.made(ARC, "GGGGGG", seed=6, sat_ecef_m=sat[:1], sigma_m=np.full(6, 1.0), noise=0.0)
+    space = point_model(exact, raim_cases.LINE.at_arc(ARC))
     level = reliability(space, limits=limits)
     draws = np.random.default_rng(8).normal(size=(epochs, 6))
     beyond = int((np.linalg.norm(draws @ space.gain_m[0], axis=1) > level.noise_level_m[0]).sum())
@@ -224,8 +228,8 @@ def test_noise_level():
     ],
 )
 def test_availability(channels, level, available):
-    ranges = oracle.only(oracle.made(ARC, "GGGGEEC", seed=3), channels)
-    got = reliability(linear_model(ranges, oracle.LINE, ARC), limits=RaimLimits(alarm_limit_m=1e5))
+    ranges = raim_cases.only(raim_cases.made(ARC, "GGGGEEC", seed=3), channels)
+    got = reliability(linear_model(ranges, raim_cases.LINE, ARC), limits=RaimLimits(alarm_limit_m=1e5))
     value = got.protection_level_m[0]
     assert {"finite": np.isfinite(value), "infinite": np.isposinf(value), "nan": np.isnan(value)}[level]
     assert bool(got.available[0]) is available
@@ -237,41 +241,43 @@ def test_availability(channels, level, available):
 
 
 def test_lone_satellite_of_a_clock():
-    got = reliability(linear_model(oracle.only(oracle.made(ARC, "GGGGEEC", seed=3), [0, 1, 2, 3, 6]), oracle.LINE, ARC))
+    got = reliability(
+        linear_model(raim_cases.only(raim_cases.made(ARC, "GGGGEEC", seed=3), [0, 1, 2, 3, 6]), raim_cases.LINE, ARC)
+    )
     assert np.isposinf(got.minimal_detectable_bias_m[0, 6])
     assert got.slope_m[0, 6] == 0.0
     # Known clock: the satellite is checked, and counts.
-    tied = oracle.only(oracle.made(ARC, "GGGGEEC", seed=3, tie_sigma_m=(0.0, 1.0, 1.0)), [0, 1, 2, 3, 6])
-    got = reliability(linear_model(tied, oracle.LINE, ARC))
+    tied = raim_cases.only(raim_cases.made(ARC, "GGGGEEC", seed=3, tie_sigma_m=(0.0, 1.0, 1.0)), [0, 1, 2, 3, 6])
+    got = reliability(linear_model(tied, raim_cases.LINE, ARC))
     assert np.isfinite(got.minimal_detectable_bias_m[0, 6])
     assert got.slope_m[0, 6] > 0.0
 
 
 def test_pair_that_hides_a_fault():
     """Two satellites in error in the proportion that another place or clock would show."""
-    ranges = oracle.made(ARC, "GGG", seed=3)
+    ranges = raim_cases.made(ARC, "GGG", seed=3)
     one, two = (
-        reliability(linear_model(ranges, oracle.LINE, ARC), limits=RaimLimits(faults=k, alarm_limit_m=1e6))
+        reliability(linear_model(ranges, raim_cases.LINE, ARC), limits=RaimLimits(faults=k, alarm_limit_m=1e6))
         for k in (1, 2)
     )
     assert one.available[0]
     assert np.isposinf(two.protection_level_m[0])  # one degree of freedom cannot see two
     assert two.alarm[0]
     # The two satellites of a clock of their own hide a common error, which moves nothing.
-    ranges = oracle.made(ARC, "GGGGGGEE", seed=3)
-    two = reliability(linear_model(ranges, oracle.LINE, ARC), limits=RaimLimits(faults=2))
+    ranges = raim_cases.made(ARC, "GGGGGGEE", seed=3)
+    two = reliability(linear_model(ranges, raim_cases.LINE, ARC), limits=RaimLimits(faults=2))
     assert two.available[0]
 
 
 def test_alarm_truth_table():
-    model = linear_model(oracle.made(ARC, "GGGGGG", seed=3), oracle.LINE, ARC)
+    model = linear_model(raim_cases.made(ARC, "GGGGGG", seed=3), raim_cases.LINE, ARC)
     level = float(reliability(model).protection_level_m[0])
     for limit, alarm in ((level, False), (np.nextafter(level, 0.0), True), (level / 2, True), (2 * level, False)):
         assert bool(reliability(model, limits=RaimLimits(alarm_limit_m=limit)).alarm[0]) is alarm
 
 
 def test_scale_multiplies_what_the_noise_does():
-    model = linear_model(oracle.made(ARC, "GGGGGEE", seed=3), oracle.LINE, ARC)
+    model = linear_model(raim_cases.made(ARC, "GGGGGEE", seed=3), raim_cases.LINE, ARC)
     one, three = reliability(model), reliability(model, scale=3.0)
     for name in ("minimal_detectable_bias_m", "slope_m", "fault_level_m"):
         assert getattr(three, name) == pytest.approx(3.0 * getattr(one, name), rel=1e-9)
@@ -280,7 +286,7 @@ def test_scale_multiplies_what_the_noise_does():
 
 def test_all_epochs_at_once_is_epoch_by_epoch_in_any_order_of_satellites():
     arc = np.linspace(100.0, 1900.0, 60)
-    ranges = oracle.made(arc, "GGGGGEEEECC", seed=5)
+    ranges = raim_cases.made(arc, "GGGGGEEEECC", seed=5)
     rng, weight = np.random.default_rng(4), ranges.weight.copy()
     for t in range(60):
         weight[t, rng.choice(11, t % 10, replace=False)] = 0.0
@@ -291,7 +297,7 @@ def test_all_epochs_at_once_is_epoch_by_epoch_in_any_order_of_satellites():
         ranges, sat_ecef_m=ranges.sat_ecef_m[:, order], code_m=ranges.code_m[:, order], weight=weight[:, order]
     )
     limits = RaimLimits(faults=2)
-    models = [linear_model(r, oracle.LINE, arc) for r in (ranges, shuffled)]
+    models = [linear_model(r, raim_cases.LINE, arc) for r in (ranges, shuffled)]
     whole, other = (reliability(m, limits=limits) for m in models)
     rows = [reliability(models[0].take(np.array([t])), limits=limits) for t in range(60)]
     for item in fields(whole):

@@ -298,7 +298,7 @@ def test_a_restarted_receiver_and_repeated_messages(recordings: Path) -> None:
     whole, _ = in_fragments(data, [])
     twice, _ = in_fragments(data + data, [])
     assert np.array_equal(whole.time, twice.time)
-    assert twice.skipped["epochs not after the one before"] == len(whole)
+    assert twice.skipped["epochs not after the previous one"] == len(whole)
 
 
 def pieces_of(path: Path, epochs: int) -> Iterator[Observations]:
@@ -453,11 +453,15 @@ def test_time_of_week_beyond_the_week_is_broken() -> None:
 
 def test_observations_of_old_kinds_are_named(tmp_path: Path) -> None:
     """RTCM 3 before the multiple signal messages, and u-blox before the M8."""
-    body = (1004 << 4).to_bytes(2, "big") + bytes(20)
-    rtcm = b"\xd3" + len(body).to_bytes(2, "big") + body
-    rtcm += int(crc24q(np.frombuffer(rtcm, np.uint8), np.array([0]), np.array([len(rtcm)]))[0]).to_bytes(3, "big")
-    (tmp_path / "old.log").write_bytes(2 * rtcm + ubx_frame(0x0210, bytes(8)))
-    with pytest.raises(InputFileError, match=r"its RTCM 1004 \(2\), UBX RXM-RAW \(1\) are of kinds that are not read"):
+    log = ubx_frame(0x0210, bytes(8))
+    for number in (1004, 1004, 1083):  # the last is MSM3, without whole pseudoranges
+        body = (number << 4).to_bytes(2, "big") + bytes(20)
+        rtcm = b"\xd3" + len(body).to_bytes(2, "big") + body
+        log += rtcm
+        log += int(crc24q(np.frombuffer(rtcm, np.uint8), np.array([0]), np.array([len(rtcm)]))[0]).to_bytes(3, "big")
+    (tmp_path / "old.log").write_bytes(log)
+    has = r"its RTCM 1004 \(2\), RTCM 1083 \(1\), UBX RXM-RAW \(1\) are of unsupported kinds"
+    with pytest.raises(InputFileError, match=has):
         railfix.read_observations(tmp_path / "old.log")
 
 

@@ -195,8 +195,10 @@ def test_other_decimals_are_read_as_they_stand(tmp_path: Path) -> None:
     assert found == [20000000.5, 20000001.0, 45.0, -12345678.9012]
 
 
-def test_scale_factor_is_applied_and_rounded_once(tmp_path: Path) -> None:
-    extra = [record("G  100   2 L1C D1C", "SYS / SCALE FACTOR"), record("E   10", "SYS / SCALE FACTOR")]
+@pytest.mark.parametrize("column", ["", " "], ids=["in its columns", "a column off"])
+def test_scale_factor_is_applied_and_rounded_once(tmp_path: Path, column: str) -> None:
+    words = (f"{column}G  100   2 L1C D1C", f"{column}E   10")
+    extra = [record(text, "SYS / SCALE FACTOR") for text in words]
     types = ("C1C", "L1C", "D1C", "S1C")
     lines = header_3({"G": types, "E": types}, extra=extra)
     values = [field(20000000.123), field(123456789.123), field(12345.678), field(45.125)]
@@ -208,6 +210,7 @@ def test_scale_factor_is_applied_and_rounded_once(tmp_path: Path) -> None:
     assert observations.phase_cycles[0, g] == 1234567.89123
     assert observations.doppler_hz[0, g] == 123.45678
     assert observations.cn0_dbhz[0, e] == 4.5125
+    assert len(observations.problems) == 2 * len(column)
 
 
 @pytest.mark.parametrize(

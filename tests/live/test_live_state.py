@@ -108,7 +108,7 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
         "damaged": (kept[:-1], [], None, "is damaged or cut off"),
         "changed": (kept[:-1] + bytes([kept[-1] ^ 1]), [], None, "is damaged or cut off"),
         "empty": (b"", [], None, "is no state file of this version"),
-        "older": (kept.replace(b"live state 4", b"live state 3", 1), [], None, "is no state file of this version"),
+        "older": (kept.replace(b"live state 5", b"live state 4", 1), [], None, "is no state file of this version"),
     }
     for name, (content, words, track, says) in cases.items():
         path.write_bytes(content)
@@ -218,7 +218,7 @@ def test_only_values_of_the_package_are_read(tmp_path: Path, content: bytes, cap
     saved = SavedSession(engine=EngineState(state=State(), done_ns=1, last_tag={}, sequence=1), streams={})
     write_state(path, saved, under)
     assert load_state(path, under).session == saved
-    head = {"form": "railfix live state 4", **under, "bytes": len(content)}
+    head = {"form": "railfix live state 5", **under, "bytes": len(content)}
     head["sha256"] = hashlib.sha256(content).hexdigest()
     path.write_bytes(json.dumps(head).encode() + b"\n" + content)
     loaded = load_state(path, under)

@@ -7,11 +7,15 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from scipy.integrate import cumulative_simpson
 from typer.testing import CliRunner
 
 from railfix.cli import app
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.motion.features import LineSeries, LocatedFeature, line_series, locate, map_features
 from railfix.simulate.demonstration import demo_inputs
+from railfix.track import Track
+from railfix.track.curves import curved_line
 from tracking_cases import bent_line
 
 NOISE = (2e-4, 1e-4)
@@ -128,6 +132,35 @@ def test_features_of_a_map_are_where_the_line_bends() -> None:
     found = [f for f in map_features(series) if f.quantity == "curvature"]
     assert min(abs(f.arc_m - 500.0) for f in found) < 20.0
     assert min(abs(f.arc_m - 1000.0) for f in found) < 20.0
+
+
+@pytest.mark.requirement("E3")
+@pytest.mark.parametrize("spacing_m", [2.0, 5.0, 10.0, 20.0])
+@pytest.mark.parametrize("start_m", [0.0, 3.0, 7.0])
+@pytest.mark.parametrize("radii", ["of the map", "none"])
+def test_features_are_the_same_at_any_spacing_of_the_map(spacing_m: float, start_m: float, radii: str) -> None:
+    """Four transitions of 60 m between straight and radii of 300 m, and three vertical curves of 15 to 60 m."""
+    breaks = np.array([0.0, 120.0, 180.0, 300.0, 360.0, 480.0, 540.0, 660.0, 720.0, 840.0])
+    bends = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]) / 300.0
+    grid = np.linspace(0.0, 840.0, 84_001)
+    heading = cumulative_simpson(np.interp(grid, breaks, bends), x=grid, initial=0.0)
+    gradient = np.interp(
+        grid, [0.0, 195.0, 225.0, 330.0, 345.0, 570.0, 630.0], np.array([2, 2, 12, 12, 4, 4, -11]) / 1e3
+    )
+    s = np.arange(start_m, 840.0, spacing_m)
+    rates = (np.cos(heading), -np.sin(heading), gradient)  # east, north, up: a right curve
+    points = np.stack([np.interp(s, grid, cumulative_simpson(rate, x=grid, initial=0.0)) for rate in rates], axis=-1)
+    with np.errstate(divide="ignore"):
+        radius = 1.0 / np.interp(s, breaks, bends)
+    track = Track.from_ecef(
+        ecef_from_geodetic(47.0, 8.0, 400.0) + points @ enu_axes(47.0, 8.0),
+        cant_m=np.zeros(len(s)), radius_m=radius if radii == "of the map" else np.full(len(s), np.nan),
+    )  # fmt: skip
+    found = map_features(line_series(curved_line(track)))
+    expected = [(150, "c"), (210, "g"), (330, "c"), (337.5, "g"), (510, "c"), (600, "g"), (690, "c")]
+    assert [feature.quantity[0] for feature in found] == [kind for _, kind in expected]
+    assert [feature.arc_m + start_m for feature in found] == pytest.approx([at for at, _ in expected], abs=3.0)
+    assert [np.sign(f.change) for f in found if f.quantity == "curvature"] == [1.0, -1.0, 1.0, -1.0]
 
 
 @pytest.mark.requirement("E3")

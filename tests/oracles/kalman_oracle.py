@@ -2,7 +2,7 @@
 
 One hypothesis, normal errors, a straight line, satellites at rest, clocks of GPS and Galileo. The design comes from
 differences of ranges; prediction, update and smoother are filterpy's (R. Labbe, https://github.com/rlabbe/filterpy).
-The recursion under test shares only the noise of Singer's model, which `test_singer` compares with an integral.
+The figures of the model are those of docs/filter-equations.md, written again; Singer's noise is the integral.
 """
 
 from __future__ import annotations
@@ -12,33 +12,38 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.kalman import KalmanFilter, rts_smoother
 
-from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.kernels.tracking.constants import (
-    CLOCK_WALK_MPS,
-    CODE_CORRELATION_M,
-    CODE_CORRELATION_S,
-    DOPPLER_CORRELATION_S,
-    DOPPLER_ERROR_MPS,
-    DOPPLER_ERROR_SHARE,
-    MAP_ABSOLUTE_M,
-    MAP_CORRELATION_M,
-    MAP_ROUGHNESS_M,
-    MAP_SCALE_M,
-    OFFSET_PRIOR_M,
-    OFFSET_WALK_M,
-    PHASE_WALK_M,
-    SLOW_CODE_S,
-    START_SIGMA_M,
-)
-from railfix.motion.singer import singer_steps
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, TrackingLimits
 
 #: Unknowns: arc length, speed, acceleration, arc length before, change of the phases' clock, its drift, map right and
 #: up, clock of the codes, displacement of the map right, up and along, wheel, error of the Dopplers, of the codes'
 #: place, offsets of the two constellations from that clock; then one error a satellite.
 S, V, A, S0, B, D, MR, MU, CLOCK, QR, QU, QA, WHEEL, W, Z, GPS, GALILEO, X = range(18)
+#: The earth's rotation [rad/s] over the speed of light [m/s].
+TURN_PER_M = 7.2921151467e-5 / 299_792_458.0
+#: Clocks: random walk of a drift [m/s per square root of s]; offset of two constellations: at first [m], walk.
+CLOCK_WALK_MPS, OFFSET_PRIOR_M, OFFSET_WALK_M = 0.5, 30.0, 0.02
+#: Slow errors: of each code, of all codes' place [s], of Dopplers, at rest [m/s] and per speed; walk of the phases.
+CODE_CORRELATION_S, CODE_CORRELATION_M, SLOW_CODE_S = 60.0, 100.0, 7200.0
+DOPPLER_ERROR_MPS, DOPPLER_ERROR_SHARE, DOPPLER_CORRELATION_S, PHASE_WALK_M = 0.01, 0.02, 10.0, 0.03
+#: The map: roughness [m] and its length [m], lengths [m per square root of m], its offset's length [m].
+MAP_ROUGHNESS_M, MAP_CORRELATION_M, MAP_SCALE_M, MAP_ABSOLUTE_M = 0.3, 50.0, 0.03, 500.0
+START_SIGMA_M = 30.0
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 #: The step of the differences [m]; a new linearisation where the place moves by more than this [m].
 STEP_M, MOVED_M = 10.0, 2.0
+
+
+def response(dt: np.ndarray, tau_s: float) -> np.ndarray:
+    """Position, speed and acceleration a while after an impulse of the acceleration, shape (3, K)."""
+    x = dt / tau_s
+    return np.stack([tau_s**2 * (x + np.expm1(-x)), -tau_s * np.expm1(-x), np.exp(-x)])
+
+
+def singer(dt: float, sigma_mps2: float, tau_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Transition, and the integral of the noise over the responses to it."""
+    step = np.column_stack([[1.0, 0.0, 0.0], [dt, 1.0, 0.0], response(np.array([dt]), tau_s)[:, 0]])
+    inside = response(0.5 * dt * (_NODES + 1.0), tau_s)
+    return step, 2.0 * sigma_mps2**2 / tau_s * (inside * (0.5 * dt * _WEIGHTS)) @ inside.T
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,7 @@ class Oracle:
     def turned(self, t: int, place: np.ndarray) -> np.ndarray:
         """What the earth turns while the signals fly."""
         sat = self.epochs.sat_ecef_m[t]
-        return EARTH_ROTATION_RATE / SPEED_OF_LIGHT * (sat[:, 0] * place[1] - sat[:, 1] * place[0])
+        return TURN_PER_M * (sat[:, 0] * place[1] - sat[:, 1] * place[0])
 
     def distance(self, t: int, arc_m: float) -> np.ndarray:
         place = self.place(arc_m)
@@ -108,14 +113,14 @@ class Oracle:
         """Transition and noise over an interval from a state."""
         limits, speed, size = self.limits, abs(mean[V]), len(mean)
         travel = speed * dt
-        step, singer = singer_steps(np.array([dt]), limits.acceleration_mps2, limits.acceleration_s)
+        step, walked = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
         kept = np.ones(size)
         kept[[B, CLOCK, QR, QU, QA]] = 0.0
         kept[[MR, MU]] = np.exp(-travel / MAP_ABSOLUTE_M)
         kept[[W, Z]] = np.exp(-dt / np.array([DOPPLER_CORRELATION_S, SLOW_CODE_S]))
         kept[X:] = np.exp(-dt / CODE_CORRELATION_S - travel / CODE_CORRELATION_M)
         transition = np.diag(kept)
-        transition[:3, :3] = step[0]
+        transition[:3, :3] = step
         transition[S0] = 0.0
         transition[S0, S] = 1.0
         transition[B, D] = dt
@@ -131,7 +136,7 @@ class Oracle:
         rough = 2.0 * MAP_ROUGHNESS_M**2 * (1.0 - np.exp(-travel / MAP_CORRELATION_M))
         variance[[QR, QU, QA]] = rough + 1e-8, rough + 1e-8, length + 1e-8
         noise = np.diag(variance)
-        noise[:3, :3] += singer[0]
+        noise[:3, :3] += walked
         noise[[S, V], [S, V]] += least
         noise[S, S] += length
         noise[S, QA] = noise[QA, S] = -length

@@ -7,17 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.timescale import to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
 rtk = pytest.importorskip("pyrtklib5", reason="pyrtklib5 (the oracle) is not installed")
 _SYSTEMS = {"G": rtk.SYS_GPS, "J": rtk.SYS_QZS, "E": rtk.SYS_GAL, "C": rtk.SYS_CMP, "R": rtk.SYS_GLO}
 
 
+def week_and_second(time: np.datetime64) -> tuple[int, float]:
+    """Week of GPS time, and seconds of it."""
+    week, rest = divmod(int((time - np.datetime64("1980-01-06T00:00:00", "ns")).astype(np.int64)), 604_800_000_000_000)
+    return week, rest / 1e9
+
+
 def instant(time: np.datetime64) -> Any:
-    week, sow = to_week(time)
-    return rtk.gpst2time(int(week), float(sow))
+    return rtk.gpst2time(*week_and_second(time))
 
 
 def satellite_number(name: str) -> int:
@@ -54,12 +57,12 @@ def glonass_ephemeris(records: GlonassRecords, row: int) -> Any:
 def state(ephemeris: Any, time: np.datetime64, code_m: float) -> tuple[list[float], float]:
     """Position [m] and clock [m] at the instant of transmission of a code, as RTKLIB's satposs finds it."""
     is_glonass = isinstance(ephemeris, rtk.geph_t)
-    sent = rtk.timeadd(instant(time), -code_m / SPEED_OF_LIGHT)
+    sent = rtk.timeadd(instant(time), -code_m / rtk.CLIGHT)
     clock = rtk.geph2clk(sent, ephemeris) if is_glonass else rtk.eph2clk(sent, ephemeris)
     sent = rtk.timeadd(sent, -clock)
     place, bias, variance = rtk.Arr1Ddouble(3), rtk.Arr1Ddouble(1), rtk.Arr1Ddouble(1)
     (rtk.geph2pos if is_glonass else rtk.eph2pos)(sent, ephemeris, place, bias, variance)
-    return [place[i] for i in range(3)], bias[0] * SPEED_OF_LIGHT
+    return [place[i] for i in range(3)], bias[0] * rtk.CLIGHT
 
 
 def troposphere_m(latitude_deg: float, height_m: float, elevation_deg: float, humidity: float) -> float:

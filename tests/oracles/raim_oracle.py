@@ -1,105 +1,40 @@
-"""Made cases for RAIM, and RAIM by deleting rows and solving again: one column a clock, one row a prior."""
+"""RAIM by deleting rows and solving again: one column a clock, one row a prior."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Final
 
 import numpy as np
+from pyproj import Transformer
 from scipy.stats import chi2
 
-import synthetic
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, linear_model
-from railfix.integrity.raim.model import _model
-from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
-from railfix.ranges.channels import clock_groups
-from railfix.track import Track
+from railfix.integrity.raim import Outcome, RaimLimits
+from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Offsets of the clocks that made cases have [m].
-CLOCK_OFFSET_M = (0.0, 12.0, -30.0, 5.0)
+#: Standard deviations of inter-system biases from which on nothing is known of them [m].
+UNTIED_M: Final = 1e6
+#: The earth's rotation [rad/s] and the speed of light [m/s] (IS-GPS-200, 20.3.3.4.3).
+ROTATION_RADPS, LIGHT_MPS = 7.2921151467e-5, 299_792_458.0
+_GEODETIC: Final = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
 
 
-def point_model(ranges: Ranges, ecef_m: np.ndarray) -> LinearModel:
-    """3-D positions: east, north and up unknown, the horizontal ones wanted (P4's horizontal form)."""
-    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
-    return _model(ranges, ecef_m, enu_axes(latitude, longitude), np.zeros((3, 3)), unknowns=3)
+def east_north_up(ecef_m: np.ndarray) -> np.ndarray:
+    """Return the unit vectors to the east, to the north and up at a place."""
+    longitude, latitude, _ = _GEODETIC.transform(*ecef_m)
+    (c, s), (cl, sl) = ((np.cos(x), np.sin(x)) for x in np.radians([latitude, longitude]))
+    return np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
 
 
-def straight(length_m: float = 2000.0) -> Trajectory:
-    """A line to the north-east, points every 20 m."""
-    s = np.arange(0.0, length_m + 1.0, 20.0)
-    return Trajectory.from_antenna_path(
-        Track.from_ecef(synthetic.enu_to_ecef(np.stack([0.6 * s, 0.8 * s, 0.002 * s], axis=1)))
-    )
-
-
-LINE = straight()
-
-
-def made(
-    arc_m: np.ndarray,
-    systems: str,
-    *,
-    seed: int,
-    faults_m: Mapping[int, float] | None = None,
-    tie_sigma_m: tuple[float, ...] | None = None,
-    noise: float = 1.0,
-    sat_ecef_m: np.ndarray | None = None,
-    sigma_m: np.ndarray | None = None,
-) -> Ranges:
-    """Ranges with just the noise, the map error and the clock offsets that the model assumes, read-only."""
-    rng = np.random.default_rng(seed)
-    shape = (len(arc_m), len(systems))
-    sat = synthetic.satellites(rng, *shape[:1], systems) if sat_ecef_m is None else sat_ecef_m
-    sigma = rng.uniform(0.5, 3.0, shape) if sigma_m is None else np.broadcast_to(sigma_m, shape)
-    groups = clock_groups(list(systems))
-    section = LINE.segment_at(arc_m)[0]
-    place = LINE.at_arc(arc_m)
-    place = place + rng.normal(0.0, LINE.sigma_plan_m, (len(arc_m), 1)) * LINE.across[section]
-    place = place + rng.normal(0.0, LINE.sigma_height_m, (len(arc_m), 1)) * LINE.up[section]
-    code = synthetic.travelled_range(sat, place[:, None, :]) + 3.0e4 + noise * sigma * rng.normal(size=shape)
-    ties = None
-    if tie_sigma_m is not None:
-        tie_sigma = np.broadcast_to(np.array(tie_sigma_m[: len(groups)]), (len(arc_m), len(groups)))
-        offset = np.broadcast_to(np.array(CLOCK_OFFSET_M[: len(groups)]), tie_sigma.shape)
-        ties = InterSystemBiases(offset_m=offset, sigma_m=tie_sigma)
-        drawn = offset + np.minimum(tie_sigma, 100.0) * rng.normal(size=tie_sigma.shape)
-    else:
-        drawn = np.broadcast_to(np.array(CLOCK_OFFSET_M[: len(groups)]), (len(arc_m), len(groups)))
-    for g, group in enumerate(groups):
-        code[:, group] += drawn[:, g, None]
-    for channel, size in (faults_m or {}).items():
-        code[:, channel] += size
-    weight = 1.0 / sigma**2
-    for array in (sat, code, weight):
-        array.flags.writeable = False
-    return Ranges(sat_ecef_m=sat, code_m=code, weight=weight, groups=groups, ties=ties)
-
-
-def only(ranges: Ranges, channels: list[int]) -> Ranges:
-    """Weight left to some channels."""
-    weight = np.zeros_like(ranges.weight)
-    weight[:, channels] = ranges.weight[:, channels]
-    weight.flags.writeable = False
-    return Ranges(
-        sat_ecef_m=ranges.sat_ecef_m, code_m=ranges.code_m, weight=weight, groups=ranges.groups, ties=ranges.ties
-    )
-
-
-def solved(ranges: Ranges, arc_m: np.ndarray) -> tuple[Constrained, LinearModel]:
-    """Position on the line, started near the truth, and its model."""
-    got = position_on_line(ranges, LINE, np.argmin(np.abs(LINE.arc_m - arc_m[:, None]), axis=1))
-    return got, linear_model(ranges, LINE, got.arc_m, section=got.section)
-
-
-def in_space(ranges: Ranges) -> LinearModel:
-    """Model of the 3-D position."""
-    point = point_position(ranges, np.broadcast_to(LINE.ecef_m[0], (len(ranges), 3)))
-    return point_model(ranges, point.ecef_m)
+def range_on_turning_earth(sat_ecef_m: np.ndarray, place_ecef_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances in the frame of reception, to first order of the rotation, and the unit vectors of sight."""
+    apart = sat_ecef_m - place_ecef_m
+    distance = np.linalg.norm(apart, axis=-1)
+    turned = sat_ecef_m[..., 0] * place_ecef_m[..., 1] - sat_ecef_m[..., 1] * place_ecef_m[..., 0]
+    return distance + ROTATION_RADPS / LIGHT_MPS * turned, apart / distance[..., None]
 
 
 @dataclass(frozen=True)
@@ -146,7 +81,7 @@ def problem(ranges: Ranges, t: int, place: np.ndarray, axes: np.ndarray, prior_s
     """Rows and columns of one epoch; `prior_sigma` of the three axes, infinite where unknown."""
     channels = np.flatnonzero(ranges.weight[t] > 0)
     sigma = 1.0 / np.sqrt(ranges.weight[t, channels])
-    distance, los = range_with_rotation(ranges.sat_ecef_m[t, channels], place)
+    distance, los = range_on_turning_earth(ranges.sat_ecef_m[t, channels], place)
     clock = np.array([next(i for i, s in enumerate(ranges.groups) if s.start <= c < s.stop) for c in channels])
     seen = np.unique(clock)
     observed = ranges.code_m[t, channels] - distance
@@ -184,16 +119,23 @@ def problem(ranges: Ranges, t: int, place: np.ndarray, axes: np.ndarray, prior_s
     )
 
 
-def problem_on_line(ranges: Ranges, t: int, arc_m: float) -> Problem:
-    section = int(LINE.segment_at(np.array([arc_m]))[0][0])
-    axes = np.stack([LINE.tangent[section], LINE.across[section], LINE.up[section]])
-    prior = (np.inf, LINE.sigma_plan_m, LINE.sigma_height_m)
-    return problem(ranges, t, LINE.at_arc(np.array([arc_m]))[0], axes, prior)
+def problem_on_line(ranges: Ranges, t: int, arc_m: float, line: Trajectory) -> Problem:
+    """Along the section at an arc length, to the right and up unknown, the last two with the priors of the map."""
+    length = np.linalg.norm(np.diff(line.ecef_m, axis=0), axis=1)
+    begin = np.concatenate([[0.0], np.cumsum(length)])
+    section = int(np.clip(np.searchsorted(begin, arc_m, side="right") - 1, 0, len(length) - 1))
+    first, second = line.ecef_m[section : section + 2]
+    along = (second - first) / length[section]
+    up = east_north_up(0.5 * (first + second))[2]
+    right = np.cross(along, up)
+    axes = np.stack([along, right / np.linalg.norm(right), up])
+    prior = (np.inf, line.sigma_plan_m, line.sigma_height_m)
+    return problem(ranges, t, first + (arc_m - begin[section]) * along, axes, prior)
 
 
 def problem_in_space(ranges: Ranges, t: int, place_ecef_m: np.ndarray) -> Problem:
-    latitude, longitude, _ = geodetic_from_ecef(place_ecef_m)
-    return problem(ranges, t, place_ecef_m, enu_axes(latitude, longitude), (np.inf,) * 3)
+    """East, north and up unknown."""
+    return problem(ranges, t, place_ecef_m, east_north_up(place_ecef_m), (np.inf,) * 3)
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pyrtklib_orbits import instant, rtk, satellite_number
-from railfix.core.timescale import to_week
+from pyrtklib_orbits import instant, rtk, satellite_number, week_and_second
 from railfix.ranges.sbas import SbasMessages
 
 
@@ -22,8 +21,8 @@ class RtklibSbas:
         if log.type[row] == 9:
             return 9
         message = rtk.sbsmsg_t()
-        week, tow = to_week(log.time[row])
-        message.week, message.tow, message.prn = int(week), round(float(tow)), int(log.prn[row])
+        week, tow = week_and_second(log.time[row])
+        message.week, message.tow, message.prn = week, round(tow), int(log.prn[row])
         for i in range(29):
             byte = int(log.bits[row, i])
             message.msg[i] = byte & 0xC0 if i == 28 else byte

@@ -7,19 +7,23 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from typer.testing import CliRunner
 
-import recordings_score
 import recordings_truth
 from live_batch import chunks_of, differences, epochs_of, tables_of, thinned
 from pipeline_cases import clean_trajectories, demo_observations
+from railfix.cli import app
 from railfix.core.channel_state import join_channels
 from railfix.gnss.observations import Observations
 from railfix.integrity.interference.limits import InterferenceLimits, PowerState, power_signs
 from railfix.io import read_navigation, read_observations
+from railfix.io.rinex.write import write_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import make_processor
 from railfix.simulate.demonstration import demo_files
+from railfix.track import from_positions
+from railfix.track.point_files import write_track_csv
+from ubx_made import log_of
 
 pytestmark = pytest.mark.requirement("A8")
 
@@ -61,26 +65,78 @@ def test_the_demonstration_in_chunks_of_any_kind(share: float, step: int) -> Non
     check(demo_processor(), logs)
 
 
-def urbannav(folder: Path, log: str) -> tuple[EpochProcessor, Observations]:
-    trajectory = recordings_score.trajectory_of(*recordings_truth.urbannav_truth(folder))
-    navigation = read_navigation([folder / "hksc137c.nav"])
-    processor = make_processor(Config(filter="track"), navigation, {"front": trajectory})
-    return processor, read_observations(folder / f"20210517.light-urban.tste.ublox.{log}.obs")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.1])
-@pytest.mark.parametrize("name", ["m8t.GC", "f9p", "japan"])
-def test_recordings_in_chunks_of_any_kind(recordings: Path, name: str, share: float) -> None:
+def write_recording(name: str, recordings: Path, folder: Path) -> tuple[dict[str, Observations], list[str]]:
+    """Logs of a recording by antenna, and the words of a command that name its navigation, map and vehicle."""
+    if name == "demonstration":
+        files = demo_files()
+        logs = {antenna: read_observations(files[antenna]) for antenna in ("front", "rear")}
+        return logs, ["--nav", str(files["nav"]), "--track", str(files["track"]), "--vehicle", str(files["vehicle"])]
     if name == "japan":
-        folder = next((recordings / "kinematic").glob("japan_mosaic*"))
-        trajectory = recordings_score.trajectory_of(*recordings_truth.japan_truth(recordings))
-        navigation = read_navigation([folder / "SEPT2650.21P"])
-        processor = make_processor(Config(filter="track"), navigation, {"front": trajectory})
-        log = read_observations(folder / "SEPT265G.21O")
+        source = next((recordings / "kinematic").glob("japan_mosaic*"))
+        log, nav, truth = source / "SEPT265G.21O", source / "SEPT2650.21P", recordings_truth.japan_truth(recordings)
     else:
-        processor, log = urbannav(recordings / "kinematic" / "urbannav_tst", name)
-    check(processor, {"front": thinned(log[100:300], share)})
+        source = recordings / "kinematic" / "urbannav_tst"
+        log, nav = source / f"20210517.light-urban.tste.ublox.{name}.obs", source / "hksc137c.nav"
+        truth = recordings_truth.urbannav_truth(source)
+    write_track_csv(from_positions(*truth, spacing_m=5.0), folder / "track.csv")
+    return {"front": read_observations(log)}, ["--nav", str(nav), "--track", str(folder / "track.csv")]
+
+
+def write_log(log: Observations, folder: Path, antenna: str, *, bit_errors: float | None) -> Path:
+    """Write a log as RINEX, or as UBX with a share of its bytes changed by a bit."""
+    if bit_errors is None:
+        write_observations(log, path := folder / f"{antenna}.obs")
+        return path
+    data, rng = np.frombuffer(log_of(log), dtype=np.uint8).copy(), np.random.default_rng(len(log))
+    wrong = np.flatnonzero(rng.random(len(data)) < bit_errors)
+    data[wrong] ^= 1 << rng.integers(0, 8, len(wrong)).astype(np.uint8)
+    (path := folder / f"{antenna}.ubx").write_bytes(data.tobytes())
+    return path
+
+
+def tables_by_command(folder: Path, name: str, words: list[str]) -> dict[str, pl.DataFrame]:
+    """Tables that a command writes."""
+    out = folder / name
+    done = CliRunner().invoke(app, [*words, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    return {path.stem: pl.read_parquet(path) for path in out.glob("*.parquet")}
+
+
+#: Recording, epochs, share of observations that are missing, bit errors: short stretches, and (slow) the whole; of the
+#: demonstration with its 10 Hz three minutes.
+SHORT = [
+    ("m8t.GC", slice(100, 150), 0.1, None),
+    ("f9p", slice(100, 140), 0.02, 1e-4),
+    ("japan", slice(100, 160), 0.02, None),
+    ("demonstration", slice(300, 360), 0.02, None),
+]
+WHOLE = [
+    (name, slice(300, 2100) if name == "demonstration" else slice(None), share, bit_errors)
+    for name in ("m8t.GC", "f9p", "japan", "demonstration")
+    for share, bit_errors in ((0.0, None), (0.02, None), (0.1, None), (0.0, 1e-4), (0.02, 1e-4))
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "epochs", "share", "bit_errors"),
+    [*SHORT, *(pytest.param(*case, marks=pytest.mark.slow) for case in WHOLE)],
+)
+def test_run_whole_run_epoch_by_epoch_and_live_write_equal_tables(
+    recordings: Path, tmp_path: Path, name: str, epochs: slice, share: float, bit_errors: float | None
+) -> None:
+    """All columns, by the commands, whatever is missing: single observations, epochs, satellites for a while."""
+    logs, words = write_recording(name, recordings, tmp_path)
+    for k, (antenna, log) in enumerate(logs.items(), 1):
+        piece = thinned(log[epochs], share, seed=k)
+        words += [f"--{antenna}", str(write_log(piece, tmp_path, antenna, bit_errors=bit_errors))]
+    whole = tables_by_command(tmp_path, "whole", ["run", *words, "--observations"])
+    assert {"positions", "observations", "train"} <= whole.keys()
+    assert whole["train"]["chainage_m"].is_not_nan().sum() > 20
+    single = tables_by_command(tmp_path, "single", ["run", *words, "--observations", "--chunk", "1"])
+    assert differences(whole, single, ROUNDING_M) == {}
+    live = tables_by_command(tmp_path, "live", ["live", *words, "--send", f"json@{tmp_path / 'messages'}"])
+    del whole["observations"]  # a live session keeps none
+    assert differences(whole, live, ROUNDING_M) == {}
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.02, 0.1, 0.2])

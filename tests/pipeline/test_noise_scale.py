@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import raim_cases
+import raim_oracle
 from pipeline_cases import clean_trajectories, demo_observations, with_code
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Status
@@ -17,7 +19,7 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.tables import antenna_positions
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, robust_fit
+from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, noise_scale, robust_fit
 from railfix.positioning.windows import Windows
 from railfix.simulate.demonstration import demo_files
 
@@ -119,3 +121,28 @@ def test_the_statistic_of_raim_is_recomputed_from_the_tables_by_its_scale() -> N
     statistic = table["raim_statistic"].to_numpy() * table["raim_scale"].to_numpy() ** 2
     assert kept.sum() > 100
     np.testing.assert_allclose(statistic[kept], found.constrained.wsse[kept], rtol=1e-5)
+
+
+@pytest.mark.requirement("C3")
+@pytest.mark.parametrize("true_scale", [0.6, 1.0, 2.5])
+def test_the_scale_of_a_window_lies_within_a_bootstrap_of_its_epochs(true_scale: float) -> None:
+    """Each epoch solved by dense least squares; epochs drawn again a thousand times give the interval."""
+    epochs, rng = 400, np.random.default_rng(11)
+    arc = rng.uniform(100.0, 1900.0, epochs)
+    ranges = raim_cases.made(arc, "GGGGGEEEE", seed=5, noise=true_scale)
+    cases = [raim_oracle.problem_on_line(ranges, t, arc[t], raim_cases.LINE) for t in range(epochs)]
+    wsse = np.array([case.statistic((), "chi_square", 1.0) for case in cases])
+    freedom = np.array([case.freedom for case in cases])
+    drawn = rng.integers(0, epochs, (1000, epochs))
+    low, high = np.quantile(np.sqrt(wsse[drawn].sum(axis=1) / freedom[drawn].sum(axis=1)), [0.0005, 0.9995])
+
+    solved, _ = raim_cases.solved(ranges, arc)
+    time = np.datetime64("2024-03-05T00:00:00", "ns") + timedelta(np.arange(epochs))
+    windows = Windows.of(time, (slice(None),), [(np.datetime64("NaT", "ns"), 0.0)], window_s=1e6, least_epochs=4.0)
+    scale, _ = noise_scale(
+        windows, solved.wsse, freedom, np.ones(epochs, dtype=bool), np.ones(epochs), np.zeros((1, 2)),
+        limits=NoiseScaleLimits(window_s=1e6, prior=1e-9),
+    )  # fmt: skip
+    assert low < scale[-1] < high
+    assert low < true_scale < high
+    assert high - low < 0.15 * true_scale

@@ -30,14 +30,15 @@ from tracking_cases import part, ride
 START = np.datetime64("2026-03-01T10:00:00", "ns")
 
 
-def judged(said: str, cuts: tuple[int, ...] = (), least_s: float = 3.0) -> str:
+def judged(said: str, cuts: tuple[int, ...] = (), least_s: float = 3.0, offset_m: np.ndarray | None = None) -> str:
     """Verdicts of epochs a second apart: positions on the map (+), off it (-), none (.)."""
     time = START + timedelta(np.arange(float(len(said))))
+    offset = np.full(len(said), np.nan) if offset_m is None else offset_m
     on, off = np.array([c == "+" for c in said]), np.array([c == "-" for c in said])
     state, parts = OffMapState(), []
     for first, last in zip((0, *cuts), (*cuts, len(said)), strict=True):
         here = slice(first, last)
-        found, state = off_map_epochs(time[here], on[here], off[here], state, least_s=least_s)
+        found, state = off_map_epochs(time[here], on[here], off[here], offset[here], state, least_s=least_s)
         parts.append(found)
     return "".join("x" if away else "o" for away in np.concatenate(parts))
 
@@ -63,10 +64,21 @@ def test_departure_and_return_take_their_time(said: str, expected: str) -> None:
 def test_any_cutting_gives_the_same_verdicts() -> None:
     said = "".join(np.random.default_rng(3).choice(list("+-."), size=400, p=[0.4, 0.4, 0.2]).tolist())
     said = said.replace("+-+", "+++").replace("-+-", "---")
-    whole = judged(said, least_s=2.0)
+    offset = np.random.default_rng(4).normal(np.where(np.array([*said]) == "-", 6.0, 2.8), 1.0)
+    whole = judged(said, least_s=2.0, offset_m=offset)
     assert set(whole) == {"o", "x"}
-    assert judged(said, tuple(range(1, 400)), 2.0) == whole
-    assert judged(said, (7, 8, 150), 2.0) == whole
+    assert judged(said, least_s=2.0) != whole
+    for cuts in (tuple(range(1, 400)), (7, 8, 150)):
+        assert judged(said, cuts, 2.0, offset) == whole
+
+
+@pytest.mark.requirement("B6", "A10")
+@pytest.mark.parametrize(("back_m", "returns"), [(5.5, False), (-0.9, True), (3.5, True), (3.7, False)])
+def test_a_train_beside_the_line_is_not_back_because_its_ranges_fit_by_chance(back_m: float, returns: bool) -> None:
+    """On a track 7.2 m aside that the map lacks: what fits the line is still more than half as far from it."""
+    said = "+++" + 6 * "-" + 20 * "+"
+    offset = np.array(3 * [0.5] + 6 * [7.2] + 20 * [back_m])
+    assert judged(said, offset_m=offset) == "oooooo" + "xxx" + ("xxx" + 17 * "o" if returns else 20 * "x")
 
 
 @pytest.mark.requirement("E5")

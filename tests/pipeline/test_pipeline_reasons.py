@@ -24,6 +24,7 @@ from pipeline_cases import (
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
+from railfix.integrity.protection import LevelStatus
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.tables import observations_table
 from railfix.track import Track
@@ -127,6 +128,18 @@ def test_off_map_beyond_the_end():
     all_are(found, Status.OFF_MAP)
     assert (found.constrained.overshoot_m > 5.0).all()
     assert np.all(found.arc_m == found.arc_m.max())
+
+
+def test_a_position_clamped_to_an_end_within_the_noise_is_not_ok():
+    """The line ends 1 m before the train: within four sigmas of the position, which is the end of the line."""
+    there, at = clean_trajectories()["front"], whole()
+    kept = there.arc_m < at.arc_m[0] - 1.0
+    end = there.at_arc(at.arc_m[:1] - 1.0)
+    found = front_alone(front()[:1], MASK_ONLY, trajectories=line(np.concatenate([there.ecef_m[kept], end])))
+    all_are(found, Status.MAP_END)
+    assert found.constrained.overshoot_m[0] == pytest.approx(1.0, abs=0.1)
+    assert found.protection is not None
+    assert found.protection.status[0] == LevelStatus.UNAVAILABLE
 
 
 def test_off_map_far_to_the_side():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, ncx2
 
-import raim_oracle as oracle
+import raim_cases
 import synthetic
 from railfix.core.timescale import seconds, timedelta
 from railfix.positioning.antenna_rows import AntennaRows
@@ -29,7 +29,7 @@ from railfix.positioning.search_index import SearchIndex
 pytestmark = pytest.mark.requirement("C4")
 
 EPOCHS = 40
-LINE = replace(oracle.LINE, sigma_plan_m=0.4, sigma_height_m=0.9)
+LINE = replace(raim_cases.LINE, sigma_plan_m=0.4, sigma_height_m=0.9)
 ALONE = AntennaRows.on(SearchIndex(LINE))
 LIMITS = MapOffsetLimits(window_s=70.0, correlation_s=14.0, least_samples=2.5)
 SYSTEMS = "GGGGGEEE"
@@ -45,7 +45,7 @@ def case() -> tuple[np.ndarray, Ranges, SinglePoint, np.ndarray, np.ndarray, np.
     steps[20] = 400.0
     time = np.datetime64("2024-03-05T00:00:00", "ns") + timedelta(np.cumsum(steps))
     arc = np.linspace(200.0, 1500.0, EPOCHS)
-    ranges = oracle.made(arc, SYSTEMS, seed=5)
+    ranges = raim_cases.made(arc, SYSTEMS, seed=5)
     weight = ranges.weight.copy()
     weight[6, 2:] = 0.0  # two satellites: no position
     weight[9, [0, 1, 5]] = 0.0  # five of two clocks: no redundancy, not used

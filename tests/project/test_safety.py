@@ -28,6 +28,16 @@ def test_each_hazard_and_condition_has_a_test_that_exists_or_says_that_it_is_not
     assert without == re.findall(r"\| (C\d+) \|[^|]*\| \*\*not checked\*\*", TEXT)
 
 
+def test_tests_that_the_documents_name_exist() -> None:
+    named = {
+        name: path.name
+        for path in (ROOT / "docs").rglob("*.md")
+        for name in re.findall(r"\btest_\w+\.py::test_\w+", path.read_text(encoding="utf-8"))
+    }
+    assert len(named) > 150
+    assert {name: page for name, page in named.items() if name not in TESTS} == {}
+
+
 def test_statuses_and_reasons_of_the_tables_exist() -> None:
     tables = "\n".join(line for line in TEXT.splitlines() if line.startswith(("|", "- ")))
     named = set(re.findall(r"`([a-z_]+)`", tables))

@@ -1,4 +1,4 @@
-"""The documentation site: notebooks name what exists, all pages are reached, it builds without a warning."""
+"""The documentation site: examples name what exists, all pages are reached, it builds without a warning."""
 
 from __future__ import annotations
 
@@ -19,13 +19,7 @@ from railfix.cli import app
 from railfix.cli.command import load_command
 
 DOCS = ROOT / "docs"
-NOTEBOOKS = [*sorted((DOCS / "notebooks").glob("*.md")), DOCS / "gallery.md"]
-
-
-def cells(text: str) -> list[str]:
-    """Return the code cells of a notebook, without the magic commands of IPython."""
-    code = re.findall(r"^```\{code-cell\}[^\n]*\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
-    return [re.sub(r"^%.*\n", "", cell, flags=re.MULTILINE) for cell in code]
+EXAMPLES = sorted((DOCS / "gallery").glob("*.py"))
 
 
 def missing_names(tree: ast.AST) -> Iterator[str]:
@@ -55,11 +49,13 @@ def missing_names(tree: ast.AST) -> Iterator[str]:
 
 
 @pytest.mark.requirement("G2")
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_notebooks_parse_and_their_names_exist(path: Path) -> None:
-    code = cells(path.read_text(encoding="utf-8"))
-    assert len(code) >= 4
-    assert list(missing_names(ast.parse("\n".join(code)))) == []
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+def test_examples_parse_and_their_names_exist(path: Path) -> None:
+    assert list(missing_names(ast.parse(path.read_text(encoding="utf-8")))) == []
+
+
+def test_there_are_ten_examples() -> None:
+    assert len(EXAMPLES) == 10
 
 
 def test_missing_names_are_found() -> None:
@@ -73,9 +69,9 @@ def test_the_site_reaches_every_page() -> None:
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     trees = re.findall(r"^```\{toctree\}\n(.*?)^```$", index, flags=re.MULTILINE | re.DOTALL)
     listed = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
-    pages = [page for folder in (".", "notebooks", "maintain") for page in (DOCS / folder).glob("*.md")]
-    names = sorted(page.relative_to(DOCS).with_suffix("").as_posix() for page in pages)
-    assert sorted([*listed, "index"]) == names
+    pages = [page for folder in (".", "maintain") for page in (DOCS / folder).glob("*.md")]
+    names = [page.relative_to(DOCS).with_suffix("").as_posix() for page in pages]
+    assert sorted([*listed, "index"]) == sorted([*names, "auto_examples/index"])
 
 
 def commands() -> Iterator[str]:
@@ -109,7 +105,7 @@ def test_pictures_of_the_readme_are_small() -> None:
 @pytest.mark.slow
 @pytest.mark.requirement("G2")
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    for package in ("sphinx", "myst_nb", "numpydoc", "pydata_sphinx_theme"):
+    for package in ("sphinx", "myst_parser", "sphinx_gallery", "sphinx_design", "numpydoc", "pydata_sphinx_theme"):
         pytest.importorskip(package)
     command = [
         sys.executable,
@@ -125,6 +121,11 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    page = (tmp_path / "site" / "notebooks" / "first-positions.html").read_text(encoding="utf-8")
+    examples = tmp_path / "site" / "auto_examples"
+    page = (examples / "first_positions.html").read_text(encoding="utf-8")
     assert "single epochs" in page
-    assert page.count("<img") == 2  # plan and errors
+    assert page.count("sphx-glr-single-img") == 2  # plan and errors
+    gallery = (examples / "index.html").read_text(encoding="utf-8")
+    assert gallery.count("sphx-glr-thumbcontainer") == len(EXAMPLES)
+    api = (tmp_path / "site" / "api" / "railfix.pipeline.EpochProcessor.html").read_text(encoding="utf-8")
+    assert "_modules/railfix/pipeline/" in api  # link to the source

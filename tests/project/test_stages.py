@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -30,8 +31,9 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.positioning.receiver_noise import LastingErrorLimits
 from railfix.track import Track, from_positions
-from test_site import cells
 
+#: The example that calls the stages one by one.
+EXAMPLE = ROOT / "docs" / "gallery" / "stages_by_hand.py"
 #: Stages of P1's figure 1, in their order, by room.
 STAGES = {
     "ranges": ("select_channels", "find_satellites", "corrected_ranges"),
@@ -74,11 +76,8 @@ def test_every_public_stage_has_a_caller_in_the_pipeline() -> None:
 
 @pytest.fixture(scope="module")
 def names() -> dict[str, Any]:
-    """Names of the notebook after its cells have run."""
-    found: dict[str, Any] = {}
-    for cell in cells((ROOT / "docs" / "notebooks" / "stages.md").read_text(encoding="utf-8")):
-        exec(compile(cell, "stages.md", "exec"), found)
-    return found
+    """Names of the example after it has run."""
+    return runpy.run_path(str(EXAMPLE))
 
 
 def assert_same_positions(fix: Any, result: Any, *, least: float) -> None:
@@ -90,9 +89,9 @@ def assert_same_positions(fix: Any, result: Any, *, least: float) -> None:
 
 @pytest.mark.requirement("S1")
 @pytest.mark.requirement("G2")
-def test_the_stages_of_the_notebook_are_the_pipeline_to_a_millimetre(names: dict[str, Any]) -> None:
-    text = (ROOT / "docs" / "notebooks" / "stages.md").read_text(encoding="utf-8")
-    by_hand = [line for cell in cells(text)[:3] for line in cell.splitlines() if line.strip()]
+def test_the_stages_of_the_example_are_the_pipeline_to_a_millimetre(names: dict[str, Any]) -> None:
+    text = EXAMPLE.read_text(encoding="utf-8").split('"""', 2)[2].split("# Comparison with the pipeline")[0]
+    by_hand = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     assert len(by_hand) <= 30
     for fix, result in names["compared"].values():
         assert_same_positions(fix, result, least=0.8)

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 import railfix
 from railfix.cli.ground import app
+from railfix.simulate import Scenario
 
 pytestmark = pytest.mark.requirement("G4")
 FILES = railfix.demo_files()
@@ -46,3 +47,8 @@ def test_a_track_off_the_earth_is_no_track() -> None:
 def test_keys_of_a_million_days_are_refused(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["keys", str(tmp_path / "keys"), "--train", "1", "--days", "9999999"])
     assert "less than or equal to 36500" in " ".join(str(done.output).split())
+
+
+def test_settings_show_what_differs_from_the_defaults() -> None:
+    assert repr(Scenario()) == "Scenario()"  # with defaults that are computed from other settings
+    assert repr(railfix.Config(min_satellites=2)) == "Config(min_satellites=2)"

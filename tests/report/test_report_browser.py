@@ -245,7 +245,7 @@ def test_it_prints_whole(page: Path, tmp_path: Path) -> None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     text = " ".join(told("pdftotext", "-layout", str(paper), "-").split())
-    for words in ("Figures of merit", "Settings asked for and used", "min_satellites", "SHA-256", "rear antenna"):
+    for words in ("Figures of merit", "Settings given and used", "min_satellites", "SHA-256", "rear antenna"):
         assert words in text
     # what is written along the axes of the charts is text on paper too: every one is there
     read = Page(page.read_text(encoding="utf-8"))

@@ -163,7 +163,7 @@ def test_without_a_vehicle_the_output_says_so(bench: Bench, tmp_path: Path) -> N
     inputs = RunInputs(front=(bench.front,), nav=(bench.nav,), track=(bench.track,))
     summary = run_files(inputs, out=tmp_path / "out")
     record = json.loads(summary.files["run.json"].read_text())
-    assert any("no vehicle file: the track is taken as the antenna's own path" in note for note in record["notes"])
+    assert any("no vehicle file: the track is assumed to be the antenna's own path" in note for note in record["notes"])
     assert record["line"]["vehicle"] is None
 
 

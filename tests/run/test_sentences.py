@@ -37,7 +37,7 @@ def test_an_offset_of_the_map_has_its_side_its_height_and_its_cause(
     assert f"3.0 m (sigma 0.5 m) {side} of the line and {abs(up_m):.1f} m (sigma 0.7 m) {above} it" in found.text
     # nine metres in height are more of their sigma than three metres to the side
     assert ("geoid" in found.text) == (abs(up_m) == 9.0)
-    assert ("another track" in found.text) == (abs(up_m) == 1.0)
+    assert ("a parallel track" in found.text) == (abs(up_m) == 1.0)
 
 
 @pytest.mark.parametrize(("lag_s", "word"), [(0.6, "late"), (-0.6, "early")])

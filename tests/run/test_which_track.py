@@ -18,6 +18,7 @@ from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
+from railfix.positioning.standstill_phase import CodePlace
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
 from railfix.run.standstill import StandstillCodes, standstill_codes
 from railfix.run.which_track import (
@@ -103,6 +104,24 @@ def test_a_place_far_from_its_track_in_standard_deviations_decides_nothing() -> 
     near = track_posterior(tracks, [_fix((0.2, 0.0), 0.2)], arms_m=(0.0,), errors=errors)
     assert near.misfit_sigmas[0] == pytest.approx(1.0, abs=0.05)
     assert near.decision(risk=1e-3) == "T1"
+
+
+@pytest.mark.parametrize(("antenna_up_m", "sigma_up_m", "least"), [(4.0, 2.0, 0.95), (None, 2.0, 0.9), (4.0, 8.0, 0.5)])
+def test_a_train_under_a_viaduct_is_not_on_it(antenna_up_m: float | None, sigma_up_m: float, least: float) -> None:
+    """Two tracks at one place in plan, 8 m above each other; the codes' height is 4 m above the lower one."""
+    below = made_tracks(1, 0.0, np.zeros(2), 0)[0]
+    tracks = [replace(below, up_m=-4.0, sigma_up_m=0.5), replace(below, name="viaduct", up_m=4.0, sigma_up_m=0.5)]
+    place = CodePlace(place_m=np.zeros(3), covariance_m2=np.diag([0.25, 0.25, sigma_up_m**2]))
+    errors = StandstillErrors(antenna_up_m=antenna_up_m)
+    found = track_posterior(tracks, [replace(_fix((0.0, 0.0), 0.5), place=place)], arms_m=(0.0,), errors=errors)
+    assert found.probability[0] / found.probability[:2].sum() > least
+    square = np.array([4.0 - (antenna_up_m or 2.5), -4.0 - (antenna_up_m or 2.5)]) ** 2
+    square /= sigma_up_m**2 + 0.25 + (1.5**2 if antenna_up_m is None else 0.0)
+    density = (1.0 + square / 8.0) ** -4.5
+    assert found.probability[0] / found.probability[1] == pytest.approx(density[0] / density[1], rel=1e-9)
+    unknown = [replace(tracks[0], up_m=np.nan), replace(tracks[1], up_m=np.nan)]
+    plan = track_posterior(unknown, [replace(_fix((0.0, 0.0), 0.5), place=place)], arms_m=(0.0,), errors=errors)
+    assert plan.probability[0] == pytest.approx(plan.probability[1])
 
 
 def test_mean_noise_is_that_of_a_gauss_markov_process() -> None:

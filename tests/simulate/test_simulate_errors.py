@@ -12,6 +12,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import carrier_frequency_hz, concatenate
+from railfix.ranges.atmosphere import thin_shell_obliquity
 from railfix.simulate import (
     Disturbance,
     Piece,
@@ -26,9 +27,6 @@ from railfix.simulate.constellation import links
 from railfix.simulate.errors import (
     CommonErrors,
     GaussMarkov,
-    ionosphere_mapping,
-    pierce_point_km,
-    troposphere_mapping,
 )
 from railfix.simulate.receiver import CarriedNoise, NoiseSettings, TrackingNoise, TrackingSettings
 from railfix.simulate.settings import (
@@ -214,7 +212,7 @@ def test_residual_ionosphere_is_vertical_delay_times_mapping() -> None:
 def test_ionospheric_gradient_grows_with_the_pierce_point() -> None:
     errors = ErrorSettings(ionosphere=IonosphereErrorSettings(gradient_mm_per_km=2.0, gradient_azimuth_deg=30.0))
     on, off = on_and_off(errors, duration_s=2.0, receiver=QUIET)
-    vertical = added_m(on, off)[0] / ionosphere_mapping(on.geometry.elevation_deg)
+    vertical = added_m(on, off)[0] / thin_shell_obliquity(on.geometry.elevation_deg)
     rtk = pytest.importorskip("pyrtklib5")
     latitude, longitude, _ = geodetic_from_ecef(Simulation(Scenario()).line.at(np.zeros(1)))
     # On the ellipsoid: RTKLIB puts the height of the place, 162 m, to the Earth's radius.
@@ -236,15 +234,6 @@ def _doubles(rtk: object, values: np.ndarray) -> object:
     for k, value in enumerate(values):
         array[k] = float(value)
     return array
-
-
-def test_pierce_points_and_mappings_at_the_zenith_and_the_horizon() -> None:
-    assert pierce_point_km(35.0, 135.0, 90.0, 10.0, (35.0, 135.0)) == pytest.approx([0.0, 0.0], abs=1e-6)
-    # Due south at 10 degrees: psi = 80 deg - arcsin(0.94798 cos 10 deg) = 11.00 deg.
-    south = pierce_point_km(35.0, 135.0, 10.0, 180.0, (35.0, 135.0))
-    assert south == pytest.approx([-6378.1363 * np.radians(11.0), 0.0], abs=2.0)
-    assert ionosphere_mapping(np.array([90.0, 5.0])) == pytest.approx([1.0, 3.04], abs=0.01)
-    assert troposphere_mapping(np.array([90.0, 30.0, 5.0])) == pytest.approx([1.0, 1.994, 10.21], abs=0.01)
 
 
 @pytest.mark.slow

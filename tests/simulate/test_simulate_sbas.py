@@ -10,11 +10,11 @@ import pytest
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.io import read_observations
+from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate import sbas_service as service
 from railfix.simulate.errors import SatelliteFault
-from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.sbas_stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ReferenceStation
 from railfix.simulate.scenario_file import load_recipe
@@ -77,11 +77,8 @@ def test_the_grid_is_the_simulated_ionosphere(simulation: Simulation, messages: 
     latitude, longitude, _ = geodetic_from_ecef(piece.geometry.antenna_ecef_m)
     elevation, azimuth = piece.geometry.elevation_deg, piece.geometry.azimuth_deg
     slant = corrections.ionosphere(time, latitude, longitude, elevation, azimuth)
-    day_s = (time - time.astype("datetime64[D]")) / np.timedelta64(1, "s")
-    simulated = ionosphere_m(
-        simulation.navigation.klobuchar["G"], day_s[:, None], latitude[:, None], longitude[:, None], elevation, azimuth,
-        frequency_hz=FREQUENCY_L1,
-    )  # fmt: skip
+    coefficients, l1 = simulation.navigation.klobuchar["G"], np.array(FREQUENCY_L1)
+    simulated = klobuchar_delay_m(time, latitude, longitude, elevation, azimuth, coefficients, l1)
     places = latitude[:, None], longitude[:, None], elevation, azimuth
     simulated = simulated + simulation.common_errors.ionosphere_m(np.arange(len(time)) * 1.0, *places)
     high = elevation > 15.0

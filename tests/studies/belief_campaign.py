@@ -362,7 +362,12 @@ def on_line(case: Case, ecef_m: np.ndarray, *, sigma_m: float | None = None) -> 
 
 
 def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
-    """Change of each range by a metre along the line at the reference, shape (T, M), 0 where unknown; and the speed."""
+    """Change of each range by a metre along the line at the reference, shape (T, M), and by a tilted ionosphere.
+
+    The tilt is ``cot(elevation)`` times cosine and sine of the azimuth over ``cot(20 deg)``, no more than 1, shape
+    (T, M, 2): a metre on a satellite at 20 deg in the north, or in the east. 0 where unknown. Tilts turn with the sky,
+    those along the line with the train.
+    """
     processor = make_processor(parse_config({"filter": "off"}), case.navigation, {"front": case.trajectory})
     found = processor.process({"front": case.observations})[0].antennas["front"]
     known = np.isfinite(case.reference_arc_m)
@@ -372,12 +377,17 @@ def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
     sight = sat - np.where(known[:, None], case.reference_ecef_m, 0.0)[:, None, :]
     sight /= np.linalg.norm(sight, axis=2, keepdims=True)
     along = np.zeros(case.observations.code_m.shape)
+    tilt = np.zeros((*along.shape, 2))
+    elevation, azimuth = np.radians(found.elevation_deg), np.radians(found.azimuth_deg)
+    slope = np.fmin(np.tan(np.radians(20.0)) / np.tan(np.fmax(elevation, 0.01)), 1.0)
+    of_channel = np.nan_to_num(slope[..., None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=2))
     # Every signal of a satellite has the sight of its channel that the pipeline used.
     names = case.observations.satellite
     for k, column in enumerate(found.columns):
         change = np.where(known & np.isfinite(sat[:, k, 0]), -(sight[:, k] * tangent).sum(axis=1), 0.0)
         along[:, names == names[column]] = change[:, None]
-    return along, np.gradient(arc)
+        tilt[:, names == names[column]] = of_channel[:, column, None]
+    return along, tilt
 
 
 def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterator[tuple[str, Case]]:
@@ -441,6 +451,13 @@ def faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterat
         some = {name: np.where(full, getattr(obs, name), values) for name, values in left.items()}
         yield f"{count} satellites", replace(case, observations=replace(obs, **left))
         yield f"{count} satellites after 45 s", replace(case, observations=replace(obs, **some))
+    gps = np.char.startswith(obs.satellite.astype(str), "G")[None, :]
+    alone = {f: np.where(gps, getattr(obs, f), np.nan) for f in ("code_m", "phase_cycles", "doppler_hz")}
+    own = np.random.default_rng(len(t) + int(start)).permutation(names[np.char.startswith(names.astype(str), "G")])
+    for name in own[:2].tolist():
+        drift = after * of(name)
+        faulty = with_fault(replace(case, observations=replace(obs, **alone)), Fault("", drift, drift, of(name) & on))
+        yield "clock 1 m/s, GPS alone", faulty
     if case.sensors is not None:
         yield from sensor_faults(case, case.sensors)
     up = np.asarray(case.trajectory.ecef_m) / np.linalg.norm(case.trajectory.ecef_m, axis=1, keepdims=True)
@@ -534,7 +551,9 @@ def sensor_faults(case: Case, sensors: SensorSamples) -> Iterator[tuple[str, Cas
         yield "radar +1 m/s", replace(case, sensors=replace(sensors, radar=replace(radar, speed_mps=speed)))
 
 
-def whole_faults(case: Case, along: np.ndarray, random: np.random.Generator) -> Iterator[tuple[str, str, Case]]:
+def whole_faults(
+    case: Case, along: np.ndarray, tilt: np.ndarray, random: np.random.Generator
+) -> Iterator[tuple[str, str, Case]]:
     """Faults that cover a whole trial: name, the cause that has to be named ("" where none need be), and the case."""
     obs = case.observations
     t, nothing = seconds(obs.time - obs.time[0]), np.zeros(obs.code_m.shape)
@@ -577,7 +596,11 @@ def whole_faults(case: Case, along: np.ndarray, random: np.random.Generator) -> 
         yield "all but one constellation lost", "nothing", replace(case, observations=replace(obs, **gone))
     steep = np.where(np.abs(along) > 0.0, along, 0.0)
     for size in (8.0, 11.0):
-        yield f"ionosphere tilted by {size:g} m", "", with_fault(case, Fault("", size * steep, -size * steep, nothing))
+        fault = Fault("", size * steep, -size * steep, nothing)
+        yield f"ionosphere tilted by {size:g} m along the line", "", with_fault(case, fault)
+    for axis, side in enumerate(("north", "east")):
+        delay = 11.0 * tilt[..., axis]
+        yield f"ionosphere tilted by 11 m to the {side}", "", with_fault(case, Fault("", delay, -delay, nothing))
     late = 15.0 * (random.random(len(letter)) < 0.5)[None, :].repeat(len(t), 0)
     yield "half of the sky 15 m late", "", with_fault(case, Fault("", late, nothing, nothing))
     step = 500.0 * (t >= 45.0)[:, None] * np.ones(obs.code_m.shape)
@@ -636,14 +659,14 @@ def show_causes(case: Case, args: argparse.Namespace) -> Counter[tuple[str, str]
     """Print the causes named and what went over its level by kind of fault; return how often each was named as each."""
     random = np.random.default_rng(args.seed)
     config = parse_config({"filter": "track", "elevation": {"mask_deg": args.mask[0]}, **args.settings})
-    along, _ = sights(case)
+    along, tilt = sights(case)
     rows: dict[tuple[str, str], list[tuple[str, Judged]]] = {}
     t = seconds(case.observations.time - case.observations.time[0])
     known = np.flatnonzero(np.isfinite(case.reference_ecef_m[:, 0]))
     for begin in np.arange(t[known[0]], t[known[-1]] - 90.0, args.fault_every):
         first, end = (int(k) for k in np.searchsorted(t, [begin, begin + args.length]))
-        for label, cause, faulty in whole_faults(case.part(first, end), along[first:end], random):
-            if args.only and args.only not in label:
+        for label, cause, faulty in whole_faults(case.part(first, end), along[first:end], tilt[first:end], random):
+            if args.only not in label:
                 continue
             processor = make_processor(config, faulty.navigation, {"front": faulty.trajectory})
             result, _ = processor.process({"front": faulty.observations})
@@ -655,8 +678,9 @@ def show_causes(case: Case, args: argparse.Namespace) -> Counter[tuple[str, str]
             rows.setdefault((label, cause), []).append((cause_named, trial))
     print(
         f"| {case.name}: put in | has to be named | trials | named | tracking % | over, on the ground, sure and wrong |"
+        " median level on the ground |"
     )
-    print("|---|---|---:|---|---:|---|")
+    print("|---|---|---:|---|---:|---|---:|")
     counts: Counter[tuple[str, str]] = Counter()
     for (label, cause), found in rows.items():
         named = Counter(name for name, _ in found)
@@ -665,7 +689,8 @@ def show_causes(case: Case, args: argparse.Namespace) -> Counter[tuple[str, str]
         print(
             f"| {label} | {cause or '-'} | {len(found)} | {', '.join(f'{n} {c}' for n, c in named.most_common())} | "
             f"{100 * trial.tracking.mean():.0f} | {int((trial.over | trial.over_chainage).sum())}, "
-            f"{int(trial.over_ground.sum())}, {int(trial.sure_and_wrong.sum())} |"
+            f"{int(trial.over_ground.sum())}, {int(trial.sure_and_wrong.sum())} | "
+            f"{np.nanmedian(trial.ground_level_m):.1f} |"
         )
     right = sum(count for (cause, name), count in counts.items() if cause == name)
     print(f"{case.name}: {right} of {counts.total()} causes named right", flush=True)
@@ -738,6 +763,8 @@ def show_faults(case: Case, args: argparse.Namespace) -> None:
             listed = chain(listed, second_faults(part, random))
         listed = pair_faults(part, along[first:end], random, args.pairs) if args.pairs else listed
         for label, faulty in listed:
+            if args.only not in label:
+                continue
             trial = run(faulty, settings)
             bad = over(label, trial)
             if args.verbose and bad.any():
@@ -786,6 +813,11 @@ HEAD: Final = (
 )
 
 
+FIRST_HEAD: Final = (
+    "| recording, mask | starts | first level on the ground: within 60 s, at all, median | the same along the line |"
+)
+
+
 def calibration(found: Judged) -> list[str]:
     """Return the stated probability of the branch against the share that is right by chainage."""
     right = found.chainage_m < np.fmax(10.0, 4.0 * found.sigma_m)
@@ -802,9 +834,15 @@ def calibration(found: Judged) -> list[str]:
     return lines
 
 
-def soon(found: Judged) -> bool:
-    """Return whether a start has a level on the ground within its first minute."""
-    return bool(np.isfinite(found.ground_level_m[found.time_s <= found.time_s[0] + 60.0]).any())
+def first_levels(label: str, parts: list[Judged]) -> str:
+    """Return a row on when cold starts get their first level, on the ground and along the line."""
+    row = f"| {label} | {len(parts)} |"
+    for name in ("ground_level_m", "level_m"):
+        after = [part.time_s[np.isfinite(getattr(part, name))][:1] - part.time_s[0] for part in parts]
+        first = np.concatenate(after) if after else np.empty(0)
+        median = f"{np.median(first):.0f} s" if len(first) else "never"
+        row += f" {int((first <= 60.0).sum())}, {len(first)}, {median} |"
+    return row
 
 
 def show_starts(case: Case, args: argparse.Namespace) -> None:
@@ -820,7 +858,7 @@ def show_starts(case: Case, args: argparse.Namespace) -> None:
             if args.verbose and (bad | found.sure_and_wrong).any():
                 print(f"    start {begin:.0f} s: {first_of(found, bad | found.sure_and_wrong)}", flush=True)
         print(counts(f"{case.name} {mask:g}", joined(parts), trials=len(parts), failed=failed), flush=True)
-        print(f"    first level on the ground within 60 s: {sum(map(soon, parts))} of {len(parts)} starts", flush=True)
+        print(f"    {FIRST_HEAD}\n    {first_levels(f'{case.name} {mask:g}', parts)}", flush=True)
         if args.calibration:
             print("\n".join(calibration(joined(parts))), flush=True)
 
@@ -845,7 +883,7 @@ def main() -> int:
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--causes", action="store_true", help="faults of whole trials: cause put in against named")
     parser.add_argument("--outliers", action="store_true", help="errors of one to three codes, by their size")
-    parser.add_argument("--only", default="", help="with --causes: kinds with this in their name alone")
+    parser.add_argument("--only", default="", help="with --causes or --faults: kinds with this in their name alone")
     parser.add_argument("--pairs", type=int, default=0, help="with --faults: so many pairs in their place")
     parser.add_argument("--fault-every", type=float, default=90.0)
     parser.add_argument("--seed", type=int, default=0)

@@ -94,9 +94,9 @@ the map made from the ground truth, every setting at its default. [How to](how-t
 - Performance features of EN 16803-1: availability (rate, level in limit), accuracy (errors, wrong, error/sigma),
   integrity (over level), continuity (15 s), TTFF (first).
 - *RTKLIB* is the single point of `rnx2rtkp` with the same mask and constellations, moved to the nearest point of the
-  line; *3-D* is that of railfix. OUT/benchmark.md has straight distances too.
-- *Held out*: read by no test, no setting was chosen with it (`python tests/studies/public_recording.py CASES/town`);
-  the others were seen while railfix was made.
+  line; *3-D* is railfix's conventional position. OUT/benchmark.md has straight distances too.
+- *Held out*: used by no test and in no choice of settings (`python tests/studies/public_recording.py CASES/town`);
+  the other recordings were seen during development.
 
 {table}{notes}"""
 #: Columns of the page: head, and the columns of benchmark.md whose cells it joins.

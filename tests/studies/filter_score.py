@@ -112,6 +112,7 @@ def smartloc_case(data: Path) -> Case:
     epochs = GnssEpochs(
         time=log.time,
         satellite=log.satellite,
+        signal=np.full(len(log.satellite), "1C"),
         clock=np.array([CLOCK_GROUP[str(s)[0]] for s in log.satellite]),
         sat_ecef_m=log.sat_ecef_m,
         sat_velocity_mps=np.zeros_like(log.sat_ecef_m),

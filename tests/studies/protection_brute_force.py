@@ -20,7 +20,7 @@ from scipy.special import ndtr
 from scipy.stats import poisson
 
 import paths  # noqa: F401
-import raim_oracle
+import raim_cases
 import synthetic
 from railfix.core.geodesy import range_with_rotation
 from railfix.integrity.protection import ProtectionLevel, RiskBudget, protection_level
@@ -417,16 +417,16 @@ def excluding(draws: int, seed: int, risk: RiskBudget, systems: str = "GGGGGGEEE
     result = np.zeros((4, 4))
     for faults in range(4):
         arc = rng.uniform(100.0, 1900.0, draws)
-        ranges = raim_oracle.made(arc, systems, seed=seed + faults)
+        ranges = raim_cases.made(arc, systems, seed=seed + faults)
         faulty = rng.random((draws, n)).argsort(axis=1).argsort(axis=1) < faults
         size = rng.uniform(2.0, 15.0, (draws, n)) * rng.choice([-1.0, 1.0], (draws, n)) / np.sqrt(ranges.weight)
         if faults == 2:
-            size = least_shown(linear_model(ranges, raim_oracle.LINE, arc), faulty, size)
+            size = least_shown(linear_model(ranges, raim_cases.LINE, arc), faulty, size)
         ranges = replace(ranges, code_m=ranges.code_m + faulty * size)
-        model = linear_model(ranges, raim_oracle.LINE, arc)
+        model = linear_model(ranges, raim_cases.LINE, arc)
         found = exclude(model, limits=RaimLimits())
         rest: LinearModel = linear_model(
-            replace(ranges, weight=np.where(found.excluded, 0.0, ranges.weight)), raim_oracle.LINE, arc
+            replace(ranges, weight=np.where(found.excluded, 0.0, ranges.weight)), raim_cases.LINE, arc
         )
         out = found.excluded.sum(axis=1)
         got = protection_level(rest, list(systems), risk=risk, n_excluded=out)

@@ -101,7 +101,7 @@ def _navigation_rows() -> Iterator[Row]:
 def _position_rows() -> Iterator[Row]:
     expected = {
         "one-2d-fix.nmea": ("12 positions", "1 of 12 fixes have no height"),
-        "separation-zero.nmea": ("12 positions", r"separation is 0 in every fix, the geoid lies 50 m"),
+        "separation-zero.nmea": ("12 positions", r"separation is 0 in every fix, but the geoid is 50 m"),
         "date-one-day-back.csv": ("8 positions", "line 6: the time goes back by 86,399"),
     }
     line = "reports/line.geojson --height-datum ellipsoidal"
@@ -113,7 +113,7 @@ def _position_rows() -> Iterator[Row]:
         yield Row(name, "doctor", f"doctor reports/{name}", 5, f"positions.*{count}.*{note}")
         made = f"map from-positions reports/{name} --out {{out}}/made.csv --overwrite"
         backward = name.startswith("date")
-        text = "line 6: the time is before that of the position above; sort them" if backward else note
+        text = "line 6: the time is before that of the preceding position; sort them" if backward else note
         yield Row(name, "from-positions", made, 3 if backward else 0, text)
         along = f"map route {line} --positions reports/{name} --out {{out}}/r.csv --overwrite"
         yield Row(name, "route", along, 0, f"route: T1.*{note}")

@@ -36,7 +36,6 @@ from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, Satellite
 from railfix.ranges.sources import apply_long_term
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
-from sbas_levels import sbas_level
 
 #: Latitude, longitude [deg] of the ends.
 LINES: Final = {
@@ -188,7 +187,7 @@ def _at_point(
     return (
         used.sum(axis=1),
         np.sqrt((gain**2).sum(axis=1)),
-        sbas_level(model, k=risk.sample_k),
+        risk.sample_k * np.sqrt(model.position_covariance_m2(np.ones(len(model)))[:, 0, 0]),
         level.level_m,
         np.concatenate([parts, rest[:, None]], axis=1),
     )

@@ -16,8 +16,8 @@ import numpy as np
 
 import paths  # noqa: F401
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.ranges.atmosphere import rtca_mapping, thin_shell_obliquity
 from railfix.simulate import LineSettings, Scenario, SensorSettings, Simulation, SkySettings, sensor_tables, write_run
-from railfix.simulate.errors import ionosphere_mapping, troposphere_mapping
 from railfix.simulate.receiver import NoiseSettings
 from railfix.simulate.settings import (
     ClockWalkSettings,
@@ -63,11 +63,11 @@ def air() -> Iterator[Row]:
     """Ionosphere and troposphere."""
     settings = IonosphereErrorSettings(vertical_sigma_m=0.5, vertical_time_s=1.0)
     on, off = on_and_off(ErrorSettings(ionosphere=settings), **AIR)
-    vertical = added_m(on, off)[0] / ionosphere_mapping(on.geometry.elevation_deg)
+    vertical = added_m(on, off)[0] / thin_shell_obliquity(on.geometry.elevation_deg)
     yield from process("vertical ionosphere", np.nanmean(vertical, axis=1)[:, None], 0.5, 1.0)
     layer = TroposphereErrorSettings(zenith_sigma_m=0.05, zenith_time_s=1.0)
     on, off = on_and_off(ErrorSettings(troposphere=layer), **AIR)
-    zenith = added_m(on, off)[0] / troposphere_mapping(on.geometry.elevation_deg)
+    zenith = added_m(on, off)[0] / rtca_mapping(on.geometry.elevation_deg)
     yield from process("zenith troposphere", np.nanmean(zenith, axis=1)[:, None], 0.05, 1.0)
 
 

@@ -85,7 +85,8 @@ def _brute(line: Trajectory, points: NDArray[np.float64]) -> tuple[NDArray[np.fl
 )
 def test_nearest_is_the_exhaustive_search(seed: int, points: int, spread: float, mix: float) -> None:
     random = np.random.default_rng(seed)
-    steps = random.normal(size=(points, 3)) * np.exp(mix * random.normal(size=(points, 1)))
+    # at most 24 km in all: a line goes no deeper than 100 km below the ground
+    steps = random.normal(size=(points, 3)) * np.exp(mix * np.minimum(random.normal(size=(points, 1)), 2.0))
     line = trajectory(np.cumsum(steps, axis=0))
     asked = line.ecef_m[random.integers(0, points, 40)] + spread * random.normal(size=(40, 3))
     arc, offset = line.nearest(asked)

@@ -32,6 +32,9 @@ def _residuals(rng: np.random.Generator, n: int, *, heights: bool) -> Residuals:
         offset_m=rng.normal(0.0, 3.0, (n, 2)),
         beyond_m=np.where(rng.random((n, 2)) < 0.3, rng.normal(0.0, 4.0, (n, 2)), 0.0),
         above_m=rng.normal(0.0, 5.0, (n, 2)),
+        clear=rng.random((n, 2)) < 0.7,
+        moved_m=np.zeros(n),
+        turned=rng.random(n) < 0.3,
         sigma_m=rng.uniform(1.0, 3.0, n),
         sigma_up_m=rng.uniform(2.0, 5.0, n),
         weight=rng.uniform(0.1, 1.0, n),
@@ -67,9 +70,10 @@ def test_probabilities_are_those_of_one_chain_of_all_states(heights: bool, monke
     n, balls, above = 5, 4, 2 if heights else 0
     monkeypatch.setattr(network_decode, "_BALLS", balls)
     monkeypatch.setattr(network_decode, "_BALLS_UP", 2)
+    monkeypatch.setattr(network_decode, "SHIFTS_M", np.array([-4.0, 4.0]))
     residuals = _residuals(np.random.default_rng(3), n, heights=heights)
     net, candidates = _parallel(n)
-    moves = Transitions(net, candidates, np.full(n - 1, STEP_M))
+    moves = Transitions(net, candidates, np.full(n - 1, STEP_M), residuals)
     axis = (np.arange(balls + 1) - balls / 2) * 1.5 / np.sqrt(balls / 4)
     up = (np.arange(above + 1) - above / 2) * (4.0 / np.sqrt(0.5) if above else 0.0)
     states = [(e, u, h) for e in axis for u in axis for h in up]
@@ -77,22 +81,27 @@ def test_probabilities_are_those_of_one_chain_of_all_states(heights: bool, monke
         binom(balls, i) * binom(balls, j) * binom(above, k) / 2.0 ** (2 * balls + above)
         for i in range(balls + 1) for j in range(balls + 1) for k in range(above + 1)
     ]  # fmt: skip
-    seen = np.empty((n, 3, len(states)))
+    seen = np.zeros((n, 5, len(states)))
     for k in range(n):
-        for t in range(2):
+        for state in range(4):
+            # the last two run beside the first track, and are level with it
+            t, shift = (state, 0.0) if state < 2 else (0, (-4.0, 4.0)[state - 2])
+            lies_on_another = state >= 2 and not residuals.clear[k, state - 2]
             east, north = residuals.across[k, t]
             for c, (e, u, h) in enumerate(states):
-                square = (residuals.offset_m[k, t] - east * e - north * u) ** 2
+                square = (residuals.offset_m[k, t] - shift - east * e - north * u) ** 2
                 beyond = residuals.beyond_m[k, t]
-                if beyond:
+                if beyond and state < 2:
                     ahead = -north * e + east * u
                     square += max(abs(beyond) - np.sign(beyond) * ahead, 0.0) ** 2
                 density = (1.0 + square / residuals.sigma_m[k] ** 2 / 8.0) ** -4.5
                 if heights:
                     density *= (1.0 + ((residuals.above_m[k, t] - h) / residuals.sigma_up_m[k]) ** 2 / 8.0) ** -4.5
-                seen[k, t, c] = density ** residuals.weight[k]
-        seen[k, 2] = np.exp(-5.0 * residuals.weight[k])
-    forward = [np.outer([1.0, 1.0, np.exp(-5.0)], prior).ravel() * seen[0].ravel()]
+                density *= np.exp(-5.0 * lies_on_another)
+                seen[k, state, c] = density ** residuals.weight[k]
+        seen[k, 4] = np.exp(-5.0 * residuals.weight[k])
+    first = [0.475, 0.475, *(0.025 * residuals.clear[0]), 0.05 * np.exp(-5.0)]
+    forward = [np.outer(first, prior).ravel() * seen[0].ravel()]
     whole = []
     for k in range(1, n):
         plan = _urn(balls, residuals.seconds[k])
@@ -102,7 +111,8 @@ def test_probabilities_are_those_of_one_chain_of_all_states(heights: bool, monke
     backward = [np.ones(seen[0].size)]
     for k in range(n - 1, 0, -1):
         backward.insert(0, whole[k - 1] @ (seen[k].ravel() * backward[0]))
-    expected = np.array([(a * b).reshape(3, -1).sum(axis=1) for a, b in zip(forward, backward, strict=True)])
+    expected = np.array([(a * b).reshape(5, -1).sum(axis=1) for a, b in zip(forward, backward, strict=True)])
+    expected = np.column_stack([expected[:, :2], expected[:, 2:].sum(axis=1)])
     _, probability = decode(residuals, moves)
     assert probability == pytest.approx(expected / expected.sum(axis=1, keepdims=True), abs=1e-9)
 
@@ -173,6 +183,49 @@ def test_height_tells_a_viaduct_from_the_line_below() -> None:
         assert matched.probability[200:].min() > 0.9
     blind = match(net, replace(log, height_m=None, sigma_up_m=None))
     assert np.abs(blind.probability - 0.5).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("missing_m", "unmapped"), [(0.0, (0.0, 0.01)), (3.6, (0.01, 1.0)), (7.2, (0.99, 1.0)), (15.0, (0.99, 1.0))]
+)
+def test_a_track_that_the_map_lacks_is_possible(missing_m: float, unmapped: tuple[float, float]) -> None:
+    """The train runs beside the only track, for ten minutes, with an error of 0.8 m toward it."""
+    x = np.linspace(0.0, 8000.0, 161)
+    net = Network(tracks=(segment("M", *to_degrees(x, 0.0 * x)),), links=())
+    latitude, longitude = to_degrees(np.arange(1000.0, 7000.0, 10.0), np.full(600, max(missing_m - 0.8, 0.0)))
+    log = PlanLog(
+        path="made",
+        time=np.datetime64("2024-01-01", "ns") + np.arange(600) * np.timedelta64(1, "s"),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.full(600, 1.5),
+    )
+    for reverse in (False, True):
+        turned = replace(net, tracks=(net.tracks[0].reverse(),)) if reverse else net
+        matched = match(turned, log)
+        share = 1.0 - matched.probabilities.sum(axis=1)
+        assert (share >= unmapped[0]).all()
+        assert (share <= unmapped[1]).all()
+        assert (matched.track == (0 if missing_m < 5.0 else -1)).all()
+
+
+def test_a_track_that_the_map_lacks_stays_where_the_nearest_track_changes() -> None:
+    """7.2 m right of T0 and 6.8 m left of T1, which is nearer now and then and is drawn in the other direction."""
+    x = np.linspace(0.0, 8000.0, 161)
+    tracks = (segment("T0", *to_degrees(x, 0.0 * x)), segment("T1", *to_degrees(x[::-1], np.full(161, -14.0))))
+    net = Network(tracks=tracks, links=())
+    north = -7.2 + np.random.default_rng(2).normal(0.0, 1.0, 600)
+    latitude, longitude = to_degrees(np.arange(1000.0, 7000.0, 10.0), north)
+    log = PlanLog(
+        path="made",
+        time=np.datetime64("2024-01-01", "ns") + np.arange(600) * np.timedelta64(1, "s"),
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.full(600, 1.5),
+    )
+    matched = match(net, log)
+    assert set(matched.candidates.track[:, 0].tolist()) == {0, 1}
+    assert (1.0 - matched.probabilities.sum(axis=1)).min() > 0.99
 
 
 def test_a_few_positions_far_off_move_no_train_to_the_track_beside() -> None:

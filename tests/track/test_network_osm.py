@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -125,3 +127,50 @@ def test_cant_signed_by_the_side_of_the_curve_is_found(
     path.write_text("# crs: EPSG:4258\nlatitude_deg,longitude_deg,height_m,cant_mm,radius_m\n" + "\n".join(rows) + "\n")
     found = {f.severity for f in check_track(read_track(path)).findings if f.kind == "cant side"}
     assert found == ({severity} if severity else set())
+
+
+def _varint(number: int) -> bytes:
+    number &= (1 << 64) - 1
+    parts = [number >> shift & 127 for shift in range(0, max(number.bit_length(), 1), 7)]
+    return bytes(part | 128 for part in parts[:-1]) + bytes(parts[-1:])
+
+
+def _field(key: int, value: int | bytes) -> bytes:
+    if isinstance(value, int):
+        return _varint(key << 3) + _varint(value)
+    return _varint(key << 3 | 2) + _varint(len(value)) + value
+
+
+def _deltas(values: list[int]) -> bytes:
+    steps = [b - a for a, b in zip([0, *values], values, strict=False)]
+    return b"".join(_varint(step << 1 ^ step >> 63) for step in steps)
+
+
+def _packed(path: Path, sign: int) -> Path:
+    """Write an .osm.pbf file (https://wiki.openstreetmap.org/wiki/PBF_Format) of one way with ids of a sign."""
+    ids = [sign * k for k in (1, 2, 3)]
+    table = b"".join(_field(1, text) for text in (b"", b"railway", b"rail", b"name", b"Main"))
+    dense = (
+        _field(1, _deltas(ids))
+        + _field(8, _deltas([480000000, 480010000, 480020000]))
+        + _field(9, _deltas([8 * 10**7] * 3))
+    )
+    way = _field(1, sign * 7) + _field(2, bytes([1, 3])) + _field(3, bytes([2, 4])) + _field(8, _deltas(ids))
+    with path.open("wb") as file:
+        for kind, data in (
+            (b"OSMHeader", _field(4, b"OsmSchema-V0.6") + _field(4, b"DenseNodes")),
+            (b"OSMData", _field(1, table) + _field(2, _field(2, dense)) + _field(2, _field(3, way))),
+        ):
+            blob = _field(2, len(data)) + _field(3, zlib.compress(data))
+            head = _field(1, kind) + _field(3, len(blob))
+            file.write(struct.pack(">I", len(head)) + head + blob)
+    return path
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_packed_extract_is_read_whatever_the_sign_of_its_ids(tmp_path: Path, sign: int) -> None:
+    """Open Source Railway Designer exports its networks with negative ids."""
+    net = read_network([_packed(tmp_path / "osrd.osm.pbf", sign)])
+    assert net.names == (f"way/{sign * 7} Main",)
+    assert len(net.points_m) == 3
+    assert "osmium cat FILE.osm.pbf -o FILE.osm" in net.notes[0]

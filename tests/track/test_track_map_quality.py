@@ -91,7 +91,7 @@ def test_duplicates_and_near_duplicates() -> None:
     north[21] = north[20] + 0.05
     found = check_track(track_of(east, north, up)).findings
     assert [(f.kind, f.severity, f.first, f.last) for f in found] == [
-        ("duplicate", "error", 10, 11),
+        ("duplicate", "warning", 10, 11),
         ("near duplicate", "warning", 20, 21),
     ]
     assert found[1].value == pytest.approx(0.05, abs=1e-6)
@@ -186,21 +186,20 @@ def test_a_reverse_curve_is_no_radius_of_the_wrong_side() -> None:
     assert "radius side" in kinds(track_of(east, north, radius_m=-radius))
 
 
-def test_two_points_are_enough_and_all_equal_points_are_an_error() -> None:
+def test_two_points_are_enough_and_equal_points_are_named() -> None:
     assert check_track(track_of(np.zeros(2), np.array([0.0, 10.0]))).findings == ()
-    found = check_track(track_of(np.zeros(3), np.zeros(3))).errors
-    assert [finding.kind for finding in found] == ["duplicate"]
+    assert "duplicate" in kinds(track_of(np.zeros(3), np.zeros(3)))
 
 
 def test_the_report_orders_errors_first_and_tells_the_marking() -> None:
     east, north, up = _line()
-    north[31] = north[30]
     north[11] = north[10] + 0.05
+    up[30] += 9.0
     quality = check_track(track_of(east, north, up, kilometrage_m=700.0 + north))
-    assert [f.severity for f in quality.findings] == ["error", "warning"]
-    assert quality.errors[0].kilometrage_m == 700.0 + north[30]
-    assert len(quality.warnings) == 1
-    assert quality.errors[0].sentence.startswith("at 150.0 m:")
+    assert quality.findings == (*quality.errors, *quality.warnings)
+    assert "near duplicate" in [f.kind for f in quality.warnings]
+    assert quality.errors[0].kilometrage_m == 700.0 + north[29]
+    assert quality.errors[0].sentence.startswith("at 145.0 m to 165.")
 
 
 def test_limits_must_be_positive() -> None:

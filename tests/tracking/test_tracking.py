@@ -7,14 +7,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.constants import ACROSS_LOST
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.chunk import prepare_chunk
+from railfix.tracking.chunk import compute_singer_step, prepare_chunk
 from railfix.tracking.search import places
-from railfix.tracking.state import Monitors, StateIndex, TrackState
-from railfix.tracking.velocity import singer_step
+from railfix.tracking.state import Monitors, TrackState
 from tracking_cases import (
     ORIGIN_M,
     Ride,
@@ -55,9 +55,9 @@ def test_a_start_does_not_depend_on_where_the_map_has_its_points(start_m: float)
     for step in (40.0, 1.0):
         points = ORIGIN_M[0] + np.arange(0.0, 2001.0, step)[:, None] * ORIGIN_M[1]
         case = ride(5, trajectory=Trajectory.from_antenna_path(Track.from_ecef(points)), start_m=start_m, noise=1.0)
-        state = TrackState.empty()
+        state = TrackState()
         chunk = prepare_chunk(part(case.epochs, slice(0, 1)), state, TrackingLimits())
-        found.append(places(chunk, 0, case.line, TrackingLimits())[0])
+        found.append(places(chunk, 0, case.line, TrackingLimits()))
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
     assert np.abs(found[0][0] - start_m) < 10.0
 
@@ -83,7 +83,7 @@ def test_a_chunk_with_its_channels_in_another_order_goes_on_with_the_phases_of_t
     late = part(case.epochs, slice(40, None))
     columns = {name: getattr(late, name) for name in names if getattr(late, name).shape[1:2] == (10,)}
     turned = {name: values[:, order] for name, values in columns.items()}
-    turned |= {name: getattr(late, name)[order] for name in ("satellite", "clock")}
+    turned |= {name: getattr(late, name)[order] for name in ("satellite", "signal", "clock")}
     _, state = track(part(case.epochs, slice(0, 40)), case.line)
     found, _ = track(replace(late, **turned), case.line, state)
     absent = [k for k in range(10) if k not in order]
@@ -93,6 +93,31 @@ def test_a_chunk_with_its_channels_in_another_order_goes_on_with_the_phases_of_t
     expected, _ = track(replace(late, code_m=code, phase_m=phase, rate_mps=rate), case.line, state)
     np.testing.assert_allclose(found.arc_m, expected.arc_m, atol=1e-6)
     np.testing.assert_allclose(found.weight, expected.weight[..., order], atol=1e-6)
+
+
+@pytest.mark.requirement("A8")
+def test_a_satellite_whose_signals_take_turns_is_the_same_epoch_by_epoch() -> None:
+    """Its error goes on with either signal; its phase goes on with its own alone."""
+    epochs, line = ride(60, noise=1.0).epochs, ride(60).line
+    both = np.append(np.arange(10), 3)  # the fourth satellite has two signals
+    fourth = np.arange(60) % 7 == 5  # in some epochs only the second one
+    values = {f.name: getattr(epochs, f.name) for f in fields(GnssEpochs) if getattr(epochs, f.name) is not None}
+    values |= {name: value[:, both] for name, value in values.items() if value.shape[1:2] == (10,)}
+    values |= {name: values[name][both] for name in ("satellite", "signal", "clock")}
+    values["signal"][-1] = "1W"
+    for name in ("code_m", "phase_m", "rate_mps"):
+        values[name] = np.array(values[name])
+        values[name][fourth, 3], values[name][~fourth, -1] = np.nan, np.nan
+    values["phase_joined"] = np.array(values["phase_joined"])
+    values["phase_joined"][1:, [3, -1]] = (fourth[1:] == fourth[:-1])[:, None]
+    mixed = GnssEpochs(**values)
+    whole, _ = track(mixed, line)
+    state, arcs = None, []
+    for k in range(60):
+        one = part(mixed, slice(k, k + 1))
+        found, state = track(one, line, state)
+        arcs.append(found.arc_m[0])
+    np.testing.assert_allclose(np.array(arcs), whole.arc_m, atol=1e-9)
 
 
 @pytest.mark.requirement("E5")
@@ -215,8 +240,8 @@ def test_a_place_put_wrong_is_lost_and_sought_again() -> None:
 
 @pytest.mark.requirement("E5")
 def test_the_noise_of_the_motion_is_that_of_many_short_steps() -> None:
-    whole_step, whole_noise = singer_step(3.0, 1.0, 2.0)
-    step, noise = singer_step(0.01, 1.0, 2.0)
+    whole_step, whole_noise = compute_singer_step(3.0, 1.0, 2.0)
+    step, noise = compute_singer_step(0.01, 1.0, 2.0)
     total, product = np.zeros((3, 3)), np.eye(3)
     for _ in range(300):
         total = step @ total @ step.T + noise
@@ -232,7 +257,7 @@ def test_inputs_are_left_as_they_are() -> None:
         if array is not None:
             array.setflags(write=False)
     _, state = track(part(case.epochs, slice(0, 15)), case.line)
-    for array in (state.mean, state.covariance, state.log_probability):
+    for array in (state.mean, state.covariance, state.hypothesis["log_probability"]):
         array.setflags(write=False)
     track(part(case.epochs, slice(15, 30)), case.line, state)
 
@@ -247,7 +272,7 @@ def _looped(trajectory_length: float) -> tuple[GnssEpochs, np.ndarray, Line]:
 def test_probabilities_sum_to_one_and_motion_decides() -> None:
     epochs, arc, line = _looped(1500.0)
     result, state = track(epochs, line, limits=TrackingLimits())
-    assert np.exp(state.log_probability).sum() == pytest.approx(1.0)
+    assert np.exp(state.hypothesis["log_probability"]).sum() == pytest.approx(1.0)
     assert np.nanmax(result.probability) <= 1.0 + 1e-12
     assert np.abs(result.arc_m - arc)[-20:].max() < 8.0
 
@@ -382,18 +407,18 @@ def test_codes_count_at_once_when_they_come_back() -> None:
 @pytest.mark.requirement("E5")
 def test_nothing_learnt_outlives_a_reset() -> None:
     """Every field of the state but the times, the satellites and what withholds a level is that of an empty one."""
-    kept = {"time", "satellite", "seen", "previous", "measured"}
+    kept = {"time", "origin", "satellite", "seen", "previous"}
     case = ride(60)
     _, state = track(case.epochs, case.line, levels=True)
     learnt = [item.name for item in fields(TrackState) if item.name not in kept]
     state.monitors = Monitors(**dict.fromkeys((item.name for item in fields(Monitors)), 1.5))
     state.reset()
-    empty = TrackState.empty()
-    assert state.monitors == Monitors(level_hold_s=1.5, ambiguity_hold_s=1.5)
+    empty = TrackState()
+    assert state.monitors == Monitors(level_hold_s=1.5, ambiguity_hold_s=1.5, measured_s=1.5)
     for name in learnt:
         value, begun = getattr(state, name), getattr(empty, name)
         if isinstance(value, np.ndarray):
-            assert not value.any(), name
+            assert not len(value) or not value.any(), name
         elif name != "monitors":
             assert value == begun or str(value) == str(begun) == "NaT", name
     assert state.time == case.epochs.time[-1]
@@ -404,11 +429,11 @@ def test_an_improbable_place_hides_no_other() -> None:
     """Places near a hypothesis are not restarted, unless it has drifted off them and is as good as excluded."""
     case = ride(40, noise=0.5)
     _, state = track(case.epochs.take(slice(0, 30)), case.line)
-    for name in ("mean", "covariance", "log_code", "log_least", "log_recent"):
+    for name in ("mean", "covariance", "hypothesis"):
         setattr(state, name, np.repeat(getattr(state, name)[:1], 2, axis=0))
-    for arc in (StateIndex.ARC, StateIndex.PREVIOUS_ARC):
+    for arc in (ix.ARC, ix.PREVIOUS_ARC):
         state.mean[:, arc] += [600.0, 50.0]
-    state.log_probability, state.origin_m = np.array([0.0, -36.0]), state.mean[:, StateIndex.ARC].copy()
+    state.hypothesis["log_probability"], state.hypothesis["origin_m"] = [0.0, -36.0], state.mean[:, ix.ARC]
     state.monitors = replace(state.monitors, across=ACROSS_LOST)
     result, _ = track(case.epochs.take(slice(30, None)), case.line, state)
     assert result.hypotheses[0] == 3

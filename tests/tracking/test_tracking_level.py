@@ -13,6 +13,7 @@ from scipy.stats import norm
 import belief_campaign
 from plain_kernels import given, kernel_state, plain
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking import layout
 from railfix.kernels.tracking.constants import (
     LEVEL_DOUBT_S,
@@ -24,8 +25,9 @@ from railfix.kernels.tracking.constants import (
 )
 from railfix.tracking import GnssEpochs, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.bank import OTHERS, budget
+from railfix.tracking.line import TILT_M
 from railfix.tracking.result import EPOCH_RESULT
-from railfix.tracking.state import SATELLITES, StateIndex, TrackState
+from railfix.tracking.state import TrackState
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
@@ -39,14 +41,17 @@ def level_of(
     branch: tuple[float, float, float, float] | None = None,
     weak_s: float = 0.0,
     in_view: tuple[float, float] | None = None,
+    slow: tuple[float, float, float] | None = None,
 ) -> dict[str, float]:
     """Levels of a place at 100 m with a standard deviation of 1 m, by sub-filters and at most one other branch.
 
     The branch has a probability, a distance along the line, a straight one, and a standard deviation; `in_view` is
-    place and standard deviation of the sub-filter with all satellites in view, where it runs.
+    place and standard deviation of the sub-filter with all satellites in view, where it runs; `slow` is the slow code
+    error of each Gaussian, its variance and its covariance with the place: the ionosphere may be tilted.
     """
     probability, apart, ground, sigma = branch or (0.0, 0.0, 0.0, 0.0)
     count = 1 if branch is None else 2
+    limits = LIMITS.replaced(level_tilt_prior=0.0 if slow is None else LIMITS.level_tilt_prior)
     state = kernel_state(
         [100.0, 100.0 + apart][:count] + place_m,
         [1.0, sigma][:count] + sigma_m,
@@ -55,14 +60,19 @@ def level_of(
         names,
     )
     state.source["contradicted_s"][: len(names)] = weak_s
+    if slow is not None:
+        state.x[:, ix.SLOW_CODE], state.P[:, ix.SLOW_CODE, ix.SLOW_CODE] = slow[:2]
+        state.P[:, ix.SLOW_CODE, ix.ARC] = state.P[:, ix.ARC, ix.SLOW_CODE] = slow[2]
     if in_view is not None:
         state.source["running"][-1], state.x[-1, 0], state.P[-1, 0, 0] = True, in_view[0], in_view[1] ** 2
     far, level = probability if apart > LIMITS.start_separation_m else 0.0, plain("tracking.level")
     branches = level.Alternatives(
-        *np.array([[0.0 if far else apart], [ground], [sigma], [probability]])[:, : count - 1]
+        *np.array([[0.0 if far else apart], [ground], [0.6 * ground], [sigma], [probability]])[:, : count - 1]
     )
     result = np.zeros(1, dtype=EPOCH_RESULT)
-    level.write_level(given(LIMITS), state, branches, far, result[0])
+    settings = given(limits)
+    settings.line["tilt_m"] = TILT_M[0]
+    level.write_level(settings, state, branches, far, result[0])
     fields = ("level_m", "ground_level_m", "level_noise_m", "separation_m")
     return {name: float(result[name][0]) for name in fields}
 
@@ -84,24 +94,44 @@ def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
 
 
 @pytest.mark.requirement("C6")
+def test_a_tilted_ionosphere_is_a_hypothesis_of_the_level() -> None:
+    """Against the equation, with the place of a larger slow code error by inverting the information of both."""
+    risks, slow = budget(LIMITS), (0.4, 0.9, -0.8)
+    found = level_of(["G01"], [100.4], [1.1], slow=slow)["level_m"]
+    information = np.linalg.inv([[1.0, slow[2]], [slow[2], slow[1]]])
+    vector = information @ [0.0, slow[0]]
+    information[1, 1] += 1.0 / TILT_M[0] ** 2 - 1.0 / LIMITS.slow_code_m**2
+    tilted = np.linalg.inv(information)
+    assert tilted[0, 0] > 2.0
+    place, sigma = np.array([0.0, 0.4, (tilted @ vector)[0]]), np.array([1.0, 1.1, tilted[0, 0] ** 0.5])
+    prior = np.array([1.0, risks.prior[0], LIMITS.level_tilt_prior])
+    parts = prior * (norm.sf((found - place) / sigma) + norm.sf((found + place) / sigma))
+    assert parts.argmax() == 2
+    assert parts.sum() == pytest.approx(risks.risk, rel=1e-6)
+
+
+@pytest.mark.requirement("C6")
 @pytest.mark.parametrize("probability", [1e-12, 1e-9, 1e-6, 1e-3, 0.4])
 def test_other_branches_are_hypotheses_of_the_level(probability: float) -> None:
-    """Against the equation: near along the line, or at another place of it that is near on the ground."""
+    """Against the equation: near along the line, or at another place of it that is near on the ground; with a fault of
+    the satellite, which shifts the place on the other branch, too."""
     risks = budget(LIMITS)
     for apart, ground in ((40.0, 35.0), (1815.0, 3.0), (900.0, 18.0)):
         found = level_of(["G01"], [101.0], [2.0], branch=(probability, apart, ground, 2.0))
 
-        def spent(level: float, distance: float) -> float:
-            own = risks.prior[0] * (norm.sf((level - 1.0) / 2.0) + norm.sf((level + 1.0) / 2.0))
-            other = probability * (norm.sf((level - distance) / 2.0) + norm.sf((level + distance) / 2.0))
-            return float(2.0 * norm.sf(level) + own + other)
+        def spent(level: float, distance: float, shifted: float) -> float:
+            places = ((risks.prior[0], 1.0), (probability, distance), (risks.prior[0] * probability, shifted))
+            parts = [p * (norm.sf((level - at) / 2.0) + norm.sf((level + at) / 2.0)) for p, at in places]
+            return float(2.0 * norm.sf(level) + sum(parts))
 
-        assert spent(found["ground_level_m"], ground) == pytest.approx(risks.risk, rel=1e-5)
+        shifted = np.hypot(0.8 * ground, 0.6 * ground + 1.0)
+        assert spent(found["ground_level_m"], ground, shifted) == pytest.approx(risks.risk, rel=2e-3)
         if apart > LIMITS.start_separation_m and probability > risks.risk:
             assert found["level_m"] == np.inf
         else:
             distance = apart if apart <= LIMITS.start_separation_m else 0.0
-            assert spent(found["level_m"], distance) == pytest.approx(risks.risk, rel=1e-5)
+            shifted = distance + 1.0 if distance else 0.0
+            assert spent(found["level_m"], distance, shifted) == pytest.approx(risks.risk, rel=2e-3)
 
 
 @pytest.mark.requirement("C2")
@@ -198,18 +228,18 @@ def test_the_sub_filter_with_all_in_view_begins_without_codes_too_and_ends_besid
 def test_what_a_map_is_off_across_is_off_along_after_a_bend() -> None:
     """By hand, 60 degrees to the left: the way on the map has it, what the phases measure has not."""
     random, turn = np.random.default_rng(3), np.radians(60.0)
-    mean, root = random.normal(size=SATELLITES), random.normal(size=(SATELLITES, SATELLITES))
-    mean[StateIndex.ARC], mean[StateIndex.PREVIOUS_ARC] = 100.0, 0.0
+    mean, root = random.normal(size=ix.SATELLITES), random.normal(size=(ix.SATELLITES, ix.SATELLITES))
+    mean[ix.ARC], mean[ix.PREVIOUS_ARC] = 100.0, 0.0
     vertex = np.zeros(3, dtype=layout.VERTEX)
     vertex["arc_m"], vertex["axes"] = [0.0, 100.0, 200.0], np.eye(3)
     vertex["axes"][1:, 0] = np.cos(turn), -np.sin(turn), 0.0
     vertex["axes"][1:, 1] = np.sin(turn), np.cos(turn), 0.0
     x, P = mean.copy(), root @ root.T
     plain("tracking.subfilters").rotate_map_error(given(LIMITS)._replace(vertex=vertex), x, P)
-    step = np.eye(SATELLITES)
-    right = StateIndex.MAP_RIGHT
-    step[StateIndex.ARC, right] = -np.sin(turn)
-    step[StateIndex.MAP_LENGTH_ERROR, right] = np.sin(turn)
+    step = np.eye(ix.SATELLITES)
+    right = ix.MAP_RIGHT
+    step[ix.ARC, right] = -np.sin(turn)
+    step[ix.MAP_LENGTH_ERROR, right] = np.sin(turn)
     step[right, right] = np.cos(turn)
     expected = step @ root @ root.T @ step.T
     expected[right, right] += (LIMITS.level_map_m * np.sin(turn)) ** 2
@@ -222,7 +252,7 @@ def test_what_a_map_is_off_across_is_off_along_after_a_bend() -> None:
 def test_only_the_map_that_lies_aside_withholds_the_level(name: str) -> None:
     """A displacement of 9 m does in the sub-filter of the map, in no other."""
     state = kernel_state([100.0], [1.0], [0.0], LIMITS, ["G"], branch_s=LEVEL_START_S)
-    at, right = 1 + list(OTHERS).index(name), StateIndex.MAP_RIGHT
+    at, right = 1 + list(OTHERS).index(name), ix.MAP_RIGHT
     state.source["running"][at], state.x[1 + at, right], state.P[1 + at, right, right] = True, 9.0, 1.0
     plain("tracking.monitors").update_monitors(state, np.nan, 0.0, 0.0, 1.0, 1.0)
     assert state.monitors["level_hold_s"][0] == (LEVEL_HOLD_S if name == "map" else 0.0)
@@ -241,8 +271,7 @@ def test_a_map_that_may_be_wrong_is_so_where_nothing_is_measured() -> None:
     assert kept < 0.5
     for name, wrong_m in (("map", LIMITS.level_map_m), ("G", 0.0)):
         old, new = (
-            bank.covariance[bank.without.index(name), StateIndex.MAP_RIGHT, StateIndex.MAP_RIGHT]
-            for bank in (before.bank, after.bank)
+            bank.covariance[bank.without.index(name), ix.MAP_RIGHT, ix.MAP_RIGHT] for bank in (before.bank, after.bank)
         )
         walked = (case.line.sigma_plan_m**2 + wrong_m**2) * (1.0 - kept)
         assert new == pytest.approx(kept * old + walked, rel=0.05)
@@ -320,6 +349,27 @@ def test_a_satellite_behind_a_bridge_keeps_its_sub_filter_and_one_long_gone_has_
     assert str(case.epochs.satellite[5]) not in state.bank.without
     # A sub-filter that had restarted would ask for K1 times what codes of one epoch tell.
     assert result.level_m[45:50].max() < 1.5 * result.level_m[35:40].max()
+
+
+@pytest.mark.requirement("C6")
+def test_without_the_other_constellation_the_level_names_the_risk_that_nothing_bounds() -> None:
+    """The sub-filter without the last constellation has nothing to measure: it goes, and comes back with the other."""
+    case = ride(240, noise=1.0, seed=3)
+    lost = (case.epochs.clock == "E") & ((np.arange(240) >= 60) & (np.arange(240) < 180))[:, None]
+    blank = {name: np.where(lost, np.nan, getattr(case.epochs, name)) for name in ("code_m", "phase_m", "rate_mps")}
+    found, state = track(replace(case.epochs, **blank), case.line, limits=LIMITS, levels=True)
+    prior = budget(LIMITS).prior[1]
+    np.testing.assert_array_equal(found.unchecked_prior[50:60], 0.0)
+    np.testing.assert_array_equal(found.unchecked_prior[90:180], prior)
+    assert found.level_m[60:90].max() > 100.0
+    alone = (case.epochs.clock == "E") & np.full((240, 1), True)
+    blank = {name: np.where(alone, np.nan, getattr(case.epochs, name)) for name in blank}
+    one, _ = track(replace(case.epochs, **blank), case.line, limits=LIMITS, levels=True)
+    np.testing.assert_array_equal(one.unchecked_prior[50:], prior)
+    np.testing.assert_allclose(found.level_m[150:180], one.level_m[150:180], rtol=0.2)
+    assert state.bank is not None
+    assert {"E", "G"} < set(state.bank.without)
+    assert found.unchecked_prior[-1] == 0.0
 
 
 @pytest.mark.requirement("C2")

@@ -24,7 +24,7 @@ class _Program(LazyCommands):
 
     summaries: ClassVar[Mapping[str, str]] = {
         "run": "Position receiver logs along the line.",
-        "doctor": "Examine files: what they are, whether they fit, the command to run.",
+        "doctor": "Examine files: identify each, check that they fit together, print the command to run.",
         "explain": "Explain one epoch of a run: its satellites, sigma, level and status.",
         "export": "Write positions of a run for maps: KML, GPX, GeoJSON, GeoPackage, GeoParquet.",
         "campaign": "Position many logs side by side, resumable.",

@@ -77,7 +77,7 @@ def campaign(
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
-    Exit codes as `railfix --help` says; 5 where some runs have failed, 7 where every one has.
+    Exit codes are those of `railfix --help`; 5 where some runs have failed, 7 where all have failed.
     """
     with open_executor(workers, scheduler) as (executor, lost):
         prepare_kernels()
@@ -102,7 +102,7 @@ def campaign(
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print how many runs are done, those of an earlier call among them, and the time left."""
+    """Print how many runs are done, earlier calls included, and the time left."""
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} from before)" if kept else ""
     typer.echo(f"{done} of {total} runs{before}, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
@@ -126,7 +126,7 @@ def _prepare_worker() -> None:
 
 
 def _end(number_of_signal: int, frame: object) -> None:
-    """End by way of an exception, which a second signal does not disturb."""
+    """End by an exception, which a second signal does not interrupt."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
     raise_exit(number_of_signal, frame)
@@ -134,9 +134,9 @@ def _end(number_of_signal: int, frame: object) -> None:
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
-    """Yield the executor, and the errors by which it reports that a worker process is gone.
+    """Yield the executor, and the errors that report a lost worker process.
 
-    SettingsError: there is no such scheduler, or `distributed` is not installed.
+    SettingsError: the scheduler does not exist, or `distributed` is not installed.
     """
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
@@ -171,7 +171,7 @@ def benchmark(
     out: OutOption,
     workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Processes side by side.")] = 2,
 ) -> None:
-    r"""Run the cases of a folder with one configuration, and judge them beside other programs.
+    r"""Run the cases of a folder with one configuration, and compare them with other programs.
 
     `case.toml` of a case names its files, relative to its folder, each with its SHA-256; a file with another one is
     refused. `files` has the names of the options of `railfix run`, and the ground truth:
@@ -195,14 +195,14 @@ def benchmark(
     `positions` are those of other programs (RTKLIB, NMEA, CSV), moved to the nearest point of the line and judged by
     the same code, as RTKLIB's single point is where `rnx2rtkp` is installed. `scenario` describes the recording as
     EN 16803-2 requires for record and replay; `options` and `evaluation` are of `railfix run` and `railfix evaluate`.
-    A case with `held_out` is for the benchmark alone: settings made from its files are refused.
+    A case with `held_out` is for the benchmark alone: settings that were made from its files are rejected.
 
     Into DIR come `benchmark.csv`, `benchmark.json` and `benchmark.md`, and the folders of the runs; a run that is
     there, of the same inputs and settings, is not repeated.
 
     Example: `railfix benchmark cases --out benchmark`
 
-    Exit codes as `railfix --help` says; 5 where some cases have failed, 7 where every one has.
+    Exit codes are those of `railfix --help`; 5 where some cases have failed, 7 where all have failed.
     """
     config, _ = resolve_settings(choices)
     with open_executor(workers, None) as (executor, lost):
@@ -232,18 +232,18 @@ def ablate(
 ) -> None:
     r"""Compare choices of screens on a log: all screens, none, each alone, all but each.
 
-    The logs are read once. Screens that are off in the settings stay off, and inactive ones
-    (no second antenna, no C/N0 curve) are left out and named. Validity and health of the satellites are
-    checked in every case; `none` is these checks alone, without an elevation mask.
+    The logs are read once. Screens that are off in the settings stay off, and screens that cannot be run (no second
+    antenna, no C/N0 curve) are left out and named. Validity and health of the satellites are checked in every case;
+    `none` is these checks alone, without an elevation mask.
 
-    With `--filter track` the filter along the track has rows too: with every source that is there
-    (codes, phases, Dopplers, and the sensors given) and without each but codes, all screens on.
+    With `--filter track` there are rows for the filter along the track too: with every available source (codes, phases,
+    Dopplers, and the sensors given), and without each of them except codes, all screens on.
 
     For each choice: the rate of epochs with coordinates and of status ok, satellites used, the median
     standard deviation along the line; with `--truth` also the errors along the line (over 50 m counts as
     a wrong position), of all epochs with coordinates and of those that are ok, of epochs without satellites, and the
-    95th percentile of the error over its stated sigma. Into DIR come
-    `ablation.csv` with all figures, those of the conventional position included, and `ablation.json`.
+    95th percentile of the error over its stated sigma. `ablation.csv` in DIR has all figures, with the conventional
+    position; `ablation.json` has the record.
 
     Example:
 
@@ -251,7 +251,7 @@ def ablate(
 
         railfix ablate ... --tachometer pulses.csv --inertial imu.csv --filter track --out sources
 
-    Exit codes as `railfix --help` says.
+    Exit codes are those of `railfix --help`.
     """
     settings, asked = resolve_settings(choices)
     inputs = inputs.replaced(config=choices.config)

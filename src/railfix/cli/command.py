@@ -21,7 +21,7 @@ from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from railfix.core.errors import InputFileError, OutputError, RailfixError, SettingsError
 
-#: Words that are given to switches by mistake.
+#: Words that users mistakenly give to switches.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
 #: Packages that commands import when they are called, and the extra of railfix that installs each.
 EXTRAS: Final = {
@@ -40,9 +40,9 @@ EXTRAS: Final = {
 }
 #: A signal ends the program with this exit code plus its number, as in a shell.
 SIGNALLED: Final = 128
-#: What `pathlib` reports of a link that leads to itself.
+#: Message of `pathlib` for a link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
-#: What the system reports of a standard output that cannot take any more.
+#: Message of the system for a standard output that accepts no more.
 _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
 
@@ -113,7 +113,7 @@ class Commands(TyperGroup):
             _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; link to the file"))
 
 
-#: Of every program: rich formats help alone.
+#: For all programs: rich formats only the help.
 _TYPER: Final[dict[str, Any]] = {
     "add_completion": False, "pretty_exceptions_enable": False, "rich_markup_mode": "markdown"
 }  # fmt: skip
@@ -128,7 +128,7 @@ class LazyCommands(Commands):
     """The commands of the program, each imported from its module when it is called; `summaries` are for their list."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Modules of the commands that share one.
+    #: Modules of commands that share one module.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -147,13 +147,13 @@ class LazyCommands(Commands):
         word = args[0] if args else ""
         near = [] if word in known or word.startswith("-") else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
         if near:
-            ctx.fail(f"there is no command {word!r}; is {near[0]!r} meant?")
+            ctx.fail(f"no such command: {word!r}; is {near[0]!r} meant?")
         name, command, rest = super().resolve_command(ctx, args)
         return name, load_command(str(name), self.modules.get(str(name))) if name in self.summaries else command, rest
 
 
 def load_command(name: str, module_name: str | None = None) -> Any:
-    """Return a command, imported from its module in `railfix.cli`: by default that of its name."""
+    """Return a command, imported from its module in `railfix.cli`, by default the module of the same name."""
     word = name.replace("-", "_")
     module = import_module(f"railfix.cli.{module_name or word}")
     app = getattr(module, "app", None)
@@ -188,7 +188,7 @@ def run_program(app: typer.Typer) -> NoReturn:
 
 
 def raise_exit(number: int, _frame: object) -> None:
-    """End by way of an exception, so that staging folders are removed."""
+    """End by an exception, so that staging folders are removed."""
     raise SystemExit(SIGNALLED + number)
 
 

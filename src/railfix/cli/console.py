@@ -36,7 +36,7 @@ _MOST: Final = 5
 #: Most lines that a run prints without ``--verbose``.
 _MOST_LINES: Final = 12
 _ANTENNAS: Final = ("front", "rear")
-#: Errors that are this many stated standard deviations at their 95th percentile (2.0 for normal ones) are no match.
+#: Errors whose 95th percentile exceeds this many stated standard deviations (2.0 for normal ones) do not match.
 _OVERCONFIDENT: Final = 3.0
 
 
@@ -55,7 +55,9 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Say for each run and antenna how good its positions are and whether what it states is true; the worst first."""
+    """Print for each run and antenna the accuracy of its positions and whether its stated figures are true; the worst
+    first.
+    """
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
@@ -130,7 +132,7 @@ class TableConsole(Console):
     """The standard output: text as it is; a table that is wider is printed in parts, and no number is cut or folded."""
 
     def __init__(self) -> None:
-        super().__init__(highlight=False)
+        super().__init__(highlight=False, markup=False)
         if not self.is_terminal:
             self.width = max(self.width, _FILE_WIDTH)
 
@@ -177,7 +179,7 @@ def _with_columns(table: RichTable, columns: Sequence[TableColumn]) -> RichTable
 
 
 def show_table(console: Console, table: Table, *, most: int | None = None) -> None:
-    """Print a table of results under its caption, at most so many rows."""
+    """Print a table of results under its caption, limited to a number of rows."""
     if table.caption:
         console.print(table.caption)
     if not table.rows:
@@ -215,7 +217,9 @@ def show_files(console: Console, paths: Iterable[Path]) -> None:
 
 @contextmanager
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
-    """Yield a bar on the standard error output, with the rate and the time left; silent where that is no terminal."""
+    """Yield a progress bar on the standard error output, with the rate and the time left; silent where that is not a
+    terminal.
+    """
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -240,7 +244,8 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
 
 
 def show_summary(summary: RunSummary, *, verbose: bool) -> None:
-    """Print the verdict on a run, its notes, where the results are and what to do next, in at most `_MOST_LINES` lines.
+    """Print the verdict on a run, its notes, the location of the results and the next command, in at most `_MOST_LINES`
+    lines.
 
     With `verbose` all notes, and the tables of statuses and reasons.
     """
@@ -275,7 +280,7 @@ def show_budget(console: Console, summary: RunSummary) -> None:
 
 
 def join_antennas(notes: Iterable[str]) -> list[str]:
-    """Return notes in their order, those that say the same of two antennas as one."""
+    """Return notes in their order; notes that are equal for two antennas are merged."""
     texts: dict[str, list[str]] = {}
     for note in notes:
         antenna, colon, text = note.partition(": ")

@@ -108,7 +108,7 @@ def show_levels(evaluation: Evaluation, console: Console) -> None:
 
 
 def median_level(evaluation: Evaluation, kind: str, antenna: str) -> float | None:
-    """Return the median of the finite levels of the positions of status ok [m]; None where there is none."""
+    """Return the median of the finite levels of the positions of status ok [m]; None without one."""
     if evaluation.levels is None:
         return None
     wanted = {"antenna": antenna, "position": "constrained_ok", "level": f"{kind}_protection_level_m"}

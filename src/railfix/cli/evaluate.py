@@ -114,17 +114,16 @@ def evaluate(
     r"""Compute errors of runs along the line against references, and statistics of them.
 
     The error is the distance along the line from the reference to the position, + toward the end of
-    the line whichever way the train runs. Shown for the positions on the map, those of status ok, and
-    the conventional ones (3-D single point, moved to the nearest point of the line), over each one's own
-    epochs and over those that both have; by antenna, section, environment, speed, satellites used,
-    with and without satellites, and status; of several runs also by configuration and line.
+    the line whichever way the train runs. Tables are of the positions on the map, of those with status ok, and of
+    conventional positions (3-D single point, moved to the nearest point of the line), each over its own epochs and over
+    common ones; by antenna, section, environment, speed, satellites used, with and without satellites, and status; for
+    several runs also by configuration and line.
 
-    Into DIR come `evaluation.json` (all figures, options, hashes of the inputs), `errors.parquet` (one
-    row an epoch and antenna), `tables.csv`, `intervals.csv` and, where a run has protection levels,
-    `levels.csv`, `stanford_KIND.csv` (levels against errors, counted at each alarm limit) and
-    `beyond_KIND.csv` (every epoch whose error is over its level), with KIND `sbas`, `separation` or `train`;
-    for the filter along the track `outages.csv` (stretches without satellites) and `branches.csv` (stated
-    probability of the place against its correctness).
+    `evaluation.json` in DIR has all figures, options and hashes of the inputs, `errors.parquet` one row per epoch and
+    antenna; further files are `tables.csv`, `intervals.csv` and, where a run has protection levels, `levels.csv`,
+    `stanford_KIND.csv` (levels against errors, counted at each alarm limit) and `beyond_KIND.csv` (every epoch whose
+    error exceeds its level), with KIND `sbas`, `separation` or `train`; for the filter along the track `outages.csv`
+    (stretches without satellites) and `branches.csv` (stated probability of a branch against its correctness).
 
     Example:
 
@@ -182,10 +181,10 @@ def reference(
 ) -> None:
     r"""Build the reference trajectory of the antennas: fixed positions on the track, gaps between them bridged.
 
-    Positions are rejected that are not fixed, have a low ratio, whose two antennas are not as far apart as on the
-    vehicle, that lie off the antenna's trajectory, or that disagree with the distance travelled. The others are
-    matched to the trajectory. Between them Doppler speeds, pulses and acceleration, whichever are given, are
-    weighted by their variances, and the closing error of each gap is distributed over it. Written into DIR:
+    Positions are rejected if they are not fixed, have a low ratio, lie off the antenna's trajectory, disagree with the
+    distance travelled, or if the two antennas are not as far apart as on the vehicle. The others are matched to the
+    trajectory. Between them Doppler speeds, pulses and acceleration, whichever are given, are weighted by their
+    variances, and the closing error of each gap is distributed over it. Written into DIR:
 
     - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
     - `fixes.csv`: every position with its verdict and measurements
@@ -199,7 +198,7 @@ def reference(
         railfix reference --rtk rtk.pos --track line.csv --vehicle car.toml \
             --front front.obs --nav brdc.nav --pulses tacho.csv --out reference
 
-    Exit codes as `railfix --help` says; 7 where there are fewer than two good fixes.
+    Exit codes are those of `railfix --help`; 7 where there are fewer than two good fixes.
     """
     asked = settings.model_dump(mode="json", exclude_unset=True)
     show_reference(reference_files(inputs, settings, out=out, options=options, asked=asked))
@@ -238,8 +237,8 @@ def error_model(
 
     Each RUN is positioned once more with its own settings. The error of a pseudorange is its residual after the
     distance from the reference and the receiver clock are subtracted, and with `--base` also the residual of a
-    nearby reference station to the same satellite. Without `--base` the model includes the orbit, clock and
-    atmospheric errors of those days: it is wider, and valid for such days.
+    nearby reference station to the same satellite. Without `--base` the model includes the orbit, clock and atmospheric
+    errors of the days recorded: it is wider, and valid for such days.
 
     The file has bias, standard deviation and a Gaussian overbound for every bin of elevation, azimuth from the
     car's front and C/N0, before the screens and after. `railfix run --error-model MODEL.toml` derives
@@ -247,7 +246,7 @@ def error_model(
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
-    Exit codes as `railfix --help` says; 5 where run, reference and station do not match each other.
+    Exit codes are those of `railfix --help`; 5 where run, reference and station do not match.
     """
     reference = beside.reference
     if len(reference) != len(runs):
@@ -270,7 +269,7 @@ def error_model(
 
 
 def priors_text(rate: FaultRate) -> str:
-    """Say what a run with this model takes for its priors."""
+    """Print the priors that a run with this model assumes."""
     if not rate.bounds_priors:
         return (
             f"Too few blocks to bound both priors by {LARGEST_PRIOR:g}: the levels of runs with this model stay "
@@ -310,7 +309,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
 def cn0_curve(
     observations: Annotated[
         list[Path],
-        typer.Argument(metavar="OBS...", help="RINEX observation file or files of one receiver, about a day."),
+        typer.Argument(metavar="OBS...", help="RINEX observation files of one receiver, about a day."),
     ],
     *,
     nav: Annotated[
@@ -335,12 +334,12 @@ def cn0_curve(
     """Fit the mean C/N0 over elevation of one antenna and receiver.
 
     Record about a day under open sky with the antenna and the receiver of the train: the curve belongs to the
-    two together. It is fitted for each constellation and signal, and the file names its inputs. Positioning then
+    two together. One curve is fitted per constellation and signal; the file names its inputs. Positioning then
     rejects signals that are 10 dB-Hz below the mean at their elevation; without a curve only a fixed floor applies.
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 
-    Exit codes as `railfix --help` says; 5 where the position or the navigation files do not fit the log.
+    Exit codes are those of `railfix --help`; 5 where the position or the navigation files do not match the log.
     """
     fit = validate(CurveFit, {"bin_deg": bin_deg}, source="--bin")
     place = None if position is None else parse_position(position, "--position")

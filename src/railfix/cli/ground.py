@@ -37,7 +37,7 @@ def ground() -> None:
 
 
 class MonitorChoices(Settings):
-    """What is judged, and where the results go."""
+    """Logs of `railfix ground monitor` and the folder of its results."""
 
     nav: tuple[Path, ...] = option(
         "RINEX navigation file; repeat it for several. Streams may bring their own.", (), metavar="FILE"
@@ -85,7 +85,7 @@ def monitor(
 
     Example: `railfix ground monitor --live tcp://10.0.0.1:2101 tcp://10.0.0.2:2101 tcp://10.0.0.3:2101 --point ...`
 
-    Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
+    Exit codes are those of `railfix --help`; 5 where the logs have no satellite or no epoch in common.
     """
     from railfix.ground.station_fixes import read_fixes
     from railfix.ground.triangle import TriangleVerdict, draw_triangle, monitor_log
@@ -211,14 +211,14 @@ def keys(
 ) -> None:
     """Make keys and certificates of a centre and its trains; add trains, and renew certificates.
 
-    They are signed by an authority, whose key (authority.key) stays in DIR: the centre gets authority.pem and its own
-    two files, each train authority.pem and its own two. In a DIR with an authority trains are added. The serial number
-    of each is printed: in revoked.txt of the centre's folder it revokes that certificate. Keys can be read by their
-    owner alone.
+    An authority signs them. Its key (authority.key) stays in DIR; the centre gets authority.pem and its own two files,
+    each train authority.pem and its own two files. In a DIR with an authority trains are added. The serial number of
+    each is printed: in revoked.txt of the centre's folder it revokes that certificate. Keys can be read by their owner
+    alone.
 
     Example: `railfix ground keys keys --train 1 --train 2`
 
-    Exit codes as `railfix --help` says; 8 where every certificate is there already.
+    Exit codes are those of `railfix --help`; 8 where all certificates exist already.
     """
     from cryptography.x509 import load_pem_x509_certificate
 
@@ -242,7 +242,7 @@ class DemoChoices(Settings):
 
     seed: int = option("Seed of losses and noise.", 1, metavar="N", ge=0)
     speed: float = option("Simulated seconds a second.", 6.0, metavar="X", ge=1, le=50)
-    port: int = option("Of the page; 0 takes a free one.", 0, metavar="PORT", ge=0, le=65535)
+    port: int = option("Port of the page; 0 for any free port.", 0, metavar="PORT", ge=0, le=65535)
     hold: float = option("Keep the page after the end for this time.", 0.0, metavar="S", ge=0, le=3600)
     coverage: Path | None = option(
         "Picture of the links: response rates along the line, round trips over time and place.", None, metavar="PNG"
@@ -255,9 +255,9 @@ class DemoChoices(Settings):
 def demo(choices: DemoChoices) -> None:
     """Show two trains, two lossy links each, a centre with its page, and a satellite fault.
 
-    The trains meet in a passing loop; one bearer fails, then both of one train; at the end a satellite drifts away, the
-    reference triangle sees it, satellite positioning is suspended and the trains stop. Everything stays on loopback
-    addresses and ends by itself in about half a minute, with a table of what happened.
+    The trains meet in a passing loop; one bearer fails, then both bearers of one train. At the end a satellite clock
+    drifts, the reference triangle detects it, satellite positioning is suspended and the trains stop. All traffic stays
+    on loopback addresses; the program ends after about half a minute with a table of events.
 
     Example: `railfix ground demo --hold 60`
 
@@ -298,14 +298,14 @@ def demo(choices: DemoChoices) -> None:
 class CentreChoices(Settings):
     """Page of a centre, and its end."""
 
-    page: str = option("Of the page; port 0 takes a free one.", "127.0.0.1:8000", metavar="HOST:PORT")
+    page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(
         "Password for orders in its first line, NAME PASSWORD of a person in others; one is printed without it.",
         None,
         metavar="FILE",
     )
     orders: str | None = option(
-        "Take orders at an address of their own, and none at that of the page.", None, metavar="HOST:PORT"
+        "Accept orders at a separate address, and none at the address of the page.", None, metavar="HOST:PORT"
     )
     for_s: float | None = option("End after this time; else at a signal.", None, name="--for", metavar="S", ge=0)
 
@@ -335,7 +335,7 @@ def centre(
 
     Example: `railfix ground centre line.toml --password secret.txt`
 
-    Exit codes as `railfix --help` says; 143 at the end by SIGTERM.
+    Exit codes are those of `railfix --help`; 143 after SIGTERM.
     """
     import asyncio
     import secrets
@@ -389,13 +389,13 @@ def train(
 ) -> None:
     """Carry the positions of a train to the centre over two links, and its authorities back.
 
-    Reads position messages as lines of JSON from standard input (`railfix live ... --send json@-`), reports the newest
-    every second, and writes each authority, each beginning and end of braking, and each line that is no position
-    message, as a line of JSON. Ends with its input, once the last report is answered or after 5 s.
+    Reads position messages as JSON lines from standard input (`railfix live ... --send json@-`) and reports the newest
+    every second. Writes a JSON line for each authority, for each beginning and end of braking, and for each line that
+    is not a position message. Ends with its input, once the last report is answered or after 5 s.
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
-    Exit codes as `railfix --help` says; 0 also where no authority came, said on standard error.
+    Exit codes are those of `railfix --help`; also 0 where no authority came, which is reported on standard error.
     """
     import asyncio
 

@@ -48,7 +48,7 @@ def locate(
 
     Example: `railfix locate --log front.obs --nav brdc.nav --out front.pos`
 
-    Exit codes as `railfix --help` says; 7 where no epoch has a position.
+    Exit codes are those of `railfix --help`; 7 where no epoch has a position.
     """
     check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -81,16 +81,16 @@ def which_track(
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Decide on which track a train at rest stands, or report that it is undecided.
+    """Decide which track a train at rest stands on, or report that it is undecided.
 
-    Each track of the map within 60 m is a hypothesis, and so is a track that the map does not have (`none`). The
+    Each track of the map within 60 m is a hypothesis; one more is a track missing from the map (`none`). The
     codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with
     a base station carrier phases count, too. The decision is taken when the probability of all other hypotheses
-    together is below `--risk`; else all probabilities are printed.
+    together is below `--risk`; otherwise all probabilities are printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
-    Exit codes as `railfix --help` says; 5 where the train moves or no track is near.
+    Exit codes are those of `railfix --help`; 5 where the train moves or no track is near.
     """
     check_outputs((out, "picture"), (save_last, "any"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = resolve_settings(choices)
@@ -147,7 +147,7 @@ def convert(
 
     Example: `railfix convert drive.ubx --out drive.rnx --nav-out drive.nav`
 
-    Exit codes as `railfix --help` says; 3 where a log holds nothing of what was asked for.
+    Exit codes are those of `railfix --help`; 3 where a log contains nothing that was requested.
     """
     if out is None and nav_out is None:
         raise SettingsError("nothing to write: give --out for observations, --nav-out for ephemerides, or both")
@@ -183,12 +183,12 @@ def export(
     protection level, speed and track, as far as the run has them; an infinite level is left empty. Epochs without a
     position are left out. Coordinates are WGS 84, heights above the ellipsoid.
 
-    Beside GeoJSON, GeoPackage and GeoParquet comes a style of the same name (`.qml`), by which QGIS colours the
-    positions by status. MCAP has every column of the run.
+    GeoJSON, GeoPackage and GeoParquet files get a style of the same name (`.qml`) that colours the positions by status
+    in QGIS. MCAP has every column of the run.
 
     Example: `railfix export results --out positions.gpkg`
 
-    Exit codes as `railfix --help` says; 4 where a package is not installed, 7 where no epoch has a position.
+    Exit codes are those of `railfix --help`; 4 where a package is not installed, 7 where no epoch has a position.
     """
     tables = list_position_tables(run)
     if filtered and tables and "train" not in tables:
@@ -213,18 +213,20 @@ def export(
     show_files(console, [path for path in (out, style) if path is not None])
 
 
+@from_models
 def doctor(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Logs, navigation, track, vehicle, references.")
     ],
     *,
+    reading: Annotated[LogReading, Without("broken_lines", "reader")],
     as_json: JsonOption = False,
 ) -> None:
-    """Examine files before a run: what each is, whether they fit together, and the command to run.
+    """Identify files before a run, check whether they fit together, and print the command to run.
 
     The kind of a file is found by its content: a log of observations, navigation, a track map, positions, a vehicle or
-    settings. First comes what does not fit together or is missing, then the command, ready to copy, then the facts of
-    each file (span in GPS time, rate, gaps, satellites, signals, place, frame, heights). Nothing is written.
+    settings. Mismatches and missing files come first, then the command, ready to copy, then the facts of each file
+    (span in GPS time, rate, gaps, satellites, signals, position, frame, heights). Nothing is written.
 
     Example: `railfix doctor front.obs brdc.nav line.csv car.toml`
 
@@ -232,7 +234,7 @@ def doctor(
     """
     from railfix.run.doctor import examine_files
 
-    diagnosis = examine_files(files)
+    diagnosis = examine_files(files, date=reading.instant)
     problems = diagnosis.problems
     if as_json:
         print_json(diagnosis.as_dict())

@@ -39,7 +39,7 @@ TracksArgument = Annotated[
     typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."),
 ]
 
-#: Reading of a map whose accuracy has no part in what is printed.
+#: Reading of a map for commands whose output does not depend on its accuracy.
 PointsReading = Annotated[
     TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma", "plan_sigma")
 ]
@@ -65,12 +65,12 @@ def check(
     """Check a track map and print its faults.
 
     Checked: spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
-    where given, else from the circle through neighbouring points), kinks, jumps and reversals of the
+    where given, otherwise from the circle through neighbouring points), kinks, jumps and reversals of the
     kilometrage, gradients and height spikes, cant, and curve attributes against the points.
 
     Example: `railfix map check line.csv --out report`
 
-    Exit codes as `railfix --help` says; 6 where the track map has errors.
+    Exit codes are those of `railfix --help`; 6 where the track map has errors.
     """
     if not mid_chord > 0.0 or not max_gap > 0.0:
         raise SettingsError("--mid-chord and --max-gap must be positive")
@@ -111,8 +111,8 @@ def features(
         list[Path] | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of `railfix run` with --tachometer and --inertial: the features as the train measured them, "
-            "beside those of the map; may be repeated.",
+            help="Folder of `railfix run` with --tachometer and --inertial: lists the features that the train "
+            "measured with those of the map; may be repeated.",
         ),
     ] = None,
     out: Annotated[
@@ -121,11 +121,11 @@ def features(
     reading: PointsReading,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """List the features of a line: the places where its gradient or its curvature changes.
+    """List the features of a line: the positions where its gradient or curvature changes.
 
-    A train that measures the same change knows where it is (`railfix.motion.features`). Changes are taken over 15 m,
-    about the distance of two bogies. With `--run` the features are those that runs have measured together: the
-    places by single runs, their spread (as in P2's table 1) and the distance from the map's stand beside each.
+    A train that measures the same change knows its position (`railfix.motion.features`). Changes are computed over 15
+    m, about the distance of two bogies. With `--run` the features are those that several runs measured consistently:
+    their positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
 
     Example:
 
@@ -133,7 +133,7 @@ def features(
 
         railfix map features line.csv --run results-1 --run results-2
 
-    Exit codes as `railfix --help` says; 3 also where a run has measured nothing.
+    Exit codes are those of `railfix --help`; 3 also where a run has no measurements.
     """
     import polars as pl
 
@@ -206,18 +206,20 @@ def from_positions_command(
         float | None, typer.Option(metavar="M", help="Largest standard deviation of a position, any axis.")
     ] = None,
     columns: ColumnNames,
-    name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name of the track; by default the name of the file.")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make a track map from the positions of one run.
 
-    Positions of other quality and those at standstill are left out, the rest is thinned to the spacing; deviations
-    between two points stay within 0.30 m. The map is the path of that antenna: use it without a vehicle file.
-    A run over several laps gives several laps.
+    Positions of other quality and at standstill are left out, and the rest is thinned to the spacing; deviations
+    between two points stay within 0.30 m. The map is the path of that antenna: use it without a vehicle file. A run
+    over several laps gives several laps.
 
     Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 
-    Exit codes as `railfix --help` says; 3 also where the positions form no line.
+    Exit codes are those of `railfix --help`; 3 also where the positions form no line.
     """
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")

@@ -27,18 +27,15 @@ from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
-Columns = Annotated[
-    list[str] | None, typer.Option(metavar="NAME=COLUMN", help=str(ColumnNames.model_fields["column"].description))
-]
 
-#: What a run alone needs of the reading of its track.
+#: Settings of reading a track that only a run needs.
 RUN_ALONE = ("reference", "cache")
 #: Reading of a map by itself.
 MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma")]
 
 
 class RouteChoice(Settings):
-    """The way of a route through a network."""
+    """Selection of a route through a network."""
 
     tracks: str | None = option("Tracks to pass, in order; others between are found.", None, metavar="NAME,NAME...")
     via: tuple[str, ...] = option("A point to pass; repeat it in the order of travel.", (), metavar="LAT,LON")
@@ -59,7 +56,7 @@ class RouteChoice(Settings):
 
 
 class Connecting(Settings):
-    """How tracks are connected, and positions put beside them."""
+    """How tracks are connected, and how positions are matched to them."""
 
     tolerance: float = option(
         "Ends nearer than this are one point, where the file has no connections.", TOLERANCE_M, metavar="M", gt=0.0
@@ -72,10 +69,11 @@ class Connecting(Settings):
 
 
 class MatchOptions(Settings):
-    """How far from a track positions are expected, and what is written of them."""
+    """How far from a track positions are expected, and what is written."""
 
     sigma: float | None = option(
-        "Sigma of the distance from the track, map included; else that of LOG, or one estimated by it, or 4 m.",
+        "Standard deviation of the distance from the track, map included; by default that of LOG, or one estimated "
+        "from LOG, or 4 m.",
         None,
         metavar="M",
         gt=0.0,
@@ -87,8 +85,8 @@ class MatchOptions(Settings):
         gt=0.0,
     )
     fill: Rows = option(
-        "Rows that are put on the shortest route: gaps, those without position between known places; or off-map, also "
-        "those whose positions lie off the map, as in a tunnel, at its start and end too.",
+        "Rows that are placed on the shortest route: gaps, those without a position between known positions; or "
+        "off-map, also those whose positions lie off the map, as in a tunnel, also at its start and end.",
         "gaps",
     )
     picture: Path | None = option("Picture to write (.png or .svg).", None, metavar="FILE")
@@ -121,7 +119,7 @@ def network(
 
     Example: `railfix map network tracks.gpkg --out network.png`
 
-    Exit codes as `railfix --help` says; 6 where the network has gaps, kinks, or connections that do not meet.
+    Exit codes are those of `railfix --help`; 6 where the network has gaps, kinks, or connections that do not meet.
     """
     check_outputs((out, "picture"), (page, "page"), overwrite=overwrite, inputs=maps)
     tracks = _network(maps, reading, connecting)
@@ -163,13 +161,13 @@ def route(
     reading: Annotated[TrackReading, Without(*RUN_ALONE)],
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Make the track map of one route from a network or any map file.
+    """Make the track map of one route from a network or another map file.
 
     The route is named by its tracks, by points that it passes, or found from the positions of a run.
 
     Example: `railfix map route net.gpkg --positions run.pos --heights run.pos --out route.csv`
 
-    Exit codes as `railfix --help` says; 5 where no route leads from one place to the next.
+    Exit codes are those of `railfix --help`; 5 where no route connects two positions.
     """
     files = [*maps, choice.positions, choice.heights, reading.jgd_parameters]
     check_outputs((out, "csv"), overwrite=overwrite, inputs=files)
@@ -196,7 +194,7 @@ def route(
 def _route_tracks(
     net: Network, choice: RouteChoice, log: PlanLog | None, connecting: Connecting, reading: TrackReading
 ) -> tuple[list[int], list[str]]:
-    """Return the tracks of the route asked for, and notes on it."""
+    """Return the tracks of the requested route, and notes."""
     if choice.tracks:
         return net.shortest_route([net.find_index(name.strip()) for name in choice.tracks.split(",")]), []
     if choice.via:
@@ -255,8 +253,8 @@ def match_command(
 ) -> None:
     """Put positions on the tracks of a network: track, chainage on it, probability, and the next best track.
 
-    Rows without position between known places are filled along the shortest route; `filled_bound_m` bounds their error.
-    The map is moved to the frame of the positions at their time. Positions far from all tracks have none.
+    Rows without a position between known positions are filled along the shortest route; `filled_bound_m` bounds their
+    error. The map is moved to the frame of the positions at their time. Positions far from all tracks have none.
 
     Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
 

@@ -15,10 +15,10 @@ from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs
 from railfix.core.errors import SettingsError
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.tables import Column, count, listing, number, percent, plain_table, plural
-from railfix.run.inputs import ColumnNames, LogReading
+from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits
 
-#: Share of the epochs of a stretch within the alarm limit from which satellites serve there.
+#: Fraction of the epochs of a stretch that must lie within the alarm limit for the stretch to be served.
 _SERVED: Final = 0.95
 _COLUMNS: Final[Sequence[Column]] = (
     ("chainage m", "from_m", count),
@@ -44,14 +44,15 @@ def service(
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit of the level.")] = 20.0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Show by chainage where satellites can serve on a line: satellites, reflections, share of ok, levels.
+    """Report by chainage where satellites serve a line: satellites in view, reflections, fraction of ok epochs,
+    protection levels.
 
-    Reflections show in the distance of the 3-D position, which does not use the map, from the line. Several runs, at
-    other times of the day, say more than one.
+    Reflections show in the distance of the 3-D position, which does not use the map, from the line. Several runs at
+    different times of the day are more representative than one.
 
     Example: `railfix map service monday-results tuesday-results --out service.csv --picture service.png`
 
-    Exit codes as `railfix --help` says; 5 where the runs are on different maps.
+    Exit codes are those of `railfix --help`; 5 where the runs are on different maps.
     """
     from railfix.core.files import write_whole
     from railfix.evaluate.intervals import compute_service
@@ -77,16 +78,17 @@ def service(
             f"({worst['within_limit_share']:.0%} of its epochs)"
         )
     else:
-        verdict.append("the runs have no filter and no levels; the shares are those of single epochs")
+        verdict.append("the runs have no filter and no levels; fractions are of single epochs")
     show_verdict(console, verdict)
     show_table(
-        console, listing("service", found, _COLUMNS, f"By stretch of {stretch:g} m; served: a level within the limit")
+        console,
+        listing("service", found, _COLUMNS, f"By stretch of {stretch:g} m; served: protection level within the limit"),
     )
     show_files(console, [path for path in (out, picture) if path is not None])
 
 
 class SurveyFiles(Settings):
-    """Files beside the runs, and how they are read."""
+    """Files given with the runs, and how they are read."""
 
     nav: tuple[Path, ...] = option(
         "Navigation file of the logs; repeat it for several days.", (), metavar="NAV", panel=INPUTS
@@ -110,7 +112,6 @@ def survey(
     files: SurveyFiles,
     limits: SurveyLimits,
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
-    reading: LogReading,
     columns: ColumnNames,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -118,11 +119,11 @@ def survey(
 
     Laps, both directions, standstill and runs over a part of the line are allowed; outliers lose their weight. Logs of
     observations make a better map than their positions: changes of the carrier phase and Dopplers give the shape.
-    The map is the path of the antenna. Runs of other days average what all positions of one day share.
+    The map is the path of the antenna. Runs on different days average errors that all positions of one day share.
 
     Example: `railfix map survey monday.obs tuesday.obs --nav monday.nav --nav tuesday.nav --out line.csv`
 
-    Exit codes as `railfix --help` says; 5 where the runs lie apart.
+    Exit codes are those of `railfix --help`; 5 where the runs lie apart.
     """
     from railfix.run.locate import survey_files
     from railfix.track import write_track_csv
@@ -132,7 +133,7 @@ def survey(
     settings, _ = resolve_settings(choices)
     surveyed = survey_files(
         runs, files.nav, settings,
-        limits=limits, name=files.name or out.stem, reading=reading, columns=columns.names,
+        limits=limits, name=files.name or out.stem, reading=columns.logs, columns=columns.names,
     )  # fmt: skip
     result = surveyed.survey
     track = result.track
@@ -166,7 +167,7 @@ def survey(
         for run, ecef, scale in zip(surveyed.runs, result.runs_ecef_m, result.scale, strict=True)
     ]
     head = ["run", "positions", "run m", "sigma / stated"]
-    caption = "Runs, with their errors across as a share of the standard deviation that they state"
+    caption = "Runs, with their cross-track errors as a fraction of the stated standard deviation"
     show_table(console, plain_table(head, rows, caption))
     show_notes(console, [*track.provenance.notes, *surveyed.notes])
     if picture is not None:

@@ -1,4 +1,4 @@
-"""Command-line options made from `Settings` models, where each is declared once; settings from them."""
+"""Command-line options from `Settings` models, which declare each option once; settings from options."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ JsonOption = Annotated[
 
 
 def overwriting(asked: bool) -> Overwrite:
-    """Return what `OverwriteOption` requests."""
+    """Return the `Overwrite` that `OverwriteOption` requests."""
     return "replace" if asked else "refuse"
 
 
 def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, inputs: Iterable[Path | None]) -> list[Path]:
-    """Raise where a file cannot or must not be written (`check_output_file`); return those that are asked for."""
+    """Raise where a file cannot or must not be written (`check_output_file`); return the requested files."""
     asked = [(path, kind) for path, kind in outputs if path is not None]
     read = [path for path in inputs if path is not None]
     for path, kind in asked:
@@ -74,7 +74,7 @@ class _Option:
 
     @property
     def name(self) -> str:
-        """As the user writes it."""
+        """As written by the user."""
         info = get_args(self.parameter.annotation)[1]
         return str(info.default)
 
@@ -170,7 +170,7 @@ def _gps_time(text: str) -> datetime:
 
 
 def _plain_type(annotation: Any) -> tuple[Any, bool]:
-    """Return the type of one value, and whether there may be several."""
+    """Return the type of one value, and whether several are allowed."""
     if get_origin(annotation) is Annotated:
         return _plain_type(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
@@ -218,7 +218,7 @@ class Choices(Settings):
         None,
         metavar="NAME",
     )
-    config: Path | None = option("Settings file; defaults where it is silent.", None, metavar="TOML")
+    config: Path | None = option("Settings file; defaults for settings that it lacks.", None, metavar="TOML")
     setting: tuple[str, ...] = option(
         "One setting, overriding the file's: --set elevation.mask_deg=15; may be repeated.",
         (),
@@ -252,7 +252,7 @@ class Choices(Settings):
 
 
 def resolve_settings(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Return the settings of the file, overridden by those of the command line; and those that were given."""
+    """Return the settings of the file overridden by those of the command line, and those that were given explicitly."""
     values: dict[str, Any] = {}
     source = "command line"
     if choices.config is not None:

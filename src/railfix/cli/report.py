@@ -64,17 +64,18 @@ def report(
 ) -> None:
     """Write one HTML page on one or several runs, to open in a browser.
 
-    At the top: one sentence, five key figures, the line in plan coloured by error, and the error over
-    chainage beside the conventional one. Below, folded: figures of merit, counts, protection levels,
-    settings and inputs, each table with a CSV download. Then the charts of each antenna: errors,
-    protection levels, intervals and, with `railfix run --observations`, sky, C/N0 and screens. The page
-    names what it leaves out, with the reason. Errors need `--reference`.
+    It begins with one sentence, five key figures, the plan of the line coloured by error, and the error over chainage
+    compared with the conventional one. Below, folded: figures of merit, counts, protection levels, settings and inputs,
+    each table with a CSV download. Then the charts of each antenna: errors, protection levels, intervals and, with
+    `railfix run --observations`, sky, C/N0 and screens. The page lists what it leaves out and why. Errors need
+    `--reference`.
 
     The page contains everything it shows: it opens without a network and can be sent and printed.
 
     Example: `railfix report results --reference truth.csv --out report.html`
 
-    Exit codes as `railfix --help` says; 4 where the number of references does not fit, 5 where one is of another time.
+    Exit codes are those of `railfix --help`; 4 where the number of references does not match the runs, 5 where a
+    reference is of another time.
     """
     in_runs = [
         path
@@ -100,9 +101,9 @@ def report(
 
 
 def _free_arrays_at_once() -> None:
-    """Have the GNU C library return an array's memory as soon as it is freed; other libraries are left as they are.
+    """Have the GNU C library return an array's memory as soon as it is freed; other libraries are unchanged.
 
-    By itself it keeps freed arrays of up to 32 MB for later ones, between those in use: of a long run 50 MB.
+    By default malloc keeps freed arrays of up to 32 MB for reuse, which costs 50 MB in a long run.
     """
     if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "mallopt"):
         library.mallopt(*_THRESHOLD)
@@ -116,14 +117,15 @@ def explain(
     html: Annotated[Path | None, typer.Option(metavar="HTML", help="Write a page with the sky as well.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Explain one epoch: its position, every satellite and its outcome, what set sigma, level and status.
+    """Explain one epoch: its position, every satellite with its outcome, and what set sigma, level and status.
 
-    Of each satellite that was used it says how far the position of the single epoch would move along the line without
-    it. The epoch nearest to the time is taken, a minute away at most.
+    For each satellite that was used it prints how far the position of the single epoch would move along the line
+    without it. The epoch nearest to the time is taken, a minute away at most.
 
     Example: `railfix explain results --at 06:34:12 --html epoch.html`
 
-    Exit codes as `railfix --help` says; 4 where there is no such time or antenna, 5 no epoch near the time.
+    Exit codes are those of `railfix --help`; 4 where the time or the antenna does not exist, 5 where no epoch is near
+    the time.
     """
     inputs = sorted(run.iterdir()) if run.is_dir() else []
     check_outputs((html, "page"), overwrite=overwrite, inputs=[path for path in inputs if path.suffix != ".html"])
@@ -146,8 +148,7 @@ def plot_screens(
     """Plot each screen's metric against its limit, over time and over chainage.
 
     One PNG per screen and antenna: `front_doppler.png`, `rear_antenna_pair.png`, `front_raim.png`, ...;
-    none for screens that were off or inactive. Rejected observations have another colour, and their share is
-    in the title.
+    none for screens that were off or inactive. Rejected observations have another colour; the title has their fraction.
 
     Example: `railfix plot-screens results --out results/screens`
 

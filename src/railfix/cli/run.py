@@ -97,16 +97,16 @@ def live(
     r"""Position a train from its receivers' streams, one message a period.
 
     Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from
-    the moment they are complete, SBAS messages with `--sbas stream`. The answers are those of `railfix run` on the
+    the moment they are complete, SBAS messages with `--sbas stream`. The positions are those of `railfix run` on the
     same epochs, with sensors on board too. A period without input has a message. Connections that break are opened
-    again. The program ends when files end, or on SIGINT or SIGTERM; SIGHUP reloads nothing, and says so.
+    again. The program ends when its files end, or on SIGINT or SIGTERM; SIGHUP has no effect but a message.
 
     Example:
 
         railfix live --front tcp://127.0.0.1:3001 --rear tcp://127.0.0.1:3002 --track line.csv \
             --vehicle car.toml --send json@- --send cbor@udp://127.0.0.1:4000
 
-    Exit codes as `railfix --help` says; 9 where two channels disagree; 143 at the end by SIGTERM.
+    Exit codes are those of `railfix --help`; 9 where two channels disagree, 143 after SIGTERM.
     """
     import asyncio
 

@@ -18,7 +18,7 @@ from railfix.simulate.scenario_file import Recipe, list_scenarios, load_recipe
 
 
 class SimulateOptions(Settings):
-    """Where the runs go, and what overrides the scenario."""
+    """Folder of the runs, and settings that override the scenario."""
 
     out: Path | None = option(
         "Folder for the files; each run of a recipe in its own below it.", None, metavar="DIR", panel="Options"
@@ -49,7 +49,7 @@ class SimulateOptions(Settings):
 
     @property
     def words(self) -> list[str]:
-        """Options that make the same run again."""
+        """Options that reproduce the run."""
         sets = [("--set", text) for text in self.setting]
         given = [("--out", self.out), ("--seconds", self.seconds), ("--seed", self.seed), *sets]
         words = [word for name, value in given if value is not None for word in (name, str(value))]
@@ -75,7 +75,7 @@ def simulate(
 
     Example: `railfix simulate demo --out simulated`
 
-    Exit codes as `railfix --help` says; 5 where the navigation file does not serve the scenario's time.
+    Exit codes are those of `railfix --help`; 5 where the navigation file does not cover the scenario's time.
     """
     if list_shipped:
         for name in list_scenarios():

@@ -1,4 +1,4 @@
-"""Types of the arrays that functions take and return, by what their elements are; dataclasses of them."""
+"""Types of the arrays that functions accept and return, by element; dataclasses of arrays."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def freeze_arrays(instance: DataclassInstance) -> None:
 
 
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
-    """Freeze the arrays of a dataclass that has one row of each; ValueError where one is longer or shorter."""
+    """Freeze the arrays of a dataclass with one row per item; ValueError where one is longer or shorter."""
     rows = len(vars(instance)[first])
     for name, value in vars(instance).items():
         if isinstance(value, np.ndarray) and len(value) != rows:
@@ -94,7 +94,7 @@ def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
 
 
 def join_rows(parts: Sequence[Rows]) -> Rows:
-    """Return a dataclass with the rows of several one after the other, and the other fields of the first.
+    """Return a dataclass with the rows of several concatenated, and the other fields of the first.
 
     ValueError: they do not have the same arrays.
     """
@@ -116,15 +116,15 @@ def patch_rows(result: Rows, rows: Indices, part: Rows) -> Rows:
 
 
 class RowArrays:
-    """Base of dataclasses whose arrays have one row for each of the same things."""
+    """Base of dataclasses whose arrays have one row per item of a common axis."""
 
     def take(self, rows: NDArray[Any] | slice) -> Self:
-        """Return some of the rows, by mask, index or slice, and the other fields."""
+        """Return selected rows, by mask, index or slice, with the other fields unchanged."""
         return take_rows(self, rows)  # type: ignore[type-var]
 
 
 def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
-    """Return the group of each row of groups with so many rows, and its place in its group from 0.
+    """Return the group of each row, given the number of rows of each group, and its index in the group from 0.
 
     >>> places_in_groups(np.array([2, 0, 3]))
     (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
@@ -134,9 +134,9 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
 
 
 def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]:
-    """Return one choice of each layer (dynamic programming): the least sum of their costs and those of the steps.
+    """Return one choice per layer (dynamic programming) with the least sum of node costs and step costs.
 
-    `costs` of the choices of a layer, shape (n,); `steps` from those of the layer before, shape (n, n before).
+    `costs` of the choices of a layer, shape (n,); step costs from the previous layer, shape (n, n before).
     """
     total, came = costs[0], list[Indices]()
     for cost, step in zip(costs[1:], steps, strict=True):
@@ -150,7 +150,7 @@ def cheapest_path(costs: Sequence[Floats], steps: Iterable[Floats]) -> list[int]
 
 
 def medians(values: Floats) -> Floats:
-    """Return the medians along the last axis over what is not NaN; NaN where nothing is."""
+    """Return the medians along the last axis, ignoring NaN; NaN where all are NaN."""
     *shape, width = values.shape
     if not width:
         return np.full(shape, np.nan)
@@ -166,4 +166,4 @@ def over_blocks(function: Callable[[Indices], None], blocks: Iterable[Indices]) 
     if len(every := list(blocks)) == 1:
         return function(every[0])
     with ThreadPoolExecutor() as threads:
-        list(threads.map(function, every))  # raises what the function raises
+        list(threads.map(function, every))  # raises the function's exception

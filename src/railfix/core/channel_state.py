@@ -1,7 +1,7 @@
-"""State by channel that crosses chunks: kept by what it belongs to and by age, whatever channels a chunk has.
+"""State per channel across chunks, stored by channel key and age, independent of the channels of a chunk.
 
-A chunk has the channels that were observed in it: a live epoch may lack a satellite that the epoch before had and the
-next one has again. A stage with a state by channel works on the channels of the chunk and of its state together.
+A chunk has the channels that were observed in it: a live epoch may lack a satellite that the previous epoch had and the
+next one has again. A stage with a state per channel operates on the channels of the chunk and of its state.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Value = TypeVar("Value", bound=np.generic)
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedChannels:
-    """Channels of a chunk, then those of states that it lacks; U in all."""
+    """Channels of the chunk, then channels of the states that the chunk lacks; U in all."""
 
     channel: Strings  #: Shape (U,).
     present: int  #: Number of channels of the chunk, the first ones.
-    #: Place in each state of each channel, -1 where the state does not know it; shape (U,) each.
+    #: Index of each channel in each state, -1 where the state does not have it; shape (U,) each.
     places: tuple[Indices, ...]
 
     def arrange(self, values: NDArray[Value], fill: Any, state: int = 0) -> NDArray[Value]:
@@ -47,7 +47,7 @@ class JoinedChannels:
 def join_channels(channel: Strings, states: Sequence[Strings], kept: Sequence[Masks | None] = ()) -> JoinedChannels:
     """Return the channels of a chunk and of states together.
 
-    `kept` says which channels of each state are young enough to matter; None, or nothing, keeps all.
+    `kept` marks the channels of each state that are recent enough; None, or nothing, keeps all.
     """
     names = channel.tolist()
     place = {name: k for k, name in enumerate(names)}

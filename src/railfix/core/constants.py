@@ -45,8 +45,8 @@ GLONASS_STEP: Final[dict[str, float]] = {"1": 0.5625e6, "2": 0.4375e6}
 #: Constellations that share one receiver clock: QZSS time is steered to GPS time (IS-QZSS-PNT, 3.2.1).
 CLOCK_GROUP: Final[dict[str, str]] = {"G": "G", "J": "G", "E": "E", "C": "C", "R": "R", "S": "G", "I": "I"}
 
-# What kernels and their callers must have alike.
-#: Gradient of the Earth-rotation term of a range over the receiver's place, rounded up (see `geodesy`).
+# Constants that kernels and their callers share.
+#: Gradient of the Earth-rotation term of a range with respect to the receiver's position, rounded up (see `geodesy`).
 ROTATION_GRADIENT: Final = 1.1e-5
 #: Children of a stretch of line in the search.
 FAN_OUT: Final = 8
@@ -54,11 +54,11 @@ FAN_OUT: Final = 8
 LEAST_REDUNDANCY: Final = 1e-9
 #: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
 ALONG: Final = 0.9945
-#: Distance up to which the line is looked over for parts off the tangent before anything else [m].
+#: Distance over which the line is searched first for parts off the tangent [m].
 CLEAR_M: Final = 200.0
 #: Points this near to a tangent are not off it beyond any level [m].
 ON_TANGENT_M: Final = 1e-3
 
-#: Prior of one reflection off a side of the track that the largest data set supports: 2 of 30 943 blocks of 30 s of 70
+#: Prior of one reflection from a side of the track that the largest data set supports: 2 of 30 943 blocks of 30 s in 70
 #: simulated hours in a city, 95 % (docs/level-results.md); recordings, which are shorter, support 1e-2.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

@@ -1,4 +1,4 @@
-"""Rows of dataclasses of arrays: epochs taken from them, and those of several joined."""
+"""Rows of dataclasses of arrays: selection of epochs, and concatenation."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ EVERY: Final = slice(None)  #: All rows.
 
 
 class OnDemand:
-    """Base of dataclasses with fields that are computed when they are first asked for: most are not, epoch by epoch."""
+    """Base of dataclasses with fields computed at first access, as most are not used for each epoch."""
 
     @classmethod
     def create(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
-        """Return an instance with some fields; `later` returns another by its name, and those made with it."""
+        """Return an instance with some fields; `later` returns another field by name, with fields computed in the same
+        step.
+        """
         return cast(Value, _make(cls, {**members, "_later": later}))
 
     if not TYPE_CHECKING:
@@ -52,7 +54,7 @@ def _defaults(kind: Any) -> tuple[str, ...]:
 
 
 def join_epochs(values: Sequence[Value]) -> Value:
-    """Join arrays row after row, or those of dataclasses or of tuples; what is neither is that of the first."""
+    """Concatenate arrays, or dataclasses or tuples of them, row by row; other values are taken from the first."""
     first: Any = values[0]
     if len(values) == 1:
         return values[0]

@@ -28,17 +28,18 @@ from typing import ClassVar
 class RailfixError(Exception):
     """Base of all errors that a user can correct: input files, settings, outputs."""
 
-    exit_code: ClassVar[int] = 1  #: Of the command line for this class of error.
+    exit_code: ClassVar[int] = 1  #: Exit code of the command line for this class of error.
 
 
 class RailfixWarning(UserWarning):
-    """Something that limits a result and that the caller may not know: what the command line prints as a note."""
+    """A limitation of a result that the caller may not know: the command line prints it as a note."""
 
 
 class InputFileError(RailfixError):
     """An input file is missing, unreadable or malformed.
 
-    The message is what is wrong, what was expected, what to do, without a full stop at the end; `line` counts from 1.
+    The message states what is wrong, what was expected and what to do, without a full stop at the end; `line` counts
+    from 1.
     """
 
     exit_code = 3
@@ -58,7 +59,7 @@ class SettingsError(RailfixError):
 
 
 def check_type(value: object, expected: type, *, what: str, hint: str = "") -> None:
-    """Raise SettingsError where an argument is not of the type that is expected; `hint` says how to get one."""
+    """Raise SettingsError where an argument is not of the type that is expected; `hint` says how to obtain one."""
     if not isinstance(value, expected):
         made = f"; {hint}" if hint else ""
         raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{made}")
@@ -71,7 +72,7 @@ class MismatchError(RailfixError):
 
 
 class MapQualityError(RailfixError):
-    """The quality report of a track map holds errors."""
+    """The quality report of a track map contains errors."""
 
     exit_code = 6
 

@@ -34,17 +34,18 @@ from railfix.core.packed import COMPRESS, STREAMS, ZIP, damage_errors, open_zip,
 
 FilePath = str | PathLike[str]
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
-#: What a reader does with a broken line: stop with an error, or leave it out and count it.
+#: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
-Reader = Literal["railfix", "georinex"]  #: What reads RINEX observation files.
-#: Last clause of the error of a broken line: how to go on.
+Reader = Literal["railfix", "georinex"]  #: Program that reads RINEX observation files.
+#: Last clause of the error of a broken line: how to continue.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
-_SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")  #: Endings of packed files before which the kind stands.
+#: Endings of compressed files; the ending before them gives the kind.
+_SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
-#: Whole files: text is packed to a twentieth or a fiftieth; more is no text, and could fill the memory.
+#: Whole files: text compresses by a factor of 20 to 50; a larger factor is no text, and could fill the memory.
 _LARGEST_RATIO: Final = 100
 _LARGEST_BYTES: Final = 64_000_000
 
@@ -121,7 +122,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of texts; ValueError where there is none, SettingsError: it is no path."""
+    """Return one or several paths as a list of texts; ValueError where none is given, SettingsError: not a path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise ValueError("no file was given")
@@ -176,7 +177,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 def unpacked_file(path: FilePath) -> Iterator[Path]:
     """Yield a file on disk with the unpacked content, for programs that open files themselves.
 
-    A file that is not packed is itself; all files of a zip archive are unpacked beside each other.
+    A file that is not compressed is returned as it is; all files of a zip archive are extracted into one folder.
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)
@@ -225,7 +226,8 @@ def read_text(path: FilePath) -> str:
 
 
 def ending(path: FilePath) -> str:
-    """Return the ending of a file name in lower case, ignoring those of packed files; of a zip archive its file's.
+    """Return the ending of a file name in lower case, ignoring endings of compression; for a zip archive the ending of
+    its file.
 
     >>> ending("Line.GeoJSON.gz")
     '.geojson'
@@ -253,7 +255,9 @@ def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[s
 
 
 def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file; `what` it should be, with its article ("the record of a run")."""
+    """Return the object in a JSON file; `what` names the expected kind of file with its article ("the record of a
+    run").
+    """
     try:
         content = json.loads(read_text(path))
     except RecursionError:
@@ -268,7 +272,7 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
     """Write a text file under a temporary name, then rename it: a failed write leaves no file.
 
-    `what` is the kind of file, for the message of the OutputError where it cannot be written.
+    `what` is the kind of file, for the OutputError raised where it cannot be written.
     """
     with stage_file(path, what=what) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -276,7 +280,7 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
 @contextmanager
 def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
-    """Yield a temporary path beside a file, which replaces the file where the block ends without error."""
+    """Yield a temporary path in the folder of a file, which replaces the file if the block ends without error."""
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
@@ -290,7 +294,7 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
         raise write_error(target, error, what=f"the {what} ") from error
 
 
-#: Errors of a file system without room, and what to do.
+#: Errors of a file system without space, and what to do.
 _FULL: Final = {
     errno.ENOSPC: "free some space on the disk, or name a folder on another",
     errno.EDQUOT: "free some of your quota, or name a folder elsewhere",
@@ -299,7 +303,7 @@ _FULL: Final = {
 
 
 def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputError:
-    """Return the error of a file that cannot be written: the system's reason, and what to do about it."""
+    """Return the error of a file that cannot be written: the system's reason, and what to do."""
     hint = _FULL.get(error.errno or 0, "name a folder that can be written to")
     return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
 
@@ -358,14 +362,14 @@ def hatanaka_program(name: str) -> AbstractContextManager[Path]:
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the decoder on an open source and take over the resources in `held`."""
+    """Start the decoder on an open source and take ownership of the resources in `held`."""
     if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:
             shutil.copyfileobj(unpacked, spool, _COPY_BYTES)
         spool.flush()
         source = spool
-    # the decoder inherits the descriptor, whose place `seek` need not move within what is buffered
+    # the decoder inherits the descriptor; `seek` need not move its position within the buffer
     os.lseek(source.fileno(), 0, os.SEEK_SET)
     log = _temporary(held)
     program = held.enter_context(hatanaka_program("crx2rnx"))
@@ -390,8 +394,8 @@ FROM_BUILD: Final = Path(__file__).parents[1] / "_commit.txt"
 def source_commit() -> str:
     """Return the commit of the source, "unknown" where neither the build nor a checkout has it.
 
-    "+changed" follows where files were not as committed when the package was built. For a checkout
-    (``pip install -e``) git's files are read; changes since its commit are not seen.
+    "+changed" follows where files were not as committed when the package was built. For a checkout (``pip install -e``)
+    git's files are read; changes since its commit are not detected.
     """
     if FROM_BUILD.is_file():
         return FROM_BUILD.read_text(encoding="ascii").strip()

@@ -63,13 +63,13 @@ def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
 
 
 def axes_at(ecef_m: ArrayLike) -> Floats:
-    """Compute `enu_axes` at ECEF places of shape (..., 3)."""
+    """Compute `enu_axes` at ECEF positions of shape (..., 3)."""
     latitude, longitude, _ = geodetic_from_ecef(ecef_m)
     return enu_axes(latitude, longitude)
 
 
 def sigma_along(sigma_enu_m: Floats, ecef_m: Floats, direction: Floats) -> Floats:
-    """Compute the sigma along unit vectors (T, 3) from those east, north and up, uncorrelated, at places (T, 3)."""
+    """Compute the sigma along unit vectors (T, 3) from uncorrelated sigmas east, north and up, at positions (T, 3)."""
     components = np.einsum("tij,tj->ti", axes_at(ecef_m), direction)
     return np.asarray(np.sqrt(np.sum((components * sigma_enu_m) ** 2, axis=1)))
 

@@ -20,7 +20,7 @@ FilePath = str | PathLike[str]
 
 
 def _zstd() -> Any:
-    """Return the module of zstd: that of the standard library (3.14), or the same for older versions."""
+    """Return the zstd module: that of the standard library (3.14), or its backport."""
     return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
@@ -38,7 +38,7 @@ def open_zip(path: FilePath, source: IO[bytes]) -> zipfile.ZipFile:
 
 
 def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
-    """Return the name of the one file of a zip archive, or its KML; InputFileError where there are several."""
+    """Return the name of the only file of a zip archive, or of its KML file; InputFileError where there are several."""
     names = [
         item.filename
         for item in archive.infolist()
@@ -56,7 +56,7 @@ def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
 #: First bytes of a compress (.Z) file, and of a zip archive.
 COMPRESS: Final = b"\x1f\x9d"
 ZIP: Final = b"PK\x03\x04"
-#: First bytes of files that are read as streams, with what opens them.
+#: First bytes of files that are read as streams, with the function that opens them.
 STREAMS: Final[dict[bytes, Callable[[IO[bytes]], Any]]] = {
     b"\x1f\x8b": lambda source: gzip.GzipFile(fileobj=source, mode="rb"),
     b"BZh": bz2.BZ2File,

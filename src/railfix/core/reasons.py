@@ -1,7 +1,7 @@
 """Rejection reasons of observations and solution status of epochs.
 
-Each reason is one bit; an observation carries the bits of all reasons that apply, 0 means that it was
-used. Each epoch of an antenna has exactly one status.
+Each reason is one bit; an observation has the bits of all reasons that apply, 0 if it was used. Each epoch of an
+antenna has exactly one status.
 """
 
 from __future__ import annotations
@@ -59,11 +59,12 @@ class Reason(IntFlag):
     ANTENNA_PAIR = 1 << 18
     #: Excluded by RAIM: its estimated range error exceeds the limit.
     FAULT_EXCLUDED = 1 << 19
-    #: Left out: residuals of one sign and size for a minute.
+    #: Persistent range error: residuals of one sign and size for a minute.
     LASTING_ERROR = 1 << 20
     #: Left out by the setting `exclude`.
     EXCLUDED_BY_SETTING = 1 << 21
-    #: Off by more than 100 m, where the others agree on a place: the phase and the Doppler stay in the filter.
+    #: Off by more than 100 m, where the other ranges agree on a position: its phase and Doppler are still used by the
+    #: filter.
     GROSS_ERROR = 1 << 22
 
 
@@ -72,10 +73,10 @@ class Status(IntEnum):
 
     #: A position along the line.
     OK = 0
-    #: A position, but another place on the line fits the ranges equally well, or, at the level's risk, one beyond the
-    #: protection level.
+    #: A position, but another position on the line fits the ranges equally well, or, at the level's risk, one beyond
+    #: the protection level.
     AMBIGUOUS = 1
-    #: A position, but at an end of the map, or too far from the unconstrained position.
+    #: A position, but the ranges put it far beyond an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2
     #: No position: fewer usable satellites than `Config.min_satellites`.
     TOO_FEW_SATELLITES = 3
@@ -87,17 +88,19 @@ class Status(IntEnum):
     NO_OBSERVATION = 6
     #: A position, but the ranges are inconsistent and no exclusion restores consistency.
     INCONSISTENT = 7
-    #: A position, but its distance from the other antenna's disagrees with the antenna spacing.
+    #: A position, but its distance from the other antenna's position disagrees with the antenna spacing.
     ANTENNAS_DISAGREE = 8
     #: A position, but its single-epoch sigma exceeds `Config.largest_sigma_m`.
     UNCERTAIN = 9
-    #: A position, but the 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or it
-    #: is another track.
+    #: A position, but the 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or the
+    #: train is on another track.
     MAP_OFFSET = 10
     #: A position that passed every check, but interference with the signals is suspected: jamming.
     JAMMING_SUSPECTED = 11
     #: A position, but the signals may be those of a spoofer: nothing bounds its error.
     SPOOFING_SUSPECTED = 12
+    #: A position, but clamped to an end of the map: the ranges put it beyond, within their noise.
+    MAP_END = 13
 
     @property
     def text(self) -> str:
@@ -107,9 +110,10 @@ class Status(IntEnum):
 
 #: Statuses of positions that failed a check; `Config.failed_checks` keeps or drops their coordinates.
 CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN, Status.SPOOFING_SUSPECTED)
-#: Statuses that come with coordinates (those of `CHECK_FAILED` unless they are dropped).
+#: Statuses with coordinates (those of `CHECK_FAILED` unless they are dropped).
 POSITIONED: Final = (
-    Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, Status.JAMMING_SUSPECTED, *CHECK_FAILED,
+    Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, Status.JAMMING_SUSPECTED, Status.MAP_END,
+    *CHECK_FAILED,
 )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Settings and limits: frozen pydantic models beside their functions, and model files, read from TOML."""
+"""Settings and limits: frozen pydantic models, and model files read from TOML."""
 
 from __future__ import annotations
 
@@ -54,10 +54,11 @@ class Settings(BaseModel):
             )
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Show the settings that are not as by default."""
+        """Yield the settings that differ from their defaults, of which some are computed from the settings before."""
+        values = {name: getattr(self, name) for name in type(self).model_fields}
         for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            if field.is_required() or value != field.get_default(call_default_factory=True):
+            value = values[name]
+            if field.is_required() or value != field.get_default(call_default_factory=True, validated_data=values):
                 yield name, value
 
     @field_validator("*", mode="before")
@@ -116,8 +117,8 @@ def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> M
 
 
 def first_fault(model: type[BaseModel], error: ValidationError) -> str:
-    """Return the sentence for the first fault: setting, what was expected, what is known or meant."""
-    # a misspelt name before the name that is missing in its place
+    """Return the sentence for the first fault: the setting, the expected value, the known or intended name."""
+    # a misspelt name is reported before the name that is missing because of it
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     where = ".".join(str(part) for part in first["loc"] if part != "[key]")
     if first["type"] == "extra_forbidden":
@@ -163,7 +164,7 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[s
 
 
 def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Read the values of a TOML file; `what` is the kind of file expected, with its article ("a vehicle file").
+    """Read the values of a TOML file; `what` names the expected kind of file with its article ("a vehicle file").
 
     InputFileError: the file is missing, unreadable, not UTF-8, or not TOML.
     """
@@ -194,7 +195,7 @@ ModelFile = TypeVar("ModelFile", bound=Settings)
 
 
 def read_model_file(model: type[ModelFile], path: FilePath, *, what: str, format_name: str, command: str) -> ModelFile:
-    """Read a model file as a `Settings` type with the field `format`; `what` and `command` are for messages."""
+    """Read a model file as a `Settings` type with the field `format`; `what` and `command` are used in messages."""
     values = read_toml(path, what=what)
     written = values.get("format")
     if written != format_name:

@@ -22,7 +22,7 @@ from railfix.core.errors import InputFileError
 def reading_table(
     path: str | PathLike[str], message: str = "cannot be read as a table ({}); run railfix run again"
 ) -> Iterator[None]:
-    """Raise errors of reading a table, also of a lazy one, as `InputFileError`; the reason goes into `message`."""
+    """Raise errors of reading a table, also of a lazy one, as `InputFileError` with the reason in its message."""
     try:
         yield
     except (PolarsError, PanicException, OSError) as error:
@@ -43,12 +43,12 @@ def digits(places: int, value: float | None) -> str:
 
 
 def share(part: float | None, digits: int = 2) -> str:
-    """Return a share in per cent."""
+    """Return a fraction in per cent."""
     return "–" if part is None or part != part else f"{100.0 * part:.{digits}f} %"
 
 
 def percent(part: float | None) -> str:
-    """Return a share in per cent, for a column whose head has the sign."""
+    """Return a fraction in per cent, for a column whose head has the sign."""
     return share(part).removesuffix(" %")
 
 
@@ -69,7 +69,7 @@ class Table:
     #: Columns of numbers, of code.
     numeric: Sequence[int] = ()
     code: Sequence[int] = ()
-    marked: Sequence[int] = ()  #: Rows that stand out.
+    marked: Sequence[int] = ()  #: Rows that are highlighted.
     links: Sequence[str] = ()  #: Address of the page on each row, blank without one; empty where no row has one.
     boxed: bool = False  #: A terminal draws a frame around it.
 
@@ -87,7 +87,7 @@ Column = tuple[str, str, Callable[[Any], str]]  #: Head, column and format of a 
 def listing(
     name: str, rows: pl.DataFrame, columns: Sequence[Column], caption: str = "", *, marked: Sequence[int] = ()
 ) -> Table:
-    """Return a table of rows of a frame; columns of other formats than `str` are numbers."""
+    """Return a table of the rows of a frame; columns of formats other than `str` are numbers."""
     return Table(
         name=name,
         head=[head for head, _, _ in columns],

@@ -1,7 +1,7 @@
-"""How good the positions were: errors along the line against a reference, and the figures made of them.
+"""Accuracy of positions: errors along the line against a reference, and figures of merit.
 
-The error is the distance along the map between the answer and the reference's own point on it,
-positive toward the end of the line whichever way the train runs (P1 3.3, 5).
+The error is the distance along the map from the reference's own point on it to the position, positive toward the end of
+the line whichever way the train runs (P1 3.3, 5).
 """
 
 from railfix.evaluate.epochs import EPOCH_COLUMNS

@@ -51,7 +51,7 @@ _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Rates and errors of one choice of screens, or of sources of the filter along the track, on one antenna."""
+    """Rates and errors of one antenna with one choice of screens, or of sources of the filter along the track."""
 
     choice: str  #: "all", "none", "only raim", "without raim"; "filter", "filter without phase".
     #: Active screens; sources of the filter along the track, empty for single epochs.
@@ -60,7 +60,7 @@ class Effect:
 
     antenna: str
     epochs: int  #: Epochs with observations, and with a reference where one is given.
-    #: Share of the epochs with coordinates, and of those of status ok; of the filter: tracking.
+    #: Fraction of the epochs with coordinates, and of those with status ok; for the filter: tracking.
     rate: float
     ok_rate: float
     n_used: float  #: Satellites used, mean over the epochs.
@@ -70,7 +70,7 @@ class Effect:
     coordinates: Score | None = None
     ok: Score | None = None
     conventional: Score | None = None
-    #: Errors at the epochs without observations, such as those in tunnels; None where there are none.
+    #: Errors at the epochs without observations, such as those in tunnels; None where no epoch has them.
     outage: Score | None = None
     #: 95th percentile of the error size over the standard deviation; NaN without a reference.
     normalised_p95: float = float("nan")
@@ -223,7 +223,7 @@ def ablate_files(
 def _columns(
     result: AntennaResult, track: AlongTrack | None, reference: AntennaReference | None, trajectory: Trajectory
 ) -> dict[str, Floats]:
-    """Return the columns of one chunk of one antenna from which the effect is computed: of the filter where it runs."""
+    """Return the columns of one chunk of one antenna from which the effect is computed: of the filter if it is on."""
     counted = result.status != Status.NO_OBSERVATION
     without = ~counted
     if track is None:

@@ -42,7 +42,7 @@ from railfix.track.trajectory import Trajectory
 #: Row of RTKLIB's single point, and the program that computes it (Debian package rtklib).
 RTKLIB_SINGLE: Final = "RTKLIB single point"
 RTKLIB_PROGRAM: Final = "rnx2rtkp"
-#: Share of the interval of the log within which a position belongs to an epoch.
+#: Fraction of the log's interval within which a position is assigned to an epoch.
 _NEAR: Final = 0.4
 _LONGEST_S: Final = 600.0
 #: RTKLIB's bits of the constellations.
@@ -118,7 +118,7 @@ def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) 
 
 
 def write_rtklib_single_point(inputs: RunInputs, config: Config, out: Path) -> str | None:
-    """Compute RTKLIB's single point of the front antenna with the settings' mask; return why there is none."""
+    """Compute RTKLIB's single point of the front antenna with the settings' mask; return the reason if it fails."""
     program = shutil.which(RTKLIB_PROGRAM)
     if program is None:
         return f"no row of RTKLIB: {RTKLIB_PROGRAM} (Debian package rtklib) is not installed"
@@ -168,16 +168,16 @@ _OF_STANFORD: Final = (
 BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     "case": "name of the folder",
     "held_out": "no test reads the case, no setting was chosen with it",
-    "position": "positions that are judged; those of other programs are moved to the nearest point of the line",
+    "position": "positions that are evaluated; those of other programs are moved to the nearest point of the line",
     "antenna": "`front` or `rear`; `all` for both together",
     **{name: FIGURE_COLUMNS[name] for name in _OF_FIGURES},
     "time_to_first_s": "from the first epoch with observations to the first position",
     "over_level": "errors above their level without an alarm (levels `usable`)",
     "over_level_alarm": "errors above their level where the run had raised an alarm or a doubt",
     **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, own limit)" for name in _OF_STANFORD},
-    "error": "why there is no result",
+    "error": "reason for a missing result",
 }
-#: Names in the table that people read: column, head, feature of EN 16803-1, decimals, factor.
+#: Names in the table for readers: column, head, feature of EN 16803-1, decimals, factor.
 _SHOWN: Final = (
     ("observed", "epochs", "", 0, 1),
     ("rate", "rate %", "Availability", 1, 100),
@@ -207,8 +207,9 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, and judge them and other programs; return `BENCHMARK_COLUMNS`
-    and notes. InputFileError: a wrong hash. MismatchError: settings made from held-out cases.
+    """Run the cases of a folder with one configuration, and evaluate them with other programs; return
+    `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out
+    cases.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)
@@ -244,7 +245,7 @@ def run_benchmark(
 
 
 def _judge(case: Case, run: CampaignRun, out: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Evaluate railfix and the other programs on one case; rows and notes."""
+    """Evaluate railfix and the other programs on one case; return rows and notes."""
     tables = list_position_tables(run.out)
     items = [RunAndReference(run=run.out, reference=case.truth, configuration=name, table=name) for name in tables]
     others, notes = _programs(case, run, out)
@@ -256,7 +257,7 @@ def _judge(case: Case, run: CampaignRun, out: Path) -> tuple[list[dict[str, Any]
 
 
 def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path], list[str]]:
-    """Write the positions of other programs as folders of runs, by name; notes."""
+    """Write the positions of other programs as folders of runs; return them by name, and notes."""
     out.mkdir(parents=True, exist_ok=True)
     notes: list[str] = []
     single = out / "rtklib-single.pos"
@@ -274,7 +275,7 @@ def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path],
 
 
 def _row(evaluation: Evaluation, run: EvaluatedRun, name: str, kind: str) -> dict[str, Any]:
-    """Return the row of one kind of position of one run, of both antennas where there are two."""
+    """Return the row of one kind of position of one run, for both antennas if there are two."""
     figures = evaluation.figures.filter(run=run.name, grouping=ALL, epochs_of="own", position=kind)
     antenna = ALL if ALL in figures["antenna"] else figures["antenna"][0]
     row = figures.filter(antenna=antenna).row(0, named=True)
@@ -300,12 +301,12 @@ def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
 
 
 def heads() -> tuple[list[str], list[str]]:
-    """Return the heads of the table that people read, and the performance feature of EN 16803-1 of each column."""
+    """Return the heads of the table for readers, and the performance feature of EN 16803-1 of each column."""
     return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
 
 
 def shown_rows(table: pl.DataFrame) -> list[list[str]]:
-    """Return the rows of the table that people read; "-" where a column has no value."""
+    """Return the rows of the table for readers; "-" where a column has no value."""
     return [
         [
             f"{row['case']}{' (held out)' if row['held_out'] else ''}",
@@ -344,5 +345,5 @@ def _write(table: pl.DataFrame, notes: Sequence[str], cases: Sequence[Case], con
     write_whole(out / "benchmark.json", json.dumps(record, indent=2, allow_nan=False) + "\n", what="benchmark")
 
 
-#: What ``benchmark.json`` records of a case.
+#: Record of a case in ``benchmark.json``.
 _ABOUT: Final = {"held_out", "licence", "fetch", "sha256", "scenario"}

@@ -18,7 +18,7 @@ from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
 
 #: File that makes a folder a case.
 CASE_FILE: Final = "case.toml"
-#: Files of a run that are settings: one configuration is that of all cases.
+#: Files of a run that are settings: all cases share one configuration.
 _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
 
@@ -27,7 +27,7 @@ class OtherPositions(Settings):
 
     file: Path
     antenna: Antenna = "front"
-    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Of a CSV file with other names.
+    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of a CSV file whose names differ.
 
 
 class RecordedScenario(Settings):
@@ -54,7 +54,7 @@ class CaseFile(Settings):
     licence: str = Field(min_length=1)
     fetch: str = Field(min_length=1)
     held_out: bool  #: The case is for the benchmark alone: no test reads it and no setting was chosen with it.
-    files: RunInputs  #: As the options of `railfix run`, with the ground truth as `truth`.
+    files: RunInputs  #: Options of `railfix run`, with the ground truth as `truth`.
     sha256: dict[str, str]  #: SHA-256 of every file of `files` and `positions`, by its name there.
     positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by the name of the program.
     scenario: RecordedScenario = RecordedScenario()
@@ -71,14 +71,14 @@ class CaseFile(Settings):
 class Case:
     """A case with its files where they are."""
 
-    name: str  #: That of its folder.
+    name: str  #: Name of its folder.
     folder: Path
     content: CaseFile
     inputs: RunInputs  #: Without the ground truth.
     truth: Path
 
     def check_hashes(self) -> None:
-        """Raise InputFileError where a file is not the one of the case, SettingsError without a hash."""
+        """Raise InputFileError where a file differs from that of the case, SettingsError where it has no hash."""
         for name in self.content.every_file():
             path, stated = self.folder / name, self.content.sha256.get(str(name))
             if stated is None:
@@ -93,7 +93,7 @@ class Case:
 
 
 def read_case(folder: Path) -> Case:
-    """Read the case in a folder; InputFileError, SettingsError where ``case.toml`` is not that of a case."""
+    """Read the case in a folder; InputFileError, SettingsError where ``case.toml`` is not a valid case."""
     path = folder / CASE_FILE
     content = load_settings(CaseFile, path, what="a case of a benchmark")
     if content.files.truth is None:
@@ -111,7 +111,9 @@ def read_case(folder: Path) -> Case:
 
 
 def read_cases(folder: Path) -> list[Case]:
-    """Read the cases in the folders of a folder, or the one in itself, in order of their names (`read_case`)."""
+    """Read the cases in the subfolders of a folder, or the one in the folder itself, in order of their names
+    (`read_case`).
+    """
     if not folder.is_dir():
         raise InputFileError(folder, "there is no such folder; expected one of folders with a case.toml")
     folders = (
@@ -123,7 +125,7 @@ def read_cases(folder: Path) -> list[Case]:
 
 
 def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
-    """Raise MismatchError where a file of the settings was fitted (by the SHA-256 it records) on a held-out case."""
+    """Raise MismatchError where a settings file was fitted on a held-out case, by the SHA-256 that it records."""
     files = [path for path in (config.cn0_curve, config.error_model) if path is not None]
     for path in files:
         text = read_text(path)

@@ -46,7 +46,7 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "conventional_error_m": "3-D single point at its nearest point of the trajectory, + toward the end",
     "distance_m": "straight distance from the position on the map to the reference",
     "along_sigma_m": "standard deviation that the run states",
-    "branch_probability": "of the filter along the track: probability of the place",
+    "branch_probability": "of the filter along the track: probability of the branch",
     "sources": "measurements that the filter used",
     "interval_m": "distance travelled since the previous position",
     "gap_s": "time since the previous position",
@@ -55,7 +55,7 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "block": "block of time within the run, for confidence limits",
 }
 
-#: Rows of tables of the filter along the track: it states a probability for every place.
+#: Rows of filter tables, which state a probability for every position.
 OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 
@@ -70,7 +70,7 @@ class AntennaEpochs:
     speed_from: str
     outside: int  #: Epochs of the log outside the reference.
     step_s: float  #: Step of the log.
-    from_sections: int  #: Epochs with a reference whose environment is that of the sections.
+    from_sections: int  #: Epochs with a reference whose environment comes from the sections.
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
@@ -86,7 +86,7 @@ def protection_columns(table: pl.DataFrame) -> list[str]:
 
 
 def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Tables one below the other, levels null where one has none. The tables are taken apart column by column."""
+    """Concatenate tables; levels are null where a table has none. The tables are taken apart column by column."""
     schema = {name: kind for table in tables for name, kind in table.schema.items()}
     lengths = [len(table) for table in tables]
     columns = []
@@ -253,6 +253,6 @@ def _own_speed(time: Datetimes, step_m: Floats, known: Masks) -> Floats:
 
 
 def _environment(stated: Strings, sections: Sections | None, chainage_m: Floats) -> Strings:
-    """Return the environment that the reference states, else that of the sections."""
+    """Return the environment stated by the reference, or by the sections where the reference has none."""
     names = stated if sections is None else np.where(stated == "", sections.at(chainage_m), stated)
     return np.where(names == "", UNKNOWN, names)

@@ -30,12 +30,12 @@ from railfix.evaluate.intervals import branch_table, interval_table, level_table
 from railfix.evaluate.place import TrackFiles
 from railfix.io.reference_log import AntennaReference, read_reference
 
-#: Names of a reference that is looked for beside the log of a run.
+#: Names of a reference that is searched for in the folder of a run's log.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
-#: Columns of the positions that are evaluated beside those of every table.
+#: Columns of the positions that are evaluated in addition to the error columns of every table.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
 _FACTS: Final = ("speed_from", "outside", "step_s")
-#: Blocks of one run are numbered apart from those of the next.
+#: Blocks of one run are numbered separately from the next.
 _BLOCKS_APART: Final = 10**9
 
 Reference = Path | Mapping[str, AntennaReference] | None
@@ -46,11 +46,11 @@ class RunAndReference:
     """A table of positions of a run, with its reference trajectory."""
 
     run: Path
-    reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` beside the run's log.
+    reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` in the folder of the run's log.
     configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
     table: str = POSITIONS_TABLE  #: See `railfix.evaluate.inputs.list_position_tables`.
-    #: Another run on the same log, whose conventional positions take the place of the run's own: one with the screens
-    #: elevation and C/N0 alone gives those that P1 compares with.
+    #: Another run on the same log, whose conventional positions replace the run's own: a run with the elevation and
+    #: C/N0 screens alone has those that P1 compares with.
     conventional: Path | None = None
 
 
@@ -69,7 +69,7 @@ class EvaluatedRun:
     speed_from: Mapping[str, str]
     outside: Mapping[str, int]  #: Epochs of the log outside the reference, by antenna.
     step_s: Mapping[str, float]  #: Step of the log, by antenna.
-    protection: Mapping[str, Any]  #: What its protection levels rest on, as ``run.json`` says.
+    protection: Mapping[str, Any]  #: Basis of its protection levels, from ``run.json``.
     settings: Mapping[str, Any]
     inputs: tuple[Mapping[str, Any], ...]  #: Files that were read, with size and hash.
     notes: tuple[str, ...]
@@ -84,7 +84,7 @@ class Evaluation:
     figures: pl.DataFrame  #: Figures of every grouping: `FIGURE_COLUMNS`.
     intervals: pl.DataFrame  #: `INTERVAL_COLUMNS`.
     levels: pl.DataFrame | None  #: `LEVEL_COLUMNS`; None where no run has a protection level.
-    integrity: Mapping[str, Integrity]  #: Levels against errors, by what the levels rest on.
+    integrity: Mapping[str, Integrity]  #: Levels against errors, by the basis of the levels.
     #: `OUTAGE_COLUMNS`, `BRANCH_COLUMNS`; None where no table of the filter along the track is among the runs.
     outages: pl.DataFrame | None
     branches: pl.DataFrame | None
@@ -92,7 +92,9 @@ class Evaluation:
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return one figure of the row with these values, by default of "all", own, constrained; else LookupError."""
+        """Return one figure of the row with these values, by default of "all", own, constrained; otherwise
+        LookupError.
+        """
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:
@@ -127,11 +129,11 @@ def evaluate_runs(
 ) -> Evaluation:
     """Evaluate runs against their reference trajectories.
 
-    `sections`: the environment by chainage (``from_m,to_m,environment``) where a reference does not tell it. `files`:
-    in place of the track and the vehicle that ``run.json`` names.
+    `sections`: the environment by chainage (``from_m,to_m,environment``) where a reference does not state it. `files`:
+    replacements of the track and the vehicle that ``run.json`` names.
 
-    InputFileError: a file is missing, or not what it should be. MismatchError: a run and its reference have no time in
-    common, or the errors cannot be worked out as asked. SettingsError: the same run twice, or none.
+    InputFileError: a file is missing, or has other content than expected. MismatchError: a run and its reference have
+    no time in common, or the errors cannot be computed as requested. SettingsError: the same run twice, or none.
     """
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
@@ -252,7 +254,7 @@ def _evaluate(
 
 
 def reference_beside(run: RunFolder) -> Path:
-    """Return the reference beside the log of the front antenna; InputFileError unless there is exactly one."""
+    """Return the reference in the folder of the front antenna's log; InputFileError unless there is exactly one."""
     logs = run.input_paths("front")
     if not logs:
         raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")
@@ -284,7 +286,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return runs with short names that tell them apart, the table in it where it is not that of single epochs."""
+    """Return runs with short distinct names, which include the table where it is not that of single epochs."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]
@@ -296,7 +298,7 @@ def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
-    """Return the names of folders, with as many parent folders as are needed to tell different ones apart."""
+    """Return the names of folders, with as many parent folders as distinguish different ones."""
     parts = [path.resolve().parts for path in paths]
     depth = 1
     while len({part[-depth:] for part in parts}) < len(set(parts)):
@@ -305,7 +307,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Return every grouping of every run; of several also the runs of each configuration together."""
+    """Return every grouping of every run; for several runs also those of each configuration."""
     epochs = epochs.select(*KEYS, *USED)
     groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
     tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]
@@ -324,7 +326,7 @@ def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.
 
 
 def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:
-    """Of every run and antenna, and of every configuration where there are several runs."""
+    """For every run and antenna, and for every configuration with several runs."""
     table = interval_table(epochs, list(KEYS))
     if epochs["run"].n_unique() < 2:
         return table

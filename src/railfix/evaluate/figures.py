@@ -1,4 +1,4 @@
-"""Figures of merit by groups of epochs, constrained beside conventional, with confidence limits.
+"""Figures of merit by groups of epochs, for constrained and conventional positions, with confidence limits.
 
 Errors of a train are correlated over tens of seconds, so that epochs are not independent samples; blocks
 of a minute nearly are.
@@ -19,9 +19,9 @@ from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.reasons import Status
 from railfix.evaluate.inputs import EvaluationOptions, floats
 
-#: Distance on the map from which on an answer is in the wrong place [m].
+#: Distance on the map from which on a position counts as wrong [m].
 WRONG_PLACE_M = 50.0
-#: Error sizes; the share of errors above each is counted [m].
+#: Error sizes; the fraction of errors above each is counted [m].
 OVER_M: Final = (5, 10, 20, 50)
 
 
@@ -32,14 +32,14 @@ class Score:
     epochs: int  #: Epochs with observations inside the time of the reference.
     positions: int  #: Those with coordinates.
     rate: float  #: positions / epochs.
-    #: Of the signed error.
+    #: Statistics of the signed error.
     mean_m: float
     std_m: float
-    #: Of the absolute error.
+    #: Statistics of the absolute error.
     p50_m: float
     p95_m: float
     max_m: float
-    wrong_place: float  #: Share of the positions more than `WRONG_PLACE_M` from the reference.
+    wrong_place: float  #: Fraction of the positions more than `WRONG_PLACE_M` from the reference.
 
 
 def score(error_m: Floats, observed: Masks) -> Score:
@@ -152,15 +152,15 @@ def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, 
             most = high - low + 1
 
 
-#: Which positions: on the map, those of status ok alone, the 3-D ones at their nearest point.
+#: Kinds of position: on the map, of status ok alone, 3-D at their nearest point.
 POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
-#: What names a row of every table.
+#: Columns that identify a row of every table.
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
 #: Names while they are grouped by: many rows, few words.
 WORDS: Final = pl.Categorical()
-#: In place of a name: everything together.
+#: Value in place of a name for all groups together.
 ALL: Final = "all"
 #: Groups of `signals`: epochs at which the single-epoch solution used a satellite, and tunnels and other outages.
 WITH_SATELLITES: Final = "with satellites"
@@ -193,7 +193,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "highest_m": "error furthest toward the end of the line",
     "max_at_time": "GPS time of the largest error",
     "max_at_chainage_m": "chainage of the reference there",
-    **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "share of errors above this size"),
+    **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "fraction of errors above this size"),
     "wrong_places": "errors above 50 m",
     "reference_sigma_p50_m": "median standard deviation of the reference",
     "along_sigma_p50_m": "median standard deviation that the run states",
@@ -203,13 +203,13 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     ),
     **dict.fromkeys(("normalised_mean", "normalised_rms"), "error / along_sigma"),
     **dict.fromkeys(("normalised_p68", "normalised_p95"), "size of error / along_sigma"),
-    **dict.fromkeys((f"over_{n}_sigma" for n in (1, 2, 3)), "share of errors above so many along_sigma"),
+    **dict.fromkeys((f"over_{n}_sigma" for n in (1, 2, 3)), "fraction of errors above this multiple of along_sigma"),
     "blocks": "blocks of time for the confidence limits below",
     **dict.fromkeys(LIMIT_COLUMNS, "limit of confidence"),
 }
 #: Statuses of a position that passed every check, of single epochs and of the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
-#: Columns of the epochs that the figures are made of, beside the keys.
+#: Columns of the epochs from which the figures are computed, besides the keys.
 USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
     "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
@@ -369,7 +369,7 @@ def _figures() -> list[pl.Expr]:
 def _with_limits(
     table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
 ) -> pl.DataFrame:
-    """Return the table with confidence limits, null where there are none."""
+    """Return the table with confidence limits, null where they are undefined."""
     schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
     if part is None:
         return table.with_columns(pl.lit(None, kind).alias(name) for name, kind in schema.items())

@@ -26,7 +26,7 @@ from railfix.run.record import RunRecord, read_parquet, read_record
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
-#: No columns beside those that every table has.
+#: No columns beyond those that every table has.
 NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
 CONVENTIONAL: Final = ("conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m")
@@ -61,7 +61,9 @@ class RunFolder(RunRecord):
         return dict(self._line.get("chainage_of") or {})
 
     def turn_m(self, antenna: str) -> float:
-        """Once round a closed line by the chainage of an antenna [m]; infinite for others, and where no run says it."""
+        """Length of a closed line by the chainage of an antenna [m]; infinite for other lines, and where no run states
+        it.
+        """
         turn = (self._line.get("turn_m") or {}).get(antenna)
         return float("inf") if turn is None else float(turn)
 
@@ -77,7 +79,7 @@ class RunFolder(RunRecord):
 
     @property
     def tracks(self) -> list[Path]:
-        """Files of the track: that in the folder where the run moved, joined or raised it, else its inputs."""
+        """Files of the track: those in the folder if the run moved, joined or raised it, otherwise its inputs."""
         name = self.track_facts.get("file")
         return [self.path / str(name)] if name else self.input_paths("track")
 
@@ -158,7 +160,7 @@ def list_position_tables(path: Path) -> list[str]:
 def read_run(
     path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | None = None, columns: cs.Selector | None = None
 ) -> RunFolder:
-    """Read a folder that `railfix run` wrote; InputFileError, MismatchError: it is not what it should be."""
+    """Read a folder that `railfix run` wrote; InputFileError, MismatchError: the table is not as expected."""
     record = read_record(path).record
     needed = (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED
     file, rows = read_table(path, table, needed, columns)
@@ -245,7 +247,8 @@ Method = Literal["chainage", "trajectory"]
 
 #: Longest gap of a reference that is interpolated over [s].
 LARGEST_GAP_S: Final = 2.5
-#: Windows of continuity [s]: 15 s is that of an approach in aviation, a minute the run from one station to the next.
+#: Windows of continuity [s]: 15 s is the window of an approach in aviation, a minute the run from one station to the
+#: next.
 WINDOWS_S: Final = (15.0, 60.0)
 
 
@@ -261,7 +264,7 @@ RisingEdges = Annotated[tuple[Positive, ...], Field(min_length=1), AfterValidato
 
 
 class EvaluationInputs(Settings):
-    """Files of an evaluation beside the runs, and the names of the runs."""
+    """Files of an evaluation besides the runs, and names of the runs."""
 
     reference: tuple[str, ...] = option(
         "Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one for all runs or one for each in order; "
@@ -297,7 +300,7 @@ class EvaluationInputs(Settings):
 
 
 class EvaluationOptions(Settings):
-    """Settings of an evaluation; the options of `railfix evaluate` say what most are."""
+    """Settings of an evaluation; most are described by the options of `railfix evaluate`."""
 
     method: Literal["auto", "chainage", "trajectory"] = option(
         "Errors as differences of chainage, or along the trajectory from the reference position.", "auto"
@@ -324,7 +327,7 @@ class EvaluationOptions(Settings):
         "Limits between the speed classes.", (20.0, 60.0, 100.0), name="--speed-classes", metavar="KMH,..."
     )
     alarm_limits_m: tuple[Positive, ...] = option(
-        "Alarm limits that protection levels are compared with, besides the run's own.",
+        "Alarm limits that protection levels are compared with, in addition to the run's own.",
         (10.0, 20.0, 40.0),
         name="--alarm-limit",
         metavar="M,...",

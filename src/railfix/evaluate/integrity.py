@@ -26,7 +26,7 @@ LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
 PARTS: Final[tuple[str, ...]] = ("fault_free_m", "one_fault_m", "two_faults_m")
 STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
-#: Columns of the epochs that a Stanford diagram is made of, beside the level and its status.
+#: Columns of the epochs for a Stanford diagram, besides the level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
 #: Statuses whose level is a bound: a coasting filter states one and raises no alarm.
 _BOUNDED: Final = (*PASSED, "coasting")
@@ -40,7 +40,7 @@ _REGIONS: Final = {
     Region.NO_POSITION: "no_position",
 }
 
-#: Columns of the table of counts beside its keys, with their meaning.
+#: Columns of the table of counts besides its keys, with their meaning.
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
     "group": "name of the group",
@@ -60,7 +60,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "no_position": "neither position nor level",
     "available": "levels within AL, with or without an error",
     "availability": "available / epochs",
-    "availability_of_observed": "share of `observed` with a level within the limit",
+    "availability_of_observed": "fraction of `observed` with a level within the limit",
     "beyond": "errors above their level; the same at every AL",
     "beyond_share": "beyond / judged",
     "beyond_blocks": "blocks of time (60 s) with an error above its level",
@@ -70,7 +70,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "the same for 60 s"),
 }
 
-#: Columns of the list of epochs beyond, with their unit and meaning; KIND is that of the level.
+#: Columns of the list of epochs beyond, with their unit and meaning; KIND is the kind of the level.
 BEYOND_COLUMNS: Final[dict[str, str]] = {
     "run": "name of the run",
     "time_gpst": "time tag of the receiver, GPS time",
@@ -120,14 +120,14 @@ def _usable(status: Strings, verdict: Strings) -> Masks:
 def epochs_diagram(
     epochs: pl.DataFrame, kind: str, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
-    """Sort the epochs of one antenna (`EPOCH_COLUMNS`) inside the reference, and their levels, into a diagram."""
+    """Count the epochs of one antenna (`EPOCH_COLUMNS`) within the reference, and their levels, in a diagram."""
     columns = (level_name(kind), f"{kind}_protection_status")
     spanned = epochs.select(*_JUDGED, *(name for name in columns if name in epochs.columns)).filter("in_reference")
     return _sort(spanned, *_judge(spanned, kind, levels_of), alarm_limit_m, options)
 
 
 def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
-    """Return the errors and levels as counted of epochs inside the reference, NaN where there is none."""
+    """Return the counted errors and levels of epochs within the reference, NaN where missing."""
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
     level = effective_levels(
@@ -143,7 +143,7 @@ def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Float
 def positions_diagram(
     positions: pl.DataFrame, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
-    """Sort the epochs of one antenna (`POSITION_COLUMNS`) without reference by availability and continuity."""
+    """Count the epochs of one antenna (`POSITION_COLUMNS`) without a reference by availability and continuity."""
     level = effective_levels(
         floats(positions, "protection_level_m"),
         np.isfinite(floats(positions, "chainage_m")),
@@ -226,7 +226,7 @@ def _count(
 
 
 def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
-    """Return rows with their sums over both antennas and over all runs of a configuration; with shares."""
+    """Return rows with sums over both antennas and over all runs of a configuration, and with fractions."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:
         parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))

@@ -1,4 +1,4 @@
-"""What a run shows beside its errors: steps between positions, outages, branches, levels, service by chainage."""
+"""Figures of a run besides its errors: steps between positions, outages, branches, levels, service by chainage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.evaluate.epochs import OF_FILTER, level_columns
 from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, edges_reached, has_position
 from railfix.evaluate.inputs import RunFolder, list_position_tables, read_run
 
-#: Columns of the table of intervals beside its keys, with their unit and meaning.
+#: Columns of the table of intervals besides its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
     "position": "`constrained`, `constrained_ok` or `conventional`",
     "intervals": "pairs of consecutive positions between which the train moved",
@@ -90,10 +90,10 @@ def _seconds(duration: pl.Expr) -> pl.Expr:
     return duration.dt.total_nanoseconds() / 1e9
 
 
-#: Shorter losses of all satellites are no stretch [s].
+#: Shorter losses of all satellites are not listed [s].
 LEAST_S: Final = 2.0
 
-#: Columns of the table of stretches without satellites beside its keys, with their unit and meaning.
+#: Columns of the table of stretches without satellites besides its keys, with their unit and meaning.
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
     "begin_gpst": "first epoch without a satellite used, GPS time",
     "duration_s": "from the last epoch with a satellite to the last without",
@@ -154,20 +154,22 @@ _EDGES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 
 _BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branch_probability", "distance_m", "block")
 
-#: Columns of the table of probabilities beside its keys, with their unit and meaning.
+#: Columns of the table of probabilities besides its keys, with their unit and meaning.
 BRANCH_COLUMNS: Final[dict[str, str]] = {
-    "probability": "class of the stated probability of the place; `all` for every epoch",
+    "probability": "class of the stated probability of the branch; `all` for every epoch",
     "judged": "positions of the class with an error",
     "probability_mean": "mean of the stated probabilities",
-    "right_share": "share of the places within 50 m of the reference",
+    "right_share": "fraction of the positions within 50 m of the reference",
     "wrong_places": "places further away",
     "blocks": "blocks of time with such an epoch",
-    "wrong_blocks": "blocks with a wrong place",
+    "wrong_blocks": "blocks with a wrong position",
 }
 
 
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Return the stated probability against the share of right places, by class; None without a table of the filter."""
+    """Return the stated probability and the fraction of right positions, by class; None without a table of
+    the filter.
+    """
     filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None
@@ -189,7 +191,7 @@ def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     return table.sort(*KEYS, "rank", maintain_order=True).select(*KEYS, *BRANCH_COLUMNS)
 
 
-#: Columns of the table of levels beside its keys, with their unit and meaning.
+#: Columns of the table of levels besides its keys, with their unit and meaning.
 LEVEL_COLUMNS: Final[dict[str, str]] = {
     "level": "column of the level",
     "position": "`constrained` or `constrained_ok`",
@@ -197,7 +199,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
     "positions": "epochs with a position",
     "infinite": "positions with an infinite level",
     "with_level": "positions with a finite level",
-    "level_share": "share of `observed` with a finite level",
+    "level_share": "fraction of `observed` with a finite level",
     "level_p50_m": "finite levels",
     "level_p95_m": "finite levels",
     "errors": "finite levels with an error",
@@ -253,7 +255,7 @@ def _counts(level: str) -> list[pl.Expr]:
     ]
 
 
-#: Statuses of the filter with a place that has a level.
+#: Statuses of the filter with a position that has a level.
 _SOUND: Final = ("tracking", "coasting")
 _POSITION_COLUMNS: Final = ("n_used", "n_rejected", "conventional_offset_m")
 #: Columns of the table by stretch; percentiles are over epochs.
@@ -264,8 +266,8 @@ COLUMNS: Final = (
 
 
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
-    """Compute `COLUMNS`, what satellites gave by stretches of the line, over all antennas of runs on one map (else
-    MismatchError); epochs without position stand where the filter has the train.
+    """Compute `COLUMNS`, the service of satellites by stretches of the line, over all antennas of runs on one map (else
+    MismatchError); epochs without a position are located by the filter.
     """
     runs = [read_run(folder) for folder in folders]
     first = runs[0].track_facts
@@ -306,7 +308,7 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
 
 
 def _epochs(folder: Path, run: RunFolder, number: int) -> pl.DataFrame:
-    """Return the epochs of one run with their chainage, of its single epochs and of the filter where it has one."""
+    """Return the epochs of one run with their chainage, from single epochs and, where the run has it, the filter."""
     single = run.positions.select(
         "time_gpst", "antenna", "chainage_m", pl.col("status").cast(pl.String),
         *(pl.col(name).cast(pl.Float64) for name in _POSITION_COLUMNS),

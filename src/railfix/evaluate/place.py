@@ -1,4 +1,4 @@
-"""Errors along the line of one antenna: by chainage, or along the trajectory.
+"""Errors along the line of one antenna, by chainage or along the trajectory.
 
 The error is the distance along the map between the answer and the reference's own point on it,
 positive toward the end of the line (P1 3.3).
@@ -31,7 +31,7 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 class Bracket:
     """Neighbouring instants of the reference for each of T times."""
 
-    #: The same where a time is one of the reference, shape (T,).
+    #: Equal to the reference where a time is one of its times, shape (T,).
     left: Indices
     right: Indices
     share: Floats  #: 0 at left, 1 at right; shape (T,).
@@ -84,13 +84,13 @@ def along_track_error(
 ) -> Floats:
     """Signed distance on the map from the reference's point to the answer, + toward the end of the line (P1 3.3).
 
-    The distance along the line. Where the map passes the reference's place more than once (laps, a road's two
-    carriageways) the pass nearest to the answer counts: which of them it was, one epoch of ranges cannot tell. And
-    where the line comes back to near itself (a crossing), the straight distance between the two points counts if it is
-    shorter. On a line that passes every place once neither has an effect, but for the chord of a curve.
+    The distance along the line. Where the map passes the reference point more than once (laps, a road's two
+    carriageways) the pass nearest to the position counts, as the ranges of one epoch cannot distinguish them. Where the
+    line comes back near itself (a crossing), the straight distance between the two points counts if it is shorter. On a
+    line that passes every point once neither has an effect, except for the chord of a curve.
 
     `arc_m` are the answers along the trajectory, shape (T,), `reference_ecef_m` of shape (T, 3); NaN where either is
-    missing. Passes of the map up to `same_place_m` from the reference are its place.
+    missing. Passes of the map up to `same_place_m` from the reference count as its position.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -100,7 +100,7 @@ def along_track_error(
     nearest_arc, offset = trajectory.nearest(reference)
     passes = find_segments_near(reference, trajectory, np.maximum(same_place_m, offset))
     passing = passes.lowest & (np.linalg.norm(passes.offset_m, axis=1) <= same_place_m)
-    if np.isfinite(trajectory.turn_m):  # the ends of a closed line are no passes: it goes on there
+    if np.isfinite(trajectory.turn_m):  # the ends of a closed line are no separate passes: the line continues there
         passing &= ~((passes.segment == 0) & (passes.along_m <= 0.0))
         passing &= ~((passes.segment == len(length) - 1) & (passes.along_m >= length[-1]))
     ways = arc_m[at][passes.position] - trajectory.arc_m[passes.segment] - passes.foot_m
@@ -118,8 +118,8 @@ def along_track_error(
 def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
     """Straight distance between positions on the map and the reference's nearest point on the map, shape (T,) [m].
 
-    It needs no choice between several passes of the line at one place, and never exceeds the distance along the line.
-    NaN where the position or the reference, shape (T, 3), is missing.
+    It requires no choice between several passes of the line at one point, and never exceeds the distance along the
+    line. NaN where the position or the reference, shape (T, 3), is missing.
     """
     distance = np.full(len(arc_m), np.nan)
     rows = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -135,21 +135,18 @@ SAME_MAP_M: Final = 1.0
 SAME_TRAJECTORY_M: Final = 0.01
 #: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: A way along the line this much longer than twice the error is to another pass of it, no chord of a curve [m].
+#: A distance along the line that exceeds twice the error by this much leads to another pass, and is no chord of a curve
+#: [m].
 _ANOTHER_PASS_M: Final = 50.0
 #: Rounding of chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
-    """Files in place of those that ``run.json`` names, and options for reading the track (but `reading.reference`)."""
+    """Files that replace those of ``run.json``, and options for reading the track (except `reading.reference`)."""
 
-    track: tuple[Path, ...] = option(
-        "Track in place of the one that run.json names.", (), metavar="TRACK", panel=INPUTS
-    )
-    vehicle: Path | None = option(
-        "Vehicle in place of the one that run.json names.", None, metavar="TOML", panel=INPUTS
-    )
+    track: tuple[Path, ...] = option("Track that replaces the one in run.json.", (), metavar="TRACK", panel=INPUTS)
+    vehicle: Path | None = option("Vehicle that replaces the one in run.json.", None, metavar="TOML", panel=INPUTS)
     reading: TrackReading = Field(default_factory=TrackReading)
 
 
@@ -174,9 +171,9 @@ class PlaceErrors:
     error_m: Floats
     conventional_error_m: Floats
     #: Straight distance between the position on the map and the reference: its point on the map where the trajectory is
-    #: read, else its own position; shape (T,).
+    #: read, otherwise its own position; shape (T,).
     distance_m: Floats
-    reference_chainage_m: Floats  #: Of the reference; from the map where the reference has no chainage; shape (T,).
+    reference_chainage_m: Floats  #: Chainage of the reference; from the map where the reference has none; shape (T,).
     files: tuple[tuple[str, Path], ...] = ()  #: Track and vehicle, if they were read.
     notes: tuple[str, ...] = ()
 
@@ -189,7 +186,9 @@ def compute_errors(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Return the errors of one antenna, by chainage on the same map to `SAME_MAP_M`, else along the trajectory."""
+    """Return the errors of one antenna, by chainage where run and reference share a map within `SAME_MAP_M`, otherwise
+    along the trajectory.
+    """
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
     turn = run.turn_m(antenna)
@@ -198,7 +197,7 @@ def compute_errors(
             if files.track or files.vehicle is not None:
                 find_trajectory(
                     run, antenna, answers.chainage_m, answers.ecef_m, files
-                )  # what was given is that of the run
+                )  # the given file is that of the run
             return PlaceErrors(
                 method="chainage",
                 error_m=short_distance_m(answers.chainage_m - answers.reference_chainage_m, turn),
@@ -232,7 +231,7 @@ def compute_errors(
 
 
 def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
-    """Raise MismatchError where the reference lies further than `ANOTHER_PLACE_M` from the positions."""
+    """Raise MismatchError where the reference is farther than `ANOTHER_PLACE_M` from the positions."""
     apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
     apart = apart[np.isfinite(apart)]
     if len(apart) and (median := float(np.median(apart))) > ANOTHER_PLACE_M:
@@ -258,7 +257,7 @@ def _note_of_passes(
 
 
 def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[str | None, bool]:
-    """Reason against differences of chainage, or None; and whether the reference chainage is usable for places."""
+    """Return the reason against differences of chainage, or None, and whether the reference chainage is usable."""
     known = np.isfinite(answers.reference_ecef_m[:, 0])
     with_chainage = np.isfinite(answers.reference_chainage_m)
     if not with_chainage.any():
@@ -288,7 +287,9 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory of a run's positions, its files and notes; MismatchError: they do not lie on it."""
+    """Return the trajectory of a run's positions, its files and notes; MismatchError: the positions do not lie on the
+    line.
+    """
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:
@@ -322,7 +323,7 @@ def find_trajectory(
 
 
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
-    """Return options for reading the track: those given; else those of the file, then those in ``run.json``."""
+    """Return options for reading the track: the given ones, then those of the file, then those in ``run.json``."""
     given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(given):
         return [given]

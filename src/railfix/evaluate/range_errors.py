@@ -1,4 +1,4 @@
-"""Errors of single pseudoranges against a reference position, clock and common errors taken off (P1 7, fig. 14).
+"""Errors of single pseudoranges against a reference position, clock and common errors subtracted (P1 7, fig. 14).
 
 Common errors are those that a nearby reference station has measured; of the errors of runs an error model is made.
 """
@@ -165,7 +165,7 @@ def range_errors(
     *,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Return the pseudorange errors of one antenna over one chunk of T epochs, in blocks of `block_s`.
+    """Return the pseudorange errors of one antenna in one chunk of T epochs, in blocks of `block_s`.
 
     The clock of each constellation is the robust mean of the ranges that passed the screens. Each range contributes to
     its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An error common to all
@@ -191,7 +191,7 @@ def range_errors(
     if base is not None:
         residual = residual - base.at(result.time, satellite, largest_gap_s=_LARGEST_BASE_GAP_S)
     used = (reason == Reason.USED) & np.isfinite(residual)
-    # What a screen suspects has a sigma of its own: the errors of the others are what the model is of.
+    # A suspected range has an increased sigma; the model is fitted to the errors of the others.
     for name in ("doppler", "antenna_pair"):
         if name in result.screens:
             used &= ~result.screens[name].reject
@@ -231,7 +231,7 @@ def _level_sigma_m(result: AntennaResult) -> Floats:
 
 
 class StationBeside(Settings):
-    """Reference positions of runs, and a station beside the line, as the command line names them."""
+    """Reference positions of runs, and a reference station, as given on the command line."""
 
     reference: tuple[Path, ...] = input_option("Reference positions, one file for each RUN in order.", metavar="FILE")
     base: tuple[Path, ...] = input_option(
@@ -252,13 +252,14 @@ class ModelInputs:
     run: Path  #: Folder written by ``railfix run``.
     reference: Path  #: Reference trajectory of its antennas (`railfix.io.reference_log`).
     base: tuple[Path, ...] = ()  #: RINEX files of a nearby reference station; may be empty.
-    base_position_ecef_m: Floats | None = None  #: Of the station, where its header is not good enough; shape (3,).
+    #: Position of the station, where its header is not accurate enough; shape (3,).
+    base_position_ecef_m: Floats | None = None
     columns: ColumnNames = field(default_factory=ColumnNames)  #: How to read the reference.
 
 
 @dataclass(frozen=True, kw_only=True)
 class _RunErrors:
-    """Range errors of one run, with what the model's source says of it."""
+    """Range errors of one run, with the model's description of their source."""
 
     samples: tuple[ErrorSamples, ...]
     times: tuple[np.datetime64, ...]
@@ -273,8 +274,8 @@ def error_model_from_runs(
 ) -> tuple[ErrorModel, ErrorSamples]:
     """Return the error model of the pseudoranges of several runs, before and after the screens, and its samples.
 
-    Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the verdict of
-    every screen. All runs have a reference station, or none has.
+    Each run is processed again with its own settings, which yields corrected pseudoranges, satellites and the verdict
+    of every screen. Either all runs have a reference station, or none has.
 
     MismatchError: some runs have a reference station and others have none, their conditions differ, or no range error
     could be computed; or a file has changed since the run.

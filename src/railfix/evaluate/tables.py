@@ -179,7 +179,7 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def group_tables(evaluation: Evaluation) -> list[Table]:
-    """Return errors by configuration, line, environment, speed and so on, on the map beside conventional."""
+    """Return errors by configuration, line, environment, speed and other groups, on the map and conventional."""
     tables, runs = [], evaluation.runs
     apart = len({run.configuration for run in runs}) == len(runs)
     for grouping, caption in _GROUPINGS.items():
@@ -227,13 +227,15 @@ def outages(rows: pl.DataFrame) -> Table:
 
 
 def _where(rows: pl.DataFrame) -> list[Column]:
-    """Return the columns of the run and antenna; rows of one run do not name it."""
+    """Return the columns that name the run and antenna; rows of a single run do not name it."""
     antenna: Column = ("antenna", "antenna", str)
     return [antenna] if rows["run"].n_unique() == 1 and "all" not in rows["run"] else [("run", "of", str), antenna]
 
 
 def _pool_runs(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of all runs of a configuration together, those of the runs where each has its own."""
+    """Return the rows of all runs of a configuration together, or the rows of the runs where each has its own
+    configuration.
+    """
     runs = rows.filter(pl.col("run") != "all")
     several = "all" in rows["run"] and runs["run"].n_unique() > runs["configuration"].n_unique()
     return rows.filter(run="all") if several else runs
@@ -278,7 +280,7 @@ def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
     keys = ["run", "configuration", "line", "antenna", "group"]
     left, right = (rows.filter(position=position) for position in ("constrained", "conventional"))
     both = left.join(right, on=keys, how="left", suffix="_conventional", maintain_order="left")
-    # one antenna beside both together shows nothing new of the groups
+    # one antenna besides both together adds nothing to the groups
     both = both.filter(antenna="all") if "all" in both["antenna"] else both
     # without satellites nothing is observed: every epoch counts
     counted, rate = ("epochs", "rate_of_run") if grouping == "signals" else ("observed", "rate")
@@ -295,7 +297,7 @@ def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Ta
     limits = [f"{limit:g}{' (own)' if its else ''}" for limit, its in zip(rows["alarm_limit_m"], own, strict=True)]
     shown = rows.with_columns(_OF, pl.Series("limit", limits, dtype=pl.String))
     marked = [] if first else [k for k, its in enumerate(own) if its]
-    # of one environment a row: usable levels at the alarm limit of the run, as the caption says
+    # one row per environment: usable levels at the alarm limit of the run, as the caption says
     columns = _STANFORD[2:] if first else _STANFORD
     return listing(name, shown, [*_where(rows), *first, *columns], caption, marked=marked)
 
@@ -324,7 +326,7 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
     return listing(f"above-level-{kind}", shown, columns, caption)
 
 
-#: What P1 found (3.3, table 4; 5, figures 10 to 12), for comparison where it is asked for.
+#: Results of P1 (3.3, table 4; 5, figures 10 to 12), for comparison on request.
 P1_TABLE_4: Final = (
     {"configuration": "GPS only", "rate": 0.9909, "mean_m": 2.14, "std_m": 1.98},
     {"configuration": "GPS+QZS", "rate": 0.9915, "mean_m": 1.97, "std_m": 1.99},
@@ -343,7 +345,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
 
     ==================== ================================================================
     evaluation.json      all figures with their units, options, inputs with their hashes
-    errors.parquet       one row an epoch, antenna and run
+    errors.parquet       one row per epoch, antenna and run
     tables.csv           figures of every grouping, long form
     intervals.csv        distances and times between positions
     levels.csv           protection levels, where a run has any
@@ -361,7 +363,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
 
 
 def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str, str]]]:
-    """Return all tables but that of epochs, by name, with the meaning of their columns."""
+    """Return all tables except that of epochs, by name, with the meaning of their columns."""
     tables: dict[str, tuple[pl.DataFrame | None, Mapping[str, str]]] = {
         "figures": (evaluation.figures, FIGURE_COLUMNS),
         "intervals": (evaluation.intervals, INTERVAL_COLUMNS),
@@ -376,7 +378,7 @@ def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str
 
 
 def as_record(evaluation: Evaluation) -> dict[str, Any]:
-    """Everything that ``evaluation.json`` says, as plain values; NaN as None."""
+    """Content of ``evaluation.json``, as plain values; NaN as None."""
     tables = _tables(evaluation)
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), "polars": pl.__version__},

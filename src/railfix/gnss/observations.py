@@ -99,10 +99,10 @@ class Observations(NotebookTable):
     #: True where epochs must not be differenced with the one before: power failure (epoch flag 1), new site or moving
     #: antenna (2, 3), start of another file after a gap; shape (T,).
     break_before: Masks
-    #: The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 where there is none, or the log has no such
+    #: The receiver's own indicators: 1 jamming, 2 spoofing, 3 both; 0 without one, or the log has no such
     #: message; shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
-    #: Of the front end's gain control, in the receiver's unit; NaN where the log does not have it; shape (T,).
+    #: Gain of the front end, in the receiver's unit; NaN where the log does not have it; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
     #: Messages about faults that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then one with the number of
@@ -149,13 +149,13 @@ class Observations(NotebookTable):
         """Select epochs (a view), or epochs and satellites: ``log[:60]``, ``log["06:34":"06:35", "G06"]``.
 
         Bounds are numbers of epochs, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day from the log's
-        first epoch on. As with numbers the upper bound is no part of the range. Satellites are names ("G06") or
+        first epoch on. As with numbers, the upper bound is not included in the range. Satellites are names ("G06") or
         constellations ("G"), one or several.
 
         Raises
         ------
         KeyError
-            A satellite or constellation that the log does not have, or a bound that is no time.
+            The log does not have the satellite or constellation, or a bound is not a time.
         """
         rows, names = key if isinstance(key, tuple) else (key, None)
         if not isinstance(rows, slice):
@@ -225,13 +225,13 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     Returns
     -------
     Observations
-        Channels sorted by satellite, then signal. The header is that of the first part, with the
-        signals and GLONASS channels of the others added; problems are joined, counters added.
+        Channels sorted by satellite, then signal. The header is that of the first part, with the signals and GLONASS
+        channels of the others added; problems are concatenated, counters added.
 
     Raises
     ------
     ValueError
-        A part begins before the end of the one before it, or there is none.
+        A part begins before the end of the preceding part, or there are no parts.
     """
     with_epochs = [(k, part.time) for k, part in enumerate(parts) if len(part)]
     for (one, before), (other, time) in pairwise(with_epochs):
@@ -302,6 +302,6 @@ def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[st
 
 
 def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
-    """Return the first `MAX_PROBLEMS` messages, and one with the number of the others of `count`."""
+    """Return the first `MAX_PROBLEMS` messages, and a message with the number of the others, `count` in all."""
     kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

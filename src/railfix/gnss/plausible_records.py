@@ -18,7 +18,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 
 #: Semi-major axes [m]: medium orbits of GPS, Galileo (E14 and E18 at 27,978 km) and BeiDou; geosynchronous orbits of
-#: BeiDou and QZSS. Of 2,104 broadcast records of ten days from 2005 to 2025 one lies outside, a QZSS orbit under the
+#: BeiDou and QZSS. Of 2,104 broadcast records of ten days from 2005 to 2025 one is outside: a QZSS orbit under the
 #: number of a GPS satellite (`tests/gnss/test_plausible_records.py`).
 _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     "G": ((26.2e6, 26.9e6),),
@@ -30,7 +30,7 @@ _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
 _ECCENTRICITIES: Final[Mapping[str, float]] = {"G": 0.05, "E": 0.2, "C": 0.05, "J": 0.12}
 #: Radii of GLONASS, and semi-major axes by position and velocity [m]; 25,416 to 25,602 km in those records.
 _GLONASS_M: Final = (25.3e6, 25.7e6)
-#: Reference times of orbit and clock of one record: equal in all of those 2,104.
+#: Reference times of orbit and clock of one record, equal in all of these 2,104.
 LARGEST_TIME_DIFFERENCE_S: Final = 300.0
 _EARTH_GM: Final = 3.986004418e14  #: [m^3/s^2].
 _NAMES: Final = {"G": "GPS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "R": "GLONASS"}
@@ -78,7 +78,7 @@ def unrelated_times(records: KeplerRecords) -> Masks:
 
 
 def plausible_kepler(records: KeplerRecords) -> Masks:
-    """Return the records whose semi-major axis and eccentricity are those of their constellation, shape (n,)."""
+    """Return the records whose semi-major axis and eccentricity are plausible for their constellation, shape (n,)."""
     axis, letter = records.sqrt_a**2, records.satellite.astype("<U1")
     fine = np.zeros(len(records), dtype=np.bool_)
     for name, limits in _AXES_M.items():
@@ -88,7 +88,9 @@ def plausible_kepler(records: KeplerRecords) -> Masks:
 
 
 def plausible_glonass(records: GlonassRecords) -> Masks:
-    """Return the records whose radius, and semi-major axis by the energy integral, are those of GLONASS, shape (n,)."""
+    """Return the records whose radius, and semi-major axis by the energy integral, are plausible for GLONASS, shape
+    (n,).
+    """
     position = records.position_ecef_m
     turning = EARTH_ROTATION_RATE * np.stack([-position[:, 1], position[:, 0], np.zeros(len(position))], axis=1)
     radius = np.linalg.norm(position, axis=1)

@@ -34,7 +34,7 @@ class Authority(Settings):
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
     stopped: bool  #: The train is ordered to stop.
-    #: The end is one that the train is asked to take in place of a further one, where it can stop before it.
+    #: The end is one that the train is asked to accept instead of a farther one, if it can stop before it.
     shortens: bool = False
     session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Start on board that `report` is of.
     overlap_cm: Number = 0  #: Way beyond the end that is kept for a train that passes it at release speed.
@@ -56,7 +56,7 @@ class Authority(Settings):
         Raises
         ------
         MessageError
-            The bytes are no such message of this version.
+            The bytes are not an authority of this version.
         """
         import cbor2
 
@@ -79,7 +79,7 @@ class Authority(Settings):
 class BrakeOrder(Authority):
     """Order to brake to a stop: needs no store, grants nothing, and is repeated until a report names its number.
 
-    `number` is that of the last authorities; any later authority without `stopped` ends the order.
+    `number` is that of the latest authority; any later authority without `stopped` ends the order.
     """
 
     kind: ClassVar[int] = 2

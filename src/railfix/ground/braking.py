@@ -1,8 +1,7 @@
 """Braking curves: how fast a train may run so that it stops before an end, on a line with gradients.
 
-After the shape of SUBSET-026 chapter 3.13, in its simplest form: one deceleration of the train with a safety factor,
-gradients as steps, no rotating mass, no adhesion, no service brake, no display of its own. Places are distances in
-running direction.
+A simplified form of SUBSET-026 chapter 3.13: one deceleration of the train with a safety factor, gradients as steps, no
+rotating mass, no adhesion, no service brake, no display. Positions are distances in running direction.
 """
 
 from __future__ import annotations
@@ -17,41 +16,43 @@ from pydantic import Field
 from railfix.core.settings import Settings
 
 GRAVITY_MPS2: Final = 9.80665
-#: Highest speed that is looked for [m/s], and the number of halvings of it.
+#: Highest speed that is searched for [m/s], and the number of halvings of it.
 _TOP_MPS, _HALVINGS = 150.0, 40
 
 
 class BrakeLimits(Settings):
     """Brakes of a train, and times before them."""
 
-    #: Deceleration on level track, and the share of it that is counted on.
+    #: Deceleration on level track, and the fraction of it that braking curves assume.
     braking_mps2: float = Field(default=0.5, gt=0)
     safety: float = Field(default=0.9, gt=0, le=1)
     least_mps2: float = Field(default=0.05, gt=0)  #: Deceleration that is counted on down any gradient.
     build_up_s: float = Field(default=2.0, ge=0)  #: Time from the intervention until the brakes act.
     cut_s: float = Field(default=0.5, ge=0)  #: Time until traction is cut off, at most the time of the build-up.
     traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until then.
-    warning_s: float = Field(default=1.0, ge=0)  #: The warning comes so long before the intervention.
-    reaction_s: float = Field(default=3.0, ge=0)  #: The permitted speed leaves the driver so long before it.
-    over_mps: float = Field(default=1.5, ge=0)  #: A restriction may be exceeded by so much before the intervention.
+    warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
+    reaction_s: float = Field(default=3.0, ge=0)  #: Time from the permitted speed to the intervention, for the driver.
+    over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restriction at which the intervention begins.
 
 
 class Target(NamedTuple):
-    """A speed that a train keeps from a place on."""
+    """Speed limit from a position on."""
 
     at_m: float
     speed_mps: float
 
 
 class Steps(NamedTuple):
-    """Gradients as steps: uphill in running direction positive, from a place on to the next; level before the first."""
+    """Gradients as steps: uphill in running direction positive, from one position to the next; level before
+    the first.
+    """
 
     from_m: Sequence[float] = ()
     gradient: Sequence[float] = ()
 
 
 def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the square of the speed at a place from which full brakes lead to the speed of a target there [m2/s2].
+    """Return the square of the speed at a position from which full brakes lead to the speed of a target there [m2/s2].
 
     ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)``; beyond the target negative.
     """
@@ -66,7 +67,7 @@ def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits
 
 
 def deceleration_mps2(at_m: float, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the deceleration that is counted on at a place [m/s^2]."""
+    """Return the assumed deceleration at a position [m/s^2]."""
     gradient = 0.0
     for place, value in zip(*steps, strict=True):
         if place > at_m:
@@ -76,7 +77,7 @@ def deceleration_mps2(at_m: float, steps: Steps, brakes: BrakeLimits) -> float:
 
 
 def stopping_m(at_m: float, speed_mps: float, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return where a train comes to rest that is braked now: after the build-up, under traction until it is cut [m]."""
+    """Return where a train stops if it brakes now: after the build-up, under traction until it is cut [m]."""
     place, speed = _after_build_up(at_m, speed_mps, brakes)
     square, ahead = speed**2, [step for step in steps.from_m if step > place]
     for step in ahead:
@@ -89,7 +90,7 @@ def stopping_m(at_m: float, speed_mps: float, steps: Steps, brakes: BrakeLimits)
 
 
 def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple[float, float]:
-    """Return place and speed at which the brakes act."""
+    """Return position and speed at which the brakes act."""
     cut = min(brakes.cut_s, brakes.build_up_s)
     faster = speed_mps + brakes.traction_mps2 * cut
     way = speed_mps * cut + 0.5 * brakes.traction_mps2 * cut**2 + faster * (brakes.build_up_s - cut)
@@ -97,10 +98,11 @@ def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple
 
 
 def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
-    """Return the speed above which the train is braked, or above which it would be so long afterwards [m/s].
+    """Return the speed above which the train is braked, now or after a given time [m/s].
 
-    The largest speed from which the train is on `braking_speed` when its brakes act. That place and the square of the
-    curve are linear in it between two changes of gradient: a quadratic equation of each, from the target backward.
+    The largest speed from which the train is on `braking_speed` when its brakes act. That position and the square of
+    the curve are linear in the speed between two changes of gradient: each gives a quadratic equation, solved from the
+    target backward.
     """
     if at_m >= target.at_m:
         return 0.0
@@ -136,7 +138,7 @@ def release_mps(overlap_m: float, at_m: float, steps: Steps, brakes: BrakeLimits
 
 
 class Supervised(NamedTuple):
-    """Speeds of a train at a place [m/s], and the target that gives them."""
+    """Speeds of a train at a position [m/s], and the target that determines them."""
 
     permitted_mps: float
     warning_mps: float

@@ -1,10 +1,10 @@
-"""Control centre: state and shown place of each train from its reports; a display, not a safety function.
+"""Control centre: state and displayed position of each train from its reports; a display, not a safety function.
 
 A pure state machine (P5 3.1): `report_received` and `time_passed` take the record of a train and return the new one.
-The shown place is for the eye alone; occupied is the interval from the last safe rear end to the end of the authority
-(`railfix.ground.interlocking`).
+The displayed position is indicative only; a train occupies the interval from its last safe rear end to the end of the
+authority (`railfix.ground.interlocking`).
 
-Reference run curve: place over running time of one direction, for simulated running by place.
+Reference run curve: position over running time of one direction, for simulated running.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ReferenceCurve:
     direction: int  #: Direction against chainage.
     running_s: Floats  #: Running time without the standing times at stations, strictly rising; shape (N,).
     chainage_m: Floats  #: Front of the train, strictly rising or, with direction -1, falling; shape (N,).
-    stations_m: Floats  #: Stopping places of the front, in the order of the run; shape (K,).
+    stations_m: Floats  #: Stopping positions of the front, in the order of the run; shape (K,).
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -68,7 +68,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the place a running time after a place, at most the next station: by place, not by timetable."""
+        """Return the position after a running time, at most at the next station: by position, not by timetable."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -77,7 +77,7 @@ class ReferenceCurve:
         return from_m + self.direction * min(max(self.direction * (place - from_m), 0.0), limit)
 
     def station_at(self, chainage_m: float) -> int | None:
-        """Return the number of the station at a place, None between stations."""
+        """Return the number of the station at a position, None between stations."""
         distance = np.abs(self.stations_m - chainage_m)
         nearest = int(distance.argmin())
         return nearest if distance[nearest] <= _AT_STATION_M else None
@@ -85,7 +85,8 @@ class ReferenceCurve:
     def progress(self, chainage_m: float) -> tuple[int, float]:
         """Return the section, by its first station, and the progress in it in running direction [%].
 
-        P5 3.1: a train reports the station at a station, else the section and the progress, its length being 100 %.
+        P5 3.1: a train reports the station at a station, otherwise the section and the progress, its length being 100
+        %.
         """
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
@@ -96,13 +97,13 @@ class ReferenceCurve:
 class TrainState(Enum):
     """State of a train as the centre knows it."""
 
-    #: No report with a place since the centre was started.
+    #: No report with a position since the centre was started.
     UNKNOWN = "unknown"
     #: Reports come in.
     TRACKED = "tracked"
     #: No report: shown by simulated running on the reference run curve.
     SIMULATED = "simulated"
-    #: No report for too long, or the simulated place has reached the end of the authority.
+    #: No report for too long, or the simulated position has reached the end of the authority.
     ERROR = "error"
 
 
@@ -113,9 +114,10 @@ class CentreLimits(Settings):
     lost_s: float = Field(default=3.0, gt=0)
     error_s: float = Field(default=120.0, gt=0)  #: After this time without a report the train is in error.
     age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it was sent; older reports are rejected.
-    #: The clock of a train may be behind the instants of its places by so much, and its delays vary by so much unseen.
+    #: Largest delay of a train's clock behind the instants of its positions, and largest unseen variation of its
+    #: delays.
     clock_s: float = Field(default=1.0, ge=0)
-    #: A sequence number may be further ahead of the newest by so many, and by so many a second since then.
+    #: Largest lead of a sequence number over the newest, constant and per second since then.
     jump: int = Field(default=1000, ge=1)
     rate: float = Field(default=20.0, gt=0)
 
@@ -128,20 +130,20 @@ class CentreLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainRecord:
-    """What the centre knows of a train."""
+    """The centre's record of a train."""
 
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 without one.
     session: int = 0  #: Start on board that it is of.
-    retired: tuple[int, ...] = ()  #: Starts on board before: what comes late of them counts for nothing.
-    counted_s: float | None = None  #: Centre's clock when that number came in.
+    retired: tuple[int, ...] = ()  #: Earlier starts on board: late messages of them are ignored.
+    counted_s: float | None = None  #: Centre's clock when that number arrived.
     rejected: str | None = None  #: Why the newest report did not count.
-    message: TrainMessage | None = None  #: Newest report with a place.
-    heard_s: float = 0.0  #: Centre's clock (monotonic) when that report came in.
-    measured_s: float = 0.0  #: Centre's clock at the instant its place is valid at.
-    shown_m: float | None = None  #: Place of the front that is shown.
-    #: Reported less simulated place at the last resynchronisation, positive in running direction.
+    message: TrainMessage | None = None  #: Newest report with a position.
+    heard_s: float = 0.0  #: Centre's clock (monotonic) when that report arrived.
+    measured_s: float = 0.0  #: Centre's clock at the instant for which its position is valid.
+    shown_m: float | None = None  #: Displayed position of the front.
+    #: Reported less simulated position at the last resynchronisation, positive in running direction.
     jump_m: float | None = None
 
 
@@ -156,10 +158,10 @@ class Rejection(Enum):
     NO_PLACE = "without a place"
     NO_FACING = "the direction in which the front end looks is unknown"
     NO_FRONT_END = "where the front end is is unknown"
-    TOO_OLD = "place too old when it was sent, or later than the train's clock; set that clock"
+    TOO_OLD = "position too old when it was sent, or later than the train's clock; set that clock"
 
 
-#: Starts on board that are remembered.
+#: Number of earlier starts on board that are stored.
 _RETIRED = 16
 
 

@@ -1,7 +1,7 @@
 """Changes of trains by order: an interval corrected, trains entered, removed, joined and divided.
 
-What the reports cannot say is taken from who has seen it; each change leaves its trains stopped, to be released one by
-one (`railfix.ground.stops.release_train`), and frees nothing that a train may still occupy.
+Changes that reports cannot show, entered by a person who has seen them; each change leaves its trains stopped, to be
+released one by one (`railfix.ground.stops.release_train`), and frees nothing that a train may still occupy.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from railfix.ground.layout import Layout, PointName, overlap
 from railfix.ground.state import Interlocking, PointState, TrainInterval, with_train
 from railfix.ground.stops import OCCUPIED, close_section, pieces_of
 
-#: Trains that are joined are at most so far apart by their intervals [m].
+#: Largest distance between the intervals of trains that are joined [m].
 APART_M: Final = 50.0
 
 Changed = tuple[Interlocking, str | None]
@@ -46,17 +46,28 @@ def _placed(
 
 
 def correct_interval(
-    state: Interlocking, train: int, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
+    state: Interlocking,
+    train: int,
+    layout: Layout,
+    *,
+    direction: int,
+    rear_m: float,
+    front_m: float,
+    track: int,
+    silent: bool = False,
 ) -> Changed:
     """Return the state with the interval of a stopped train set by hand, and the reason of a refusal.
 
-    Its routes and its authority end; points that it no longer stands on are free.
+    Its routes and its authority end, and points that it no longer stands on are free: so the train has to report that
+    it obeys the order to brake, unless it has been `silent` for longer than an authority lasts on board.
     """
     known = state.trains.get(train)
     if known is None:
-        return state, f"there is no train {train}"
+        return state, f"no such train: {train}"
     if known.stop is None:
         return state, f"train {train} is not stopped: stop it first"
+    if known.unbraked and not silent:
+        return state, f"train {train} has not reported that it obeys the order to brake, and may run on: wait for that"
     moved = _placed(known, layout, direction=direction, rear_m=rear_m, front_m=front_m, track=track)
     if isinstance(moved, str):
         return state, moved
@@ -100,7 +111,7 @@ def _refused_overlap(
 
 
 def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[PointName, PointState]:
-    """Return points that a train locks no more."""
+    """Return points that a train no longer locks."""
     return {
         name: replace(point, locked={n: since for n, since in point.locked.items() if n != train})
         if train in point.locked
@@ -112,25 +123,25 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
 def remove_train(state: Interlocking, train: int, layout: Layout) -> Changed:
     """Return the state without a train, whose sections are occupied by vehicles that report nothing.
 
-    They are freed by their detection, or by an order of who has seen them free.
+    Their detection frees them, or an order of a person who has seen them free.
     """
     known = state.trains.get(train)
     if known is None:
-        return state, f"there is no train {train}"
+        return state, f"no such train: {train}"
     if known.stop is None or not known.standstill:
         return state, f"train {train} is not stopped, or does not stand still"
     pieces = pieces_of(known, layout)
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # a station as a whole only where its points are occupied: its tracks are sections of their own
+        # a station as a whole only where its points are occupied: its tracks are separate sections
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None
 
 
 def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> Changed:
-    """Return the state in which one train is part of the one in front of it: both lengths, one interval."""
+    """Return the state in which one train becomes part of the one in front of it: both lengths, one interval."""
     first, second = state.trains.get(lead), state.trains.get(other)
     if first is None or second is None or lead == other:
         return state, "two trains of the line were expected"
@@ -161,11 +172,11 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
 def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:
     """Return the state in which the rear of a train, behind a length of it, is another train.
 
-    Their intervals share what the bounds of the place leave open, until they are apart.
+    Until the parts are apart, their intervals overlap where the bounds of the position leave it open.
     """
     known = state.trains.get(train)
     if known is None:
-        return state, f"there is no train {train}"
+        return state, f"no such train: {train}"
     if other in state.trains or not 0 < other < 1 << 32:
         return state, f"{other} is no number for the other part"
     if known.stop is None or not known.standstill:
@@ -173,7 +184,7 @@ def divide_train(state: Interlocking, train: int, other: int, *, length_m: float
     if not 0.0 < length_m < known.length_m:
         return state, f"a length between 0 and {known.length_m:g} m was expected"
     if known.reported_m is None or known.outside_m() > 0.0:
-        return state, f"train {train} has not reported where it stands"
+        return state, f"train {train} has not reported its position"
     d = known.direction
     back, front = sorted(d * end for end in known.reported_m)
     cut = d * (front - length_m)  # the front part's rear end is at most here

@@ -1,7 +1,7 @@
 """Control centre at work: supervision with its store, the monitor of satellite positioning, log, and page values.
 
-What is acknowledged or granted is committed before it is sent: a centre that is killed at any moment goes on from
-what its trains know.
+Acknowledged and granted changes are committed before they are sent: a centre that is killed at any moment continues
+from what its trains know.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _CAUSE = "cause of the stop"
 
 
 def _severity(verdict: TriangleVerdict) -> int:
-    """Return the rank of a verdict: of those between two steps the one with the highest counts."""
+    """Return the rank of a verdict: of the verdicts between two steps the highest counts."""
     if verdict in (TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING):
         return 2  # a fix is absent: that stops only once it is late
     return 3 if verdict in STOPPING else int(verdict is not TriangleVerdict.HEALTHY)
@@ -49,7 +49,7 @@ class StopOrder:
     rest_s: float | None = None
 
     def take_report(self, message: TrainMessage, now_s: float) -> bool:
-        """Take a report; return whether the train has come to rest by it."""
+        """Process a report; return whether the train has come to rest by it."""
         taken = is_obeyed(message, self.number)
         if taken and self.acknowledged_s is None:
             self.acknowledged_s = now_s - self.sent_s
@@ -74,17 +74,18 @@ class ControlCentre:
     send: Callable[[int, bytes], None]  #: Sends bytes to a train.
     clock: Callable[[], float]  #: Centre's clock, which never runs backwards [s].
     wall_ns: Callable[[], int]  #: Time for the log [ns].
-    monitor: MonitorState | None = None  #: Of satellite positioning; None where nothing judges it.
+    monitor: MonitorState | None = None  #: Of satellite positioning; None without a triangle.
     times: MonitorLimits = field(default_factory=MonitorLimits)
     lines: list[str] = field(default_factory=list)
     reports: int = 0
     rejected: Counter[str] = field(default_factory=Counter)  #: Reports that did not count, by reason.
     stop_s: float | None = None
     stops: dict[int, StopOrder] = field(default_factory=dict)  #: Trains that are ordered to stop.
-    commits: Commits = field(default_factory=Commits)  #: Of the store; in a thread where the centre is a process.
-    #: Asks the field what points are detected at; `Supervision.set_detected` takes the answer.
+    #: Access to the store; in a thread where the centre is a process.
+    commits: Commits = field(default_factory=Commits)
+    #: Requests the detection of points from the field; `Supervision.set_detected` takes the answer.
     ask: Callable[[PointName], None] = lambda _: None
-    #: What the newest report of each train suspects.
+    #: Suspicions in the newest report of each train.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)
 
     _routes: dict[int, int] = field(init=False)
@@ -99,10 +100,10 @@ class ControlCentre:
 
     @classmethod
     def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
-        """Return the centre with what a process before has stored; at the first start as `supervision` has it.
+        """Return the centre with the state stored by an earlier process; at the first start as in `supervision`.
 
-        Trains are unknown until they are heard; the field is asked what its points are detected at. Where a triangle
-        judges satellite positioning, the first start is a stop, to be released by hand; a stop of before lasts.
+        Trains are unknown until they report; the detection of all points is requested from the field. Where a triangle
+        monitors satellite positioning, the first start is a stop, to be released by hand; an earlier stop remains.
         """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         asked: tuple[PointName, ...] = ()
@@ -137,7 +138,7 @@ class ControlCentre:
         self.store.note(self.wall_ns(), text, train=train)
 
     def report(self, number: int, payload: bytes) -> None:
-        """Take a report that came over the links of a train."""
+        """Process a report received over the links of a train."""
         try:
             message = decode(payload)
         except MessageError:
@@ -165,12 +166,12 @@ class ControlCentre:
         self._note_report(trains[number], self.supervision.state.trains[number], message)
         self.reports += 1
         if before.state in (TrainState.SIMULATED, TrainState.ERROR):
-            self.log(f"train {number}: heard again, place jumps by {after.jump_m or 0.0:.1f} m", train=number)
+            self.log(f"train {number}: reports again, position jumps by {after.jump_m or 0.0:.1f} m", train=number)
         elif before.state is TrainState.UNKNOWN:
             self.log(f"train {number}: heard", train=number)
 
     def _note_report(self, was: TrainInterval, known: TrainInterval, message: TrainMessage) -> None:
-        """Count and log what a report contradicts, and what it answers."""
+        """Count and log contradictions of a report, and its answers."""
         number = known.train
         if known.contradiction is not None:
             self.rejected["contradicts what is known of the train"] += 1
@@ -186,7 +187,7 @@ class ControlCentre:
             self.log(f"train {number}: {what}", train=number)
 
     def _hear_interference(self, message: TrainMessage) -> None:
-        """Note what a train suspects, also in a report without a place, and log where that changes."""
+        """Store a train's suspicion, also of a report without a position, and log where it changes."""
         before = self.interference.get(message.train, SuspectedInterference.NONE)
         now = message.interference or SuspectedInterference.NONE
         if now is not before:
@@ -196,9 +197,13 @@ class ControlCentre:
 
     @property
     def alarms(self) -> list[str]:
-        """What the centre waits for after a start, and interference that trains suspect, a sentence each."""
+        """What the centre waits for after a start, and interference that trains suspect, one sentence each."""
         awaited = self.supervision.awaited_text
-        waits = [f"nothing is granted until heard since the start: {awaited} (confirm-start)"] if awaited else []
+        waits = (
+            [f"nothing is granted until these trains have reported since the start: {awaited} (confirm-start)"]
+            if awaited
+            else []
+        )
         return waits + [
             f"train {n} suspects {kind.name.lower()}" for n, kind in sorted(self.interference.items()) if kind
         ]
@@ -206,7 +211,7 @@ class ControlCentre:
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
         """Take a verdict on satellite positioning, of fixes of an age; of those between two steps the worst counts.
 
-        Fixes older than `MonitorLimits.late_s`, or from the future by as much, are no verdict.
+        Fixes older than `MonitorLimits.late_s`, or from the future by as much, give no verdict.
         """
         if abs(age_s) > self.times.late_s:
             self.rejected["fixes of the triangle with a wrong age"] += 1
@@ -245,7 +250,7 @@ class ControlCentre:
         self.settle()
 
     def settle(self) -> None:
-        """Send what waits for a commit that is done, and log where the database begins or ends to fail."""
+        """Send messages whose commit is complete, and log where the database begins or ceases to fail."""
         self.commits.settle(self.clock())
         alarm = self.commits.alarm
         if alarm is not None and self._alarm is None:
@@ -262,7 +267,7 @@ class ControlCentre:
         self.send(order.train, order.encode())
 
     def _send(self, authority: Authority) -> None:
-        """Send an authority, unless its train has been ordered to brake meanwhile, or is no longer supervised."""
+        """Send an authority, unless its train has meanwhile been ordered to brake, or is not supervised any more."""
         if authority.train not in self.supervision.state.trains:
             return
         if authority.train not in self.supervision.ordered:
@@ -306,15 +311,15 @@ class ControlCentre:
         """Stop a train, or every train with None, by hand; return the reason of a refusal."""
         state = self.supervision.state
         if train is not None and train not in state.trains:
-            return f"there is no train {train}"
+            return f"no such train: {train}"
         self.supervision.state = stop_trains(state, state.trains if train is None else (train,), "stopped by hand")
         self.log("every train stopped by hand" if train is None else f"train {train}: stopped by hand", train=train)
         return None
 
     def confirm_start(self) -> str | None:
-        """Go on without the trains that have not been heard since the start; return the reason of a refusal."""
+        """Continue without the trains that have not reported since the start; return the reason if refused."""
         if not self.supervision.awaited:
-            return "every train has been heard since the start"
+            return "every train has reported since the start"
         self.supervision.awaited.clear()
         return None
 
@@ -323,7 +328,7 @@ class ControlCentre:
         return release_train(self.supervision.state, train, self.supervision.layout)
 
     def changed(self, state: Interlocking) -> None:
-        """Take a state in which an order has changed trains; of those that are gone nothing is kept."""
+        """Set a state in which an order has changed trains; data of removed trains are dropped."""
         self.supervision.forget([number for number in self.supervision.state.trains if number not in state.trains])
         self.supervision.state = state
 
@@ -332,7 +337,7 @@ class ControlCentre:
         return self.supervision.set_route(train)
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train by hand to give its route to the next station back; return the reason of a refusal."""
+        """Request a train by hand to return its route to the next station; return the reason of a refusal."""
         return self.supervision.ask_route_back(train)
 
     def _monitor(self, now: float) -> None:
@@ -386,7 +391,7 @@ class ControlCentre:
         }  # fmt: skip
 
     def _place(self, direction: int, shown_m: float | None) -> str:
-        """Return the station, or the section and the progress in it, as P5 3.1 reports it; "" without a place."""
+        """Return the station, or the section and the progress in it, in the terms of P5 3.1; "" without a position."""
         if shown_m is None or (curve := self.curves.get(direction)) is None:
             return ""
         names = [station.name for station in self.supervision.layout.stations][::direction]

@@ -133,7 +133,7 @@ def points_ecef_m() -> Floats:
 def draw_fixes(
     rng: np.random.Generator, *, epochs: int = 60, common_m: Floats | None = None, moved_m: Floats | None = None
 ) -> StationFixes:
-    """Return fixes, one a second, from simulated ranges of satellites that stand still.
+    """Return fixes, one per second, from simulated ranges of fixed satellites.
 
     `common_m`, shape (T, 9): errors of the satellites, common to the receivers. `moved_m`, shape (T, 3, 2): east and
     north by which the fix of a receiver moves; NaN: it has none, and its C/N0 has fallen.
@@ -175,12 +175,12 @@ _TIME_NS: Final = 1_400_000_000_000_000_000
 
 @dataclass(kw_only=True)
 class LinkedTraffic(Traffic):
-    """Traffic whose messages go over the links, and whose centre is the one at work."""
+    """Traffic whose messages use the links, with the real centre."""
 
     links: dict[int, TrainLinks]
     control: ControlCentre
-    verdicts: list[tuple[TriangleVerdict, int]]  #: Of the triangle, one a second.
-    rest_s: float | None = None  #: When all trains stood still after a stop.
+    verdicts: list[tuple[TriangleVerdict, int]]  #: Fixes of the triangle, one per second.
+    rest_s: float | None = None  #: Time when all trains had stopped.
 
     def step(self) -> None:
         """Run a step and note when the trains rest."""
@@ -195,7 +195,7 @@ class LinkedTraffic(Traffic):
         self.links[message.train].send(encode(message), chainage_m=train.front_m, direction=train.direction)
 
     def exchange(self) -> None:
-        """Let the centre judge satellite positioning and work."""
+        """Run the centre's monitoring and supervision."""
         if self.now_s == FAULT_S:
             self.control.log("simulated fault: the clock of a satellite drifts away")
         self.control.judge(*self.verdicts[min(int(self.now_s), len(self.verdicts) - 1)])
@@ -254,7 +254,7 @@ async def run_demo(
 
     `speed` is in simulated seconds a second; the page, on the loopback address, is at the port (0 takes a free one),
     and its password releases a stop. `announce` is called with its address, `keep` awaited with it at the end, before
-    the page closes; `picture` is that of the response rates along the line.
+    the page closes; `picture` is the path of the picture of response rates along the line.
     """
     async with contextlib.AsyncExitStack() as held:
         folder, done = Path(held.enter_context(tempfile.TemporaryDirectory())), False
@@ -339,7 +339,7 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
             relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
-        # What a busy machine loses is not caught up: the links would have less time than they simulate.
+        # Time lost on a busy machine is not caught up: the links would have less time than they simulate.
         start = max(start, loop.time() - traffic.now_s / speed)
         await asyncio.sleep(start + traffic.now_s / speed - loop.time())
 

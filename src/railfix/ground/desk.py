@@ -1,7 +1,7 @@
-"""Orders of the page: who gave them, what they change, and which are given twice before they count.
+"""Orders of the page: who gave them, their effect, and which must be given twice.
 
-Each order is a line of the log with its identity and its outcome. What rests on what somebody has seen, and no report
-confirms, is ordered twice: by two people, or by one after a time to think.
+Each order is a line of the log with its author and its outcome. Orders that rest on an observation which no report
+confirms are given twice: by two people, or by one after a minimum time.
 """
 
 from __future__ import annotations
@@ -20,21 +20,23 @@ from railfix.ground.stops import CLOSED, OCCUPIED, close_section, open_section
 from railfix.ground.supervision import Supervision
 from railfix.ground.web import Order
 
-#: An order that is given twice comes again so long after the first, at least and at most [s]; of another at once.
+#: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
+#: A train that was silent for this time runs by no authority any more (`OnBoardLimits.fresh_s`) and stands [s].
+SILENT_S: Final = 60.0
 #: Longest reason that is taken [characters].
 LONGEST_REASON: Final = 200
 Values = dict[str, Any]
 
 
 def number_of(values: Values, name: str) -> int | str:
-    """Return an integer of an order, or what is wrong with it."""
+    """Return an integer of an order, or the fault of it."""
     value = values.get(name)
     return value if type(value) is int else f"{name}: a number was expected"
 
 
 def metres_of(values: Values, *names: str) -> list[float] | str:
-    """Return numbers of an order, or what is wrong with the first that is none."""
+    """Return numbers of an order, or the fault of the first that is not a number."""
     found = [values.get(name) for name in names]
     for name, value in zip(names, found, strict=True):
         if type(value) not in (int, float) or not abs(value) < 1e7:  # type: ignore[arg-type]
@@ -43,7 +45,7 @@ def metres_of(values: Values, *names: str) -> list[float] | str:
 
 
 class OrderedCentre(Protocol):
-    """What orders need of the centre (`railfix.ground.control.ControlCentre`)."""
+    """Methods of the centre that orders need (`railfix.ground.control.ControlCentre`)."""
 
     supervision: Supervision
 
@@ -58,7 +60,7 @@ class OrderedCentre(Protocol):
         """Return the state with the stop of a train released, and the reason of a refusal."""
 
     def confirm_start(self) -> str | None:
-        """Go on without the trains that have not been heard since the start."""
+        """Continue without the trains that have not reported since the start."""
 
     def changed(self, state: Interlocking) -> None:
         """Take a state in which an order has changed trains."""
@@ -73,7 +75,7 @@ class OrderedCentre(Protocol):
         """Set a train's route to the next station."""
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train to give its route to the next station back."""
+        """Request a train to return its route to the next station."""
 
 
 @dataclass(kw_only=True)
@@ -81,7 +83,7 @@ class OrderDesk:
     """Orders of one centre."""
 
     centre: OrderedCentre
-    #: Orders that have been given once, by name and values: when and by whom.
+    #: Orders that have been given once, by name and values: time and author.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def given(self, name: str, order: Callable[[Values, str], str | None], values: Values, by: str = "") -> str | None:
@@ -95,7 +97,7 @@ class OrderDesk:
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
-        """Return None where an order comes the second time, in time; else what to do."""
+        """Return None where an order is the second one, in time; otherwise the next step."""
         key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.centre.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:
@@ -114,7 +116,9 @@ class OrderDesk:
         return self._asked.get(key, (self.centre.clock(), ""))[0]
 
     def release_train(self, values: Values, by: str) -> str | None:
-        """Release the stop of a train; nothing says of a silent one that it still is where it was: ordered twice."""
+        """Release the stop of a train; as nothing confirms the position of a silent train, its release is ordered
+        twice.
+        """
         train = number_of(values, "train")
         if isinstance(train, str):
             return train
@@ -144,7 +148,7 @@ class OrderDesk:
         return refused
 
     def _moved_meanwhile(self, before: Interlocking, after: Interlocking, since_s: float) -> str | None:
-        """Return the train whose place, as it reports since the first order, its new interval does not cover."""
+        """Return the train whose position, reported since the first order, is outside its new interval."""
         for number, train in after.trains.items():
             known, record = before.trains.get(number), self.centre.supervision.records.get(number)
             if known is None or known is train or known.reported_m is None or record is None:
@@ -155,6 +159,13 @@ class OrderDesk:
             ):
                 return "train {} reports {:.0f} to {:.0f} m, outside of that interval".format(number, *known.reported_m)
         return None
+
+    def is_silent(self, train: int) -> bool:
+        """Return whether a train has not been heard for so long that it stands, whatever it was granted."""
+        supervision = self.centre.supervision
+        record = supervision.records.get(train)
+        heard_s = supervision.begun_s if record is None else max(record.heard_s, supervision.begun_s)
+        return self.centre.clock() - heard_s > SILENT_S
 
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
         """Return the state after a change of trains, and the reason of a refusal."""
@@ -170,7 +181,7 @@ class OrderDesk:
                     return state, value
             place: Any = {"rear_m": ends[0], "front_m": ends[1], "track": track, "direction": direction}
             if of == "correct":
-                return correct_interval(state, train, layout, **place)
+                return correct_interval(state, train, layout, **place, silent=self.is_silent(train))
             length = metres_of(values, "length_m")
             if isinstance(length, str):
                 return state, length
@@ -188,18 +199,18 @@ class OrderDesk:
         return divide_train(state, train, other, length_m=length[0])
 
     def confirm_start(self, values: Values, by: str) -> str | None:
-        """Go on after a start without the trains that are not heard: the database is the newest."""
+        """Continue after a start without silent trains: the database is the newest."""
         if not self.centre.supervision.awaited:
             return self.centre.confirm_start()
-        what = f"the database is no older copy, and not heard are {self.centre.supervision.awaited_text}"
+        what = f"the database is no older copy, and these trains are silent: {self.centre.supervision.awaited_text}"
         return self.confirmed("confirm-start", values, by, what) or self.centre.confirm_start()
 
     def section(self, values: Values, by: str, *, of: str) -> str | None:
-        """Bar a section, or end that: of one that was occupied at the second order."""
+        """Bar a section, or end that; for a section that was occupied at the second order."""
         supervision, name = self.centre.supervision, str(values.get("section", ""))
         layout, state = supervision.layout, supervision.state
         if name not in layout.sections:
-            return f"there is no section {name!r}"
+            return f"no such section: {name!r}"
         kind = CLOSED if of in ("close", "open") else OCCUPIED
         if of in ("close", "occupy"):
             supervision.state = close_section(state, name, layout, f"{name} is {kind}", kind=kind)
@@ -212,10 +223,10 @@ class OrderDesk:
         return None
 
     def detect(self, values: Values, _by: str) -> str | None:
-        """Take what the detection of a section says: occupied, free, or null where it is not known any more."""
+        """Process the detection of a section: occupied, free, or null where it is unknown."""
         name, occupied = str(values.get("section", "")), values.get("occupied")
         if name not in self.centre.supervision.layout.sections:
-            return f"there is no section {name!r}"
+            return f"no such section: {name!r}"
         if occupied is not None and not isinstance(occupied, bool):
             return "occupied: true, false or null was expected"
         self.centre.supervision.set_section_detected(name, occupied)
@@ -249,7 +260,7 @@ class OrderDesk:
         return None
 
     def orders(self) -> dict[str, Order]:
-        """Return the orders by name; each takes its values and who gives it."""
+        """Return the orders by name; each is called with its values and its author."""
         centre = self.centre
 
         def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:

@@ -1,4 +1,4 @@
-"""Simulated points: there is no interface to real ones."""
+"""Simulated points: railfix has no interface to real ones."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class SimulatedPoints:
         self._answers[point] = None
 
     def ask(self, point: PointName) -> None:
-        """Answer what points are detected at."""
+        """Return the detected positions of points."""
         self._answers[point] = None if point in self._moving else self.lie.get(point, 1)
 
     def take_detected(self) -> Mapping[PointName, int | None]:
-        """Return what points have come to be detected at since the last call."""
+        """Return points whose detection has changed since the last call."""
         answers, self._answers = self._answers, {}
         for point, (until, track) in list(self._moving.items()):
             if until <= self.clock():

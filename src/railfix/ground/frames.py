@@ -23,7 +23,7 @@ _ECHO: Final = struct.Struct("!Qqqq")
 _CHECK: Final = struct.Struct("!I")
 #: Longest payload [bytes]: with the head it fits a datagram of QUIC.
 LONGEST_PAYLOAD: Final = 1100
-#: Sequence numbers behind the newest that are remembered one by one, and starts of the sender before the present one.
+#: Number of recent sequence numbers that are stored individually, and of earlier starts of the sender.
 REMEMBERED: Final = 4096
 RETIRED: Final = 64
 
@@ -89,7 +89,7 @@ class Echo(NamedTuple):
 
     @classmethod
     def decode(cls, payload: bytes) -> Echo | None:
-        """Return the echo, None where the payload is none."""
+        """Return the echo, None where the payload is not an echo."""
         return cls(*_ECHO.unpack(payload)) if len(payload) == _ECHO.size else None
 
     def round_trip_s(self, now_ns: int) -> float:
@@ -100,7 +100,7 @@ class Echo(NamedTuple):
 class ReceiverLimits(Settings):
     """Limits of a receiver."""
 
-    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest one seen.
+    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed one.
     #: Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
     drift: float = Field(default=1e-4, ge=0)
     #: A sequence number may be further ahead of the newest by so many, and by so many a second since then.
@@ -151,7 +151,7 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return a frame to be answered and the same to be used; each None where it is not.
+        """Return a frame to be answered and the frame to be used; each None where it does not apply.
 
         A second copy is answered, so that both links are measured, but not used.
         """
@@ -181,7 +181,9 @@ class FrameReceiver:
         return frame, frame
 
     def _begin(self, session: int) -> None:
-        """Begin with a start of the sender: its numbers and its clock have another origin; what is late is refused."""
+        """Begin with a new start of the sender, whose numbers and clock have another origin; late frames
+        are rejected.
+        """
         if self._session is not None:
             self._retired.append(self._session)
         self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None

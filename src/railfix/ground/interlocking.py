@@ -3,9 +3,8 @@
 A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
 Authorities are extended up to the nearest of: another train's interval, a section that is closed or occupied, points
 that are not locked and detected for the train, the end of its route; less a margin. They are shortened by agreement
-alone (`railfix.ground.stops`); reports move the intervals (`railfix.ground.reports`).
-It is not a national rule book: no shunting, no overlaps behind signals, no level crossings, no degraded working by
-hand.
+only (`railfix.ground.stops`); reports move the intervals (`railfix.ground.reports`). It is not a national rule book: no
+shunting, no overlaps behind signals, no level crossings, no degraded working by hand.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ from railfix.ground.state import with_train as with_train
 
 
 class NearbyTrains:
-    """Trains by where their intervals and routes are, or come to be by one more route.
+    """Trains by the location of their intervals and routes, with one more route included.
 
-    Made once for a step, so that the cost of a step is that of its trains and not of their pairs.
+    Computed once per step, so that the cost of a step grows with the number of trains and not of pairs.
     """
 
     def __init__(self, state: Interlocking, layout: Layout) -> None:
@@ -42,7 +41,7 @@ class NearbyTrains:
                 self._blocks[block].append(number)
 
     def between(self, state: Interlocking, low_m: float, high_m: float) -> Iterator[TrainInterval]:
-        """Return the trains, as they are now, that may share some chainage with an interval."""
+        """Return the trains that may share some chainage with an interval."""
         numbers = {n: None for block in self._layout.blocks_between(low_m, high_m) for n in self._blocks.get(block, ())}
         return (state.trains[number] for number in numbers)
 
@@ -56,7 +55,8 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
     by_high = sorted((high, low) for low, high, _ in by_low)
     free = [span for span in by_low if span[2] not in found]
     for number in list(found):
-        # those beside it, the nearest on either side, and those beside the nearest: on other tracks of its station
+        # the trains beside it, the nearest on either side, and the trains beside the nearest: on other tracks of its
+        # station
         low, high = state.trains[number].span_m
         if (k := bisect_left(by_low, (high,))) < len(by_low):
             high = by_low[bisect_right(by_low, (by_low[k][0], math.inf)) - 1][1]
@@ -71,8 +71,8 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
 def points_reported(state: Interlocking, point: PointName, detected: int | None, layout: Layout) -> Interlocking:
     """Return the state after a detection of points.
 
-    Where they lose it under a route, or the field answers after a start that they lie otherwise under an interval, the
-    trains that have them are stopped. After a start, points that no train locks are wanted as they lie.
+    Where detection is lost under a route, or differs from the interval after a start, the trains concerned are stopped.
+    After a start, points that no train locks keep their detected position.
     """
     before = state.points[point]
     after = replace(before, detected=detected)
@@ -100,7 +100,7 @@ def route_requested(
 ) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
     """Return the state with a route to the next station, the points to be moved, and the reason of a refusal.
 
-    With `NearbyTrains` and `stop_orders` of the step where they are at hand.
+    With `NearbyTrains` and `stop_orders` of the step where available.
     """
     here = state.trains[train]
     begin, direction = here.station, here.direction
@@ -138,7 +138,7 @@ def _refusal(state: Interlocking, here: TrainInterval, layout: Layout, stopped: 
         return f"the train is stopped: {stopped[here.train]}"
     if not 0 <= target < len(layout.stations):
         return "there is no station ahead"
-    if reached(here, target, layout):  # it has a track there, on which it may stand
+    if reached(here, target, layout):  # it has a track there, on which it may stop
         return f"the train is in {layout.stations[target].name}"
     for name in ((here.station, here.direction), (target, -here.direction)):
         if not state.points[name].commanded and state.points[name].detected is None:
@@ -152,7 +152,7 @@ def reached(train: TrainInterval, station: int, layout: Layout) -> bool:
 
 
 def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: NearbyTrains) -> str | None:
-    """Return what the way to the next station, or its track there, is taken by."""
+    """Return the obstacle on the way to the next station, or on its track there."""
     direction, target = here.direction, here.station + here.direction
     track, section, ahead = 1 if direction > 0 else 2, min(here.station, target), layout.stations[target]
     end = layout.track_end_m(target, direction)
@@ -171,7 +171,7 @@ def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: Nea
 
 
 def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str, str] | None:
-    """Return a section with its bar that shares track with a path, None where the path is free of them."""
+    """Return a barred section that shares track with a path, None where the path is free of them."""
     for name, kind in sorted(state.bars):
         if any(shares(piece, mine) for piece in layout.sections[name] for mine in path):
             return name, kind
@@ -179,9 +179,9 @@ def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str,
 
 
 def comes_the_other_way(other: TrainInterval, direction: int, section: int, layout: Layout) -> bool:
-    """Return whether a train of the other direction has its route or interval between a station and the next.
+    """Return whether an opposing train has its route or interval between a station and the next.
 
-    Their points are left out.
+    Their points are omitted.
     """
     if other.direction == direction:
         return False
@@ -211,7 +211,7 @@ def due_commands(
 ) -> tuple[Interlocking, dict[PointName, int]]:
     """Return the state in which every command to points is given that is due, and these: tracks by points.
 
-    Due is what is stored. Points whose detection is awaited, or that lie under an interval, have no command.
+    Only stored commands are due. Points whose detection is awaited, or that are under an interval, get no command.
     """
     due = {
         name: point
@@ -287,7 +287,7 @@ def _limit_m(
         near, far = along(layout.zone_m(name), direction)
         if far <= direction * train.rear_m or near >= end:
             continue
-        # points that the train stands on, locked by its passage, do not limit it
+        # points under the train, locked by its passage, do not limit it
         if not leads(state.points[name], train, name[0]):
             end = min(end, near)
     path = layout.pieces(train.rear_m, direction * end, train.tracks)

@@ -1,7 +1,7 @@
 """Keys and certificates of the links: made, renewed with overlap, revoked, and looked at before they end.
 
-One authority signs the certificates of the centre and of the trains. Its key stays with who makes keys: in the folder
-where they are made, and in none that is handed over.
+One authority signs the certificates of the centre and of the trains. Its key stays in the folder where keys are made,
+and is not handed out.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
 def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
     """Write the authority's key and certificate, and those of ``centre`` and of each ``train-N``; return the files.
 
-    In a folder with an authority only what is not there yet is written: trains are added so. ``authority.key`` stays
+    In a folder with an authority only missing files are written, which adds trains. ``authority.key`` stays
     there; it is in no folder that is handed to a train or a centre. Keys can be read by their owner alone.
     OutputError: when there is nothing to write, or a file cannot be written. InputFileError: when a file of the
     authority cannot be read.
@@ -107,7 +107,7 @@ def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
 
 
 def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
-    """Write new keys and certificates in place of those of the centre and of trains; return the files.
+    """Replace keys and certificates of the centre and of trains by new ones; return the files.
 
     Those before stay valid until their end, so that each end takes its new files over by itself, at its next start or
     connection. An authority that would end before them is renewed as well: ``authority.pem`` has the old and the new

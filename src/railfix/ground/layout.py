@@ -92,7 +92,7 @@ class Layout(Settings):
         return ((k, side) for k in between for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
 
     def blocks_between(self, low_m: float, high_m: float) -> range:
-        """Return the numbers of the blocks that an interval touches: 2 k + 1 is station k, 2 k what lies before it."""
+        """Return the numbers of the blocks that an interval touches: 2 k + 1 is station k, 2 k the line before it."""
         return range(bisect_left(self._borders_m, low_m), bisect_right(self._borders_m, high_m) + 1)
 
     @cached_property
@@ -115,9 +115,9 @@ class Layout(Settings):
         return pieces[0][1], pieces[-1][2]
 
     def gradients_between(self, low_m: float, high_m: float, direction: int) -> tuple[tuple[int, int], ...]:
-        """Return chainages [cm] and gradients [1/1000] between two places, rounded downhill for a running direction.
+        """Return chainages [cm] and gradients [1/1000] between two positions, rounded downhill for a running direction.
 
-        Where there are more than `MOST_PARTS`, the steepest descent of the others stands for them.
+        Beyond `MOST_PARTS` parts, the rest is represented by its steepest descent.
         """
         ends = [gradient.from_m for gradient in self.gradients[1:]] + [math.inf] * bool(self.gradients)
         parts = [
@@ -171,7 +171,7 @@ class Layout(Settings):
         return front_m > here.begin_m if direction > 0 else front_m < here.end_m
 
     def station_at(self, low_m: float, high_m: float) -> int | None:
-        """Return the station whose tracks hold a whole interval, None where there is none."""
+        """Return the station whose tracks contain a whole interval, None without one."""
         for k in self.stations_between(low_m, high_m):
             station = self.stations[k]
             if station.inner_m[0] <= low_m and high_m <= station.inner_m[1]:
@@ -206,8 +206,8 @@ _STEP_M: Final = 2.0
 def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left") -> Layout:
     """Return the layout of a network that is one single line with passing loops.
 
-    Its chainage begins at one end and runs along the single line and track 1 of each station. A station is a pair of
-    tracks between the same two switches; single line lies between stations and beyond the outer ones. Points reach
+    Its chainage begins at one end and follows the single line and track 1 of each station. A station is a pair of
+    tracks between the same two switches; the line is single between stations and beyond the outer ones. Points reach
     from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a station on the side on
     which they drive: their track is track 1. MismatchError: when the network is something else: several lines,
     branches, stations of three tracks, loops of unequal length.
@@ -233,7 +233,7 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
         far = fars.pop()
         lines = [_points_m(network, track, backward=ends[track][0] != node) for track in ahead]
         if len(ahead) == 2:
-            # positive: the second lies on the right of the first
+            # positive: the second track is to the right of the first
             if (_side(*lines) > 0.0) != (drive == "left"):
                 ahead, names, lines = ahead[::-1], names[::-1], lines[::-1]
             stations.append(_station(names, [float(network.length_m[track]) for track in ahead], lines, here))

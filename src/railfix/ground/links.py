@@ -45,9 +45,9 @@ class LinkLimits(Settings):
     good: int = Field(default=10, ge=1)  #: Answers in a row before the normal link is taken again.
     good_s: float = Field(default=30.0, ge=0)  #: Time since the fall-back before the normal link is taken again.
     window: int = Field(default=60, ge=1)  #: Frames of the response rate.
-    place_m: float = Field(default=100.0, gt=0)  #: Length of a place of the coverage map.
-    #: A connection without any packet for this time, at most 10 s, is made again: so the trains of a centre that was
-    #: killed come back.
+    place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.
+    #: A connection without any packet for this time, at most 10 s, is opened again, so that trains reconnect after a
+    #: centre was killed.
     idle_s: float = Field(default=5.0, gt=0, le=10)
 
 
@@ -59,7 +59,7 @@ class LinkMeter:
     #: Misses, and answers, in a row.
     misses: int = 0
     good: int = 0
-    #: Answered and sent frames by place and running direction.
+    #: Answered and sent frames by position and running direction.
     coverage: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     #: The last `KEPT` frames, by the time of their result.
     results: deque[LinkResult] = field(default_factory=lambda: deque(maxlen=KEPT))
@@ -67,11 +67,11 @@ class LinkMeter:
     _open: dict[int, tuple[float, float | None, int]] = field(default_factory=dict)
 
     def note_sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
-        """Note a frame that was sent; from a place that is not known it is not in the coverage."""
+        """Count a sent frame; without a known position it is not in the coverage."""
         self._open[sequence] = (now_s, chainage_m, direction)
 
     def note_answer(self, sequence: int, now_s: float, round_trip_s: float) -> None:
-        """Note the echo of a frame; one that is too late, or comes twice, is none."""
+        """Count the echo of a frame; a late or repeated echo is ignored."""
         self.settle(now_s)
         if (waiting := self._open.pop(sequence, None)) is None:
             return
@@ -102,7 +102,7 @@ class LinkMeter:
 
     @property
     def response_rate(self) -> float:
-        """Share of the frames of the window that were answered in time; NaN without frames."""
+        """Fraction of the frames of the window that were answered in time; NaN without frames."""
         window = self._window_s
         return float(np.isfinite(window).mean()) if window else float("nan")
 
@@ -114,7 +114,7 @@ class LinkMeter:
 
 
 LinkName = Literal["A", "B"]
-LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or only the one in use.
+LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or only the active one.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ class LinkChoice:
     def after(self, now_s: float, normal: LinkMeter, spare: LinkMeter) -> LinkChoice:
         """Return the choice after new results of both links.
 
-        The spare link is taken after misses of the normal one in a row, unless it misses as well; the normal link
+        The spare link is taken after misses of the normal one in per row, unless it misses as well; the normal link
         again after answers in a row and a time, or at once where only the spare one misses.
         """
         limits = normal.limits
@@ -146,7 +146,7 @@ MISSED: Final = "#e5989b"
 
 
 def coverage(meters: Iterable[LinkMeter]) -> dict[int, dict[int, tuple[int, int]]]:
-    """Return answered and sent frames by direction and place, summed over meters of one bearer."""
+    """Return answered and sent frames by direction and position, summed over meters of one bearer."""
     total: dict[int, dict[int, tuple[int, int]]] = defaultdict(dict)
     for meter in meters:
         for (place, direction), (answered, sent) in meter.coverage.items():
@@ -165,8 +165,8 @@ def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
 def draw_coverage(path: Path, bearers: Mapping[LinkName, list[LinkMeter]]) -> None:
     """Draw the links of trains, by bearer.
 
-    A row for each bearer and direction with the response rate along the line (P5, figure 7); and one for each bearer
-    with the round trips over time and over place (P5, figures 9 and 10), unanswered frames at the foot.
+    One row per bearer and direction has the response rate along the line (P5, figure 7); one row per bearer has the
+    round trips over time and position (P5, figures 9 and 10), unanswered frames at the bottom.
     """
     from matplotlib.figure import Figure
 
@@ -198,7 +198,7 @@ def draw_coverage(path: Path, bearers: Mapping[LinkName, list[LinkMeter]]) -> No
         both[0].set(ylabel=f"bearer {name} [ms]")
     pairs[-1, 0].set(xlabel="time [s]")
     pairs[-1, 1].set(xlabel="chainage of the front [m]")
-    trips.suptitle("Round trip over time and place; not answered (red)")
+    trips.suptitle("Round trip over time and position; not answered (red)")
     figure.savefig(path, dpi=110)
 
 
@@ -261,7 +261,7 @@ class TrainLinks:
         idle_s = self.meters[name].limits.idle_s
         while True:
             try:
-                # read each time: new certificates are taken over by the next connection
+                # read each time, so that the next connection uses new certificates
                 settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
                 async with connection(
                     self._bearers[name].centre,
@@ -275,7 +275,7 @@ class TrainLinks:
                     while not (protocol.ended or protocol.has_expired):
                         await asyncio.sleep(0.1)
             except (ConnectionError, TimeoutError, OSError):
-                pass  # tried again after a time: the meter counts what is not answered
+                pass  # retried after a time; the meter counts unanswered frames
             self.protocols.pop(name, None)
             await asyncio.sleep(RETRY_S)
 
@@ -321,10 +321,10 @@ class TrainLinks:
 class CentreLinks:
     """The centre's end: listens at one address a bearer, answers every frame, passes each payload on once.
 
-    `received` is called with the train's number and the payload; ports are free ones where none are given, and stand in
+    `received` is called with the train's number and the payload; by default ports are any free ones, listed in
     `addresses` by bearer. Answers wait up to `wait_s` for a payload to go with. `masquerades` counts connections that
     were rejected for their certificate, `heard_s` has the monotonic clock of a train's last frame over a bearer, by
-    both, and `alarm` what is wrong with the list of revoked certificates.
+    train and bearer, and `alarm` the fault of the list of revoked certificates.
     """
 
     def __init__(
@@ -349,7 +349,7 @@ class CentreLinks:
         self._stack = AsyncExitStack()
         self.alarm: str | None = None
         self._revoked = Revoked()
-        #: Certificates of trains that end soon, by name, and those of the centre, a sentence each.
+        #: Certificates of trains that expire soon, by name, and those of the centre, one sentence each.
         self._ending: dict[str, str] = {}
 
     async def start(self) -> None:
@@ -376,11 +376,11 @@ class CentreLinks:
         await self._stack.aclose()
 
     def alarms(self) -> list[str]:
-        """Return what is wrong with the certificates, a sentence each."""
+        """Return the faults of the certificates, one sentence each."""
         return [*([] if self.alarm is None else [self.alarm]), *self._ending.values()]
 
     def threats(self) -> Counter[Threat]:
-        """Return what was rejected from all trains."""
+        """Return the number of rejected frames of all trains."""
         total: Counter[Threat] = Counter({Threat.MASQUERADE: self.masquerades})
         for receiver in self.receivers.values():
             total += receiver.threats
@@ -409,7 +409,7 @@ class CentreLinks:
             await asyncio.sleep(RETRY_S)
 
     def _note_ending(self) -> None:
-        """Note the certificates that end within `WARNING_DAYS`: those of the centre, and of trains that are here."""
+        """List the certificates that expire within `WARNING_DAYS`: of the centre, and of connected trains."""
         limit = datetime.now(UTC) + timedelta(days=WARNING_DAYS)
         ends = {p.peer: p.certificate.not_valid_after_utc for p in self._peers.values() if p.peer and p.certificate}
         self._ending = {text: text for text in list_ending(self._keys, "centre")} | {

@@ -15,9 +15,9 @@ from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, s
 from railfix.ground.links import LinkMode
 from railfix.ground.positions import Clock
 
-#: Way back of the safe front end that is no error of two places [m].
+#: Backward distance of the safe front end that is not an error of two positions [m].
 ROLLED_M: Final = 50.0
-#: Reports of which the time of sending is remembered.
+#: Number of reports whose time of sending is stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
 
@@ -29,7 +29,7 @@ class OnBoardLimits(BrakeLimits):
     fresh_s: float = option(
         "Time limit of authorities: older ones brake the train.", 15.0, name="--fresh", metavar="S", gt=0
     )
-    #: A train without a place runs on from the last one for this time, at that one's highest speed; then it brakes.
+    #: A train without a position continues from the last one for this time, at its highest speed; then it brakes.
     placeless_s: float = Field(default=5.0, ge=0)
     clock: Clock = option(
         "Positions are of a recording: report each as of now, at the recording's own pace.", "live", name="--replay"
@@ -39,7 +39,7 @@ class OnBoardLimits(BrakeLimits):
 
 @dataclass(kw_only=True)
 class Motion:
-    """Newest place of a train: safe ends, highest speed, and when it was there, None where that is not known."""
+    """Newest position of a train: safe ends, highest speed, and its time, None where unknown."""
 
     front_m: float
     rear_m: float
@@ -52,26 +52,27 @@ class OnBoard:
     """Authority of a train, as known on board.
 
     The age of an authority is counted from the sending of the report that it answers, on the train's monotonic clock.
-    It is never too small, whatever the links do, and clocks of train and centre need not agree.
+    It is never too small, whatever the links do, and the clocks of train and centre need not agree.
     """
 
     direction: int
-    #: End of the authority, the front end before the first; it is extended, and shortened where the centre asks for it
-    #: and the train can stop before.
+    #: End of the authority, initially the front end; it is extended, and shortened where the centre requests it and the
+    #: train can stop before it.
     end_m: float
 
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
-    session: int = 0  #: Of the reports: what answers those of another start is refused.
-    number: int = -1  #: Of the newest authority, -1 before the first.
+    session: int = 0  #: Start number of the reports: answers to another start are rejected.
+    number: int = -1  #: Number of the newest authority, -1 before the first.
     stopped: bool = False  #: The newest authority is an order to stop.
     order: BrakeOrder | None = None  #: Order to brake that the train obeys.
     authority: Authority | None = None  #: The newest one.
-    #: Where the train's safe front end would come to rest if it braked now, the further of the last two places; None:
+    #: Stopping position of the train's safe front end if it braked now, the farther of the last two positions; None:
     #: it agrees to no shorter end.
     stops_at_m: float | None = None
     #: When the newest report was sent that an authority has answered; None before the first.
     answered_s: float | None = None
-    #: Newest report from before the last turn, or from before this start: what answers it or an older one is refused.
+    #: Newest report from before the last change of ends, or from before this start: answers to it or to an older one
+    #: are rejected.
     before_turn: int = -1
 
     _newest: int = -1
@@ -96,10 +97,10 @@ class OnBoard:
         safe_rear_m: float | None = None,
         now_s: float | None = None,
     ) -> None:
-        """Note where the train's safe ends are, and its speed; one wrong place alone agrees to no shorter end.
+        """Store the train's safe ends and speed; a single wrong position agrees to no shorter end.
 
-        A train that has rolled back brakes: what the centre granted before does not know of it. Without a place or a
-        speed it runs on from the one before (`OnBoardLimits.placeless_s`).
+        A train that has rolled back brakes: earlier grants of the centre do not include it. Without a position or a
+        speed it continues from the previous one (`OnBoardLimits.placeless_s`).
         """
         before, self._place_m, self.stops_at_m = self._place_m, None, None
         if safe_front_m is None:
@@ -121,11 +122,11 @@ class OnBoard:
         self.stops_at_m = self._further(before, self._place_m)
 
     def _further(self, before_m: float | None, now_m: float) -> float | None:
-        """Return the further of two places in running direction, None without the first [m]."""
+        """Return the farther of two positions in running direction, None without the first [m]."""
         return None if before_m is None else self.direction * max(self.direction * now_m, self.direction * before_m)
 
     def _withdraw(self, front_m: float) -> None:
-        """End the authority at the front: a train that stands by order gets a new one with its release."""
+        """End the authority at the front: a train that was stopped by order gets a new one with its release."""
         self.end_m = self.direction * min(self.direction * self.end_m, self.direction * front_m)
         self._granted = False
 
@@ -176,14 +177,14 @@ class OnBoard:
         return not self._granted
 
     def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
-        """Return whether a shorter end may be taken: what a train held before its start is not known.
+        """Return whether a shorter end may be accepted: an authority from before the start is unknown.
 
         It brakes until it can agree.
         """
         return not authority.shortens or agrees or self._granted
 
     def acknowledgement(self) -> dict[str, int]:
-        """Return what a report says of the orders that the train holds: nothing before the first."""
+        """Return the fields of a report on the orders that the train has: none before the first."""
         order = {} if self.order is None else {"brake_order": self.order.number}
         if self.number < 0:
             return order
@@ -199,14 +200,14 @@ class OnBoard:
         parts = () if self.authority is None else self.authority.gradients
         if self.direction > 0:
             return Steps([c / 100.0 for c, _ in parts], [p / 1000.0 for _, p in parts])
-        # backward: a gradient holds from the begin of the next part down to its own, and before the first it is level
+        # backward: a gradient applies from the begin of the next part down to its own, and before the first it is level
         ends = [-c / 100.0 for c, _ in parts[::-1]]
         return Steps([-math.inf, *ends], [*(-p / 1000.0 for _, p in parts[::-1]), 0.0])
 
     def supervised(self, now_s: float | None = None) -> Supervised | None:
-        """Return the speeds that the train may run at, None before its first place.
+        """Return the permitted speeds of the train, None before its first position.
 
-        Its place is carried on from the newest, where the instants of both are known.
+        Its position is extrapolated from the newest, where the instants of both are known.
         """
         if (motion := self._motion) is None:
             return None
@@ -226,7 +227,7 @@ class OnBoard:
         )
 
     def _carried_m(self, now_s: float | None) -> float:
-        """Return how far the train can have run since its newest place [m]."""
+        """Return the largest distance that the train can have run since its newest position [m]."""
         motion = self._motion
         if motion is None or motion.at_s is None or now_s is None:
             return 0.0
@@ -241,14 +242,14 @@ class OnBoard:
         return self.stale_reason(now_s) or self.curve_reason(now_s)
 
     def stale_reason(self, now_s: float) -> str | None:
-        """Return what is too old for the train to run by: its authority, or its place."""
+        """Return which input is too old to run by: the authority, or the position."""
         if self.age_s(now_s) > self.limits.fresh_s:
             return "no fresh authority"
         at_s = None if self._motion is None else self._motion.at_s
         return "no place" if at_s is not None and now_s - at_s > self.limits.placeless_s else None
 
     def curve_reason(self, now_s: float) -> str | None:
-        """Return why the train is braked by its curve: the speed, what was allowed, and by how much it overruns."""
+        """Return why the train is braked by its curve: the speed, the permitted speed, and the overrun."""
         found, motion = self.supervised(now_s), self._motion
         if found is None or motion is None or motion.speed_mps <= found.intervention_mps:
             return None

@@ -27,10 +27,10 @@ Clock = Literal["live", "replay"]
 async def read_positions(
     lines: AsyncIterator[str], *, rejected: Callable[[str], None], clock: Clock = "live"
 ) -> AsyncIterator[TrainMessage]:
-    """Yield the position messages of lines; what is none is rejected with a sentence, and the next line counts.
+    """Yield the position messages in lines; other lines are rejected with a sentence, and the next line counts.
 
-    With the clock "replay" each message waits until as much time has passed since the first one as between the instants
-    of their places. Its times are then those of now, so that the centre takes the place for a new one.
+    With the clock "replay" messages are delayed as their positions were recorded. Its times are then replaced by the
+    present, so that the centre accepts the position as new.
     """
     first: tuple[int, int] | None = None
     number = 0
@@ -54,7 +54,7 @@ async def read_positions(
 
 
 async def standard_input() -> AsyncIterator[str]:
-    """Yield lines as they come; a reader that waits does not hold the end of the program up.
+    """Yield lines as they arrive; a waiting reader does not delay the end of the program.
 
     A line longer than `LONGEST_LINE` is cut to its beginning, which is no message.
     """

@@ -1,6 +1,6 @@
 """QUIC connections with datagrams, and the keys and certificates of both ends.
 
-aioquic asks a client for its certificate, and lets acknowledgements wait, only by attributes that it names as its own
+aioquic requests a client's certificate, and delays acknowledgements, only by private attributes
 (`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`, `_loss`, `_datagrams_pending`); they are
 used in this module alone.
 """
@@ -28,13 +28,13 @@ from railfix.ground.keys import name_of
 
 #: Name of the protocol in the handshake.
 PROTOCOL: Final = "railfix-link/1"
-#: A connection without any packet ends after this time [s], or earlier where the train wants so (`LinkLimits.idle_s`).
+#: A connection without any packet ends after this time [s], or earlier at the train's request (`LinkLimits.idle_s`).
 IDLE_S: Final = 10.0
-#: A centre lets answers to frames wait so long for an authority that they can go with [s].
+#: Longest delay of a centre's answers to frames, to be sent with an authority [s].
 WAIT_S: Final = 0.2
-#: Acknowledgements of QUIC wait so long for a frame that they can go with [s].
+#: Longest delay of QUIC acknowledgements, to be sent with a frame [s].
 ACKNOWLEDGE_S: Final = 1.5
-#: Handshakes that a peer may have under way.
+#: Largest number of handshakes of one peer in progress.
 MOST_HANDSHAKES: Final = 64
 _REJECTED: Final = 0x101
 
@@ -82,7 +82,8 @@ class Handshakes:
 class LinkProtocol(QuicConnectionProtocol):
     """One end of a connection that carries datagrams.
 
-    `peer` is the common name of the other end's certificate, None before it was verified, and `certificate` that one.
+    `peer` is the common name in the certificate of the other end, None before it was verified, and `certificate` that
+    certificate.
     """
 
     def __init__(
@@ -149,11 +150,13 @@ class LinkProtocol(QuicConnectionProtocol):
 
     @property
     def has_expired(self) -> bool:
-        """Whether the other end's certificate was valid and is so no more."""
+        """Whether the certificate of the other end has expired since."""
         return self.certificate is not None and datetime.now(UTC) > self.certificate.not_valid_after_utc
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
-        """Take a packet; what a verified peer is owed for it waits, where it may: half the packets, half the work."""
+        """Process a packet; acknowledgements to a verified peer are delayed where possible, which halves packets and
+        work.
+        """
         if self._handshakes is not None and not self._begun:
             self._begun = True
             self._handshakes.begin(self, str(addr[0]))
@@ -166,11 +169,11 @@ class LinkProtocol(QuicConnectionProtocol):
             self._waiting = self._loop.call_later(self._wait_s, self.transmit)
 
     def answer(self, made: Callable[[], bytes]) -> None:
-        """Send what `made` returns with the next packet."""
+        """Send the result of `made` with the next packet."""
         self._answers.append(made)
 
     def transmit(self) -> None:
-        """Send what is due with the answers that wait."""
+        """Send due messages with the delayed answers."""
         if self._waiting is not None:
             self._waiting.cancel()
             self._waiting = None
@@ -193,7 +196,7 @@ class LinkProtocol(QuicConnectionProtocol):
 
 @contextmanager
 def address_errors(host: str, port: int) -> Iterator[None]:
-    """Name the address in an OSError of listening there, and what to do."""
+    """Name the address in an OSError of listening there, and the remedy."""
     try:
         yield
     except OSError as error:
@@ -214,7 +217,7 @@ async def listen(
 ) -> tuple[QuicServer, tuple[str, int]]:
     """Listen for connections at an address; port 0 takes a free one. Return the server and its address.
 
-    What is owed to a verified peer, answers and acknowledgements, waits up to `wait_s` to go with what is sent. A peer
+    Answers and acknowledgements to a verified peer are delayed up to `wait_s`, to be sent with a message. A peer
     proves that it has its address before anything is kept of it (Retry, RFC 9000, 8.1.2).
     """
     handshakes = Handshakes()
@@ -242,7 +245,7 @@ async def connection(
 ) -> AsyncIterator[LinkProtocol]:
     """Connect from a local address, that of the bearer's interface.
 
-    ConnectionError, TimeoutError: when the other end rejects the certificate, is another one, or does not answer.
+    ConnectionError, TimeoutError: the other end rejects the certificate, has another name, or does not answer.
     """
     loop = asyncio.get_running_loop()
     transport, protocol = await loop.create_datagram_endpoint(
@@ -250,7 +253,7 @@ async def connection(
     )
     try:
         protocol.connect(address)
-        # `wait_for` would leave the error of a connection that ends as it gives up to nobody.
+        # `wait_for` would not retrieve the error of a connection that ends as it gives up.
         async with asyncio.timeout(timeout_s):
             await protocol.wait_connected()
         yield protocol

@@ -1,11 +1,11 @@
-"""What a position report does to the interval of its train: pure functions.
+"""Effect of a position report on the interval of its train: pure functions.
 
-Nothing here proves a report right: `CHECKS` find reports that cannot be right together with those before. What stays
-unseen (errors inside the train's own bounds) is assumed away in ``docs/ground.md``.
+Nothing here proves a report right: `CHECKS` find reports that cannot be right given the earlier ones. Undetected
+errors (within the train's own bounds) are assumed away in ``docs/ground.md``.
 
-The safe rear end moves to what two reports in a row confirm, of a complete train of its configured length. A report
-that contradicts what is known of its train stops that train and its neighbours. Whatever else is wrong with it, the
-interval comes to cover the place that it names, as far as the train can have got there.
+The safe rear end moves to the position that two reports in a row confirm, of a complete train of its configured length.
+A report that contradicts the record of its train stops that train and its neighbours. Whatever the contradiction, the
+interval is extended to the reported position, as far as the train can have run.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Difference of a reported length from the configured one that is rounding [m].
 LENGTH_ROUNDING_M: Final = 0.02
-#: Speed of a train that stands, at most; and against the facing, from which a train rolls back [m/s].
+#: Largest speed of a standing train; and against the facing, beyond which a train rolls back [m/s].
 STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
 #: Largest sum of over- and under-reading amount of a report that is taken.
 WIDEST_M: Final = 1000.0
-#: Instants of places are so uncertain for what an interval covers: as old as a place may be when it is sent [s].
+#: Uncertainty of the instants of positions for intervals: the largest age of a position when it is sent [s].
 INSTANT_S: Final = 5.0
 
 
 def is_placed(message: TrainMessage) -> bool:
-    """Return whether a report has a place with both bounds, of a train whose front end is known."""
+    """Return whether a report has a position with both bounds, of a train whose front end is known."""
     known = None not in (message.chainage_cm, message.over_cm, message.under_cm)
     placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
     return known and placed and message.facing != 0 and Unknown.FRONT_END not in message.unknown
@@ -43,7 +43,7 @@ def is_newer(known: TrainInterval, message: TrainMessage) -> bool:
 
 
 def stands(message: TrainMessage) -> bool:
-    """Return whether a report says that the train stands, and its speed does not deny it."""
+    """Return whether a report states standstill with a speed that agrees."""
     return message.standstill and abs(message.speed_cmps or 0) / 100.0 <= STANDING_MPS
 
 
@@ -54,7 +54,7 @@ def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedReport:
-    """A report with a place, beside what is known of its train."""
+    """A report with a position, and the record of its train."""
 
     known: TrainInterval
     message: TrainMessage
@@ -62,8 +62,8 @@ class PlacedReport:
     limits: InterlockingLimits
     granted: int  #: Number of the last authorities.
     skipped: tuple[int, int]  #: `Interlocking.skipped`.
-    #: Time since the place before, at most [s]: negative where the report's clock is behind that of the one before,
-    #: None where it is not known, as at the first report.
+    #: Longest time since the previous position [s]: negative where the report's clock is behind the previous report's,
+    #: None where unknown, as at the first report.
     elapsed_s: float | None
 
     @property
@@ -98,13 +98,13 @@ class PlacedReport:
 
     @property
     def held_m(self) -> float | None:
-        """End of the authority that the train holds, at most that of the line; None where it names none [m]."""
+        """End of the authority that the train has, at most the end of the line; None where it names none [m]."""
         end_cm, stations = self.message.authority_end_cm, self.layout.stations
         return None if end_cm is None else min(max(end_cm / 100.0, stations[0].begin_m), stations[-1].end_m)
 
     @property
     def turns(self) -> bool:
-        """Whether the train looks the other way than before."""
+        """Whether the train faces the other way than before."""
         return self.message.facing != self.known.direction
 
 
@@ -120,16 +120,16 @@ def other_line(report: PlacedReport) -> str | None:
 
 
 def wide_bounds(report: PlacedReport) -> str | None:
-    """Return the reason of a place that is hardly known."""
+    """Return the reason if a position is hardly known."""
     wide = report.over_m + report.under_m > WIDEST_M
-    return f"the bounds of the place are wider than {WIDEST_M:g} m" if wide else None
+    return f"the bounds of the position are wider than {WIDEST_M:g} m" if wide else None
 
 
 def off_line(report: PlacedReport) -> str | None:
     """Return the reason of a place off the line."""
     first, last = report.layout.stations[0].begin_m, report.layout.stations[-1].end_m
     on_line = first - report.over_m <= report.front_m <= last + report.under_m
-    return None if on_line else f"the place is not on the line: {report.front_m:.0f} m"
+    return None if on_line else f"the position is not on the line: {report.front_m:.0f} m"
 
 
 def moving_standstill(report: PlacedReport) -> str | None:
@@ -147,7 +147,7 @@ def unknown_authority(report: PlacedReport) -> str | None:
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
-    """Return what a change of ends contradicts: the train stands where it stood, its rear end is now the front."""
+    """Return the contradiction of a change of ends: the train stands where it stood, its rear end is now the front."""
     if not report.turns:
         return None
     if not report.message.standstill:
@@ -161,7 +161,7 @@ def wrong_turn(report: PlacedReport) -> str | None:
 
 
 def holds_more(report: PlacedReport) -> str | None:
-    """Return the reason of an authority that reaches beyond the interval; after a change of ends beyond the place."""
+    """Return the reason if an authority reaches beyond the interval, or after a change of ends beyond the position."""
     held, facing = report.held_m, report.message.facing
     if held is None:
         return None
@@ -179,22 +179,22 @@ def too_fast(report: PlacedReport) -> str | None:
 
 
 def older_place(report: PlacedReport) -> str | None:
-    """Return the reason of a place that is older than that before."""
+    """Return the reason if a position is older than the previous one."""
     older = report.elapsed_s is not None and report.elapsed_s < 0.0
-    return "the place is older than that of the report before" if older else None
+    return "the position is older than in the previous report" if older else None
 
 
 def longest_way_m(before: float | None, now: float | None, elapsed_s: float, limits: InterlockingLimits) -> float:
     """Return how far a train can have run, between reports of its speed where it has given both [m]."""
     top = limits.speed_mps
     if before is not None and now is not None:
-        # speeds in between are at most so much above both ends
+        # speeds in between exceed both ends by at most this much
         top = min(top, max(before, now) + SPEED_ERROR_MPS + 0.5 * limits.acceleration_mps2 * elapsed_s)
     return top * elapsed_s
 
 
 def impossible_way(report: PlacedReport) -> str | None:
-    """Return the reason of a way that no train makes in the time, or that was not possible at all."""
+    """Return the reason if no train can cover the distance in the time."""
     known, elapsed = report.known, report.elapsed_s
     if report.turns:
         return None
@@ -209,13 +209,13 @@ def impossible_way(report: PlacedReport) -> str | None:
 
 
 def beyond_authority(report: PlacedReport) -> str | None:
-    """Return the reason of a place beyond the authority."""
+    """Return the reason if a position is beyond the authority."""
     beyond = report.known.direction * (report.front_m - report.known.end_m) - report.over_m
     return "the train is beyond its authority" if not report.turns and beyond > 0.0 else None
 
 
 def rolled_back(report: PlacedReport) -> str | None:
-    """Return the reason of a place behind the interval."""
+    """Return the reason if a position is behind the interval."""
     ahead = report.known.direction * (report.front_m - report.known.rear_m) + report.under_m
     return "the train has rolled back" if not report.turns and ahead < report.known.length_m else None
 
@@ -228,7 +228,7 @@ def runs_backward(report: PlacedReport) -> str | None:
 
 
 Check = Callable[[PlacedReport], str | None]
-#: What a report may contradict, in the order in which the reason is named.
+#: Contradictions of a report, in the order in which they are reported.
 CHECKS: tuple[Check, ...] = (
     no_length, other_line, wide_bounds, off_line, moving_standstill, unknown_authority, wrong_turn, holds_more,
     too_fast, older_place, impossible_way, beyond_authority, rolled_back, runs_backward,
@@ -236,14 +236,14 @@ CHECKS: tuple[Check, ...] = (
 
 
 def compute_contradiction(report: PlacedReport) -> str | None:
-    """Return what a placed report contradicts, None where it may be right."""
+    """Return the contradiction of a report with a position, None if it may be right."""
     return next((reason for check in CHECKS if (reason := check(report)) is not None), None)
 
 
 def covered_m(report: PlacedReport) -> tuple[float, float]:
-    """Return rear and front end of an interval that has grown to the reported place.
+    """Return rear and front end of an interval that is extended to the reported position.
 
-    No further than the train can have got since the place before, and not beyond the line.
+    The extension is limited by the distance that the train can have run, and by the line.
     """
     known, d = report.known, report.known.direction
     reach = math.inf if report.elapsed_s is None else max(report.elapsed_s, INSTANT_S) * report.limits.speed_mps
@@ -257,7 +257,7 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
 
 
 def _noted(report: PlacedReport) -> TrainInterval:
-    """Return the train with what any placed report says, whatever it contradicts; its interval as it was."""
+    """Return the train with the data of a report with a position, contradicted or not; its interval is unchanged."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
     return replace(
@@ -271,11 +271,14 @@ def _noted(report: PlacedReport) -> TrainInterval:
         claimed_m=None,
         contradiction=None,
         held_end_m=report.held_m,
+        unbraked=message.brake_order is None and (message.authority is not None or report.known.unbraked),
     )
 
 
 def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:
-    """Return a train that is stopped, its interval grown to the reported place and to the authority it holds."""
+    """Return a train that is stopped, its interval extended to the reported position and to the authority
+    that it has.
+    """
     (rear, front), d, noted = covered_m(report), report.known.direction, _noted(report)
     held = noted.end_m if report.held_m is None else report.held_m
     end, rear = d * max(d * noted.end_m, d * held), d * min(d * rear, d * held) if report.turns else rear
@@ -292,10 +295,10 @@ def report_received(
 ) -> Interlocking:
     """Return the state after a position report.
 
-    A train that looks the other way than before has changed ends; that counts only at a standstill inside its
-    station, and the interval still covers where the train stood. A report that contradicts what is known stops the
-    train and moves its interval outward alone. `elapsed_s` is the time since the place before at most, by the
-    centre's own clock, where that is known.
+    A train that faces the other way than before has changed ends; that counts only at a standstill inside its station,
+    and the interval still covers the earlier position. A report that contradicts the record stops the train and moves
+    its interval outward only. `elapsed_s` is the longest time since the previous position, by the centre's own clock,
+    where known.
     """
     before = state.trains.get(message.train)
     if before is None or not is_placed(message) or not is_newer(before, message):
@@ -338,26 +341,28 @@ def furthest(facing: int, agreed_m: float, known_m: float) -> float:
 
 
 def _elapsed_s(known: TrainInterval, message: TrainMessage, by_centre_s: float | None) -> float | None:
-    """Return the time since the place before, at most, by the train's clock and the centre's [s]."""
+    """Return the longest time since the previous position, by the train's clock and the centre's [s]."""
     if known.measured_ns is None or (message.session or 0) != known.session:
         return by_centre_s
     by_train_s = (message.time_ns - known.measured_ns) / 1e9
-    # a clock that was set forward makes no way possible
+    # a clock that was set forward does not lengthen the possible distance
     return by_train_s if by_centre_s is None or by_train_s < 0.0 else max(min(by_train_s, by_centre_s), 0.0)
 
 
-#: Numbers of authorities up to which a train's word is taken for what an older copy of the database does not know.
+#: Highest authority number that a train may report beyond an older copy of the database.
 _MOST_NUMBERS: Final = 1 << 62
 
 
 def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state whose next authorities have higher numbers than the train holds."""
+    """Return the state whose next authorities have higher numbers than the train's."""
     held = message.authority or 0
     return replace(state, granted=held) if state.granted < held < _MOST_NUMBERS else state
 
 
 def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
-    """Return a train that has changed ends: no new authority; where it stood, and what it holds, is still occupied."""
+    """Return a train that has changed ends: no new authority; its earlier position and its authority remain
+    occupied.
+    """
     held = ahead if known.held_end_m is None else known.held_end_m
     covered = facing * max(facing * ahead, facing * known.rear_m)
     back = facing * min(facing * rear, facing * known.front_m, facing * held)

@@ -39,7 +39,7 @@ from railfix.track.network_read import read_network
 
 #: Period of the centre's work [s].
 STEP_S = 0.1
-#: A commit that is under way at the end is waited for so long [s].
+#: Longest wait for a commit in progress at the end [s].
 ENDING_S = 3.0
 #: Thresholds of the garbage collection: with a thousand connections a whole one takes 0.3 s, and is made rarely.
 COLLECTION = 10_000, 20, 50
@@ -71,13 +71,13 @@ class TrainPlace(Settings):
     #: Front end and length.
     front_m: float
     length_m: float = Field(gt=0)
-    bound_m: float = Field(default=10.0, ge=0)  #: The front is at most so far from `front_m`.
+    bound_m: float = Field(default=10.0, ge=0)  #: Largest distance of the front from `front_m`.
 
 
 class TriangleInputs(Settings):
     """Reference triangle on live streams."""
 
-    sources: tuple[str, str, str]  #: As of ``railfix live``, length 3.
+    sources: tuple[str, str, str]  #: Length of the train, as in ``railfix live``; 3 elements.
     points: tuple[Place, Place, Place]  #: Latitude, longitude and height of the known points; length 3 [deg, deg, m].
     nav: tuple[Path, ...] = ()  #: Navigation known from the start; records from the streams are added.
     limits: TriangleLimits = TriangleLimits()
@@ -95,7 +95,7 @@ class CentreFile(Settings):
     stations: tuple[LoopStation, ...] = ()  #: The line; or else
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
-    gradients: tuple[Gradient, ...] = ()  #: Of the line, in order of chainage.
+    gradients: tuple[Gradient, ...] = ()  #: Stations of the line, in order of chainage.
     #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection: unknown until it answers, by the order
     #: ``detect-section``.
     detected_sections: tuple[str, ...] = ()
@@ -106,10 +106,11 @@ class CentreFile(Settings):
     log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.
     #: Whether a train that nears the end of its track is given the route to the next station.
     routes: Literal["automatic", "by hand"] = "automatic"
-    speed_mps: float = Field(default=20.0, gt=0)  #: Of the reference run curve, for simulated running.
-    #: Time in which the simulated points move: there is no interface to real ones.
+    speed_mps: float = Field(default=20.0, gt=0)  #: Speeds of the reference run curve, for simulated running.
+    #: Time in which simulated points move: railfix has no interface to real ones.
     points_s: float = Field(default=5.0, ge=0)
-    #: Judges satellite positioning; the first start is then a stop, to be released by hand. Without it nothing does.
+    #: Judges satellite positioning; the first start is then a stop, to be released by hand. Without it nothing
+    #: integrates satellites.
     triangle: TriangleInputs | None = None
     #: `CentreLimits`, `InterlockingLimits`, `MonitorLimits`.
     centre: CentreLimits = CentreLimits()
@@ -123,11 +124,11 @@ class CentreFile(Settings):
         if bool(self.stations) == bool(self.network):
             raise ValueError("the line is given by stations, or by network, and not by both")
         if self.network:
-            return self  # looked at again with its stations
+            return self  # checked again with its stations
         layout, numbers = self.layout, [train.number for train in self.trains]
         for name in self.detected_sections:
             if name not in layout.sections:
-                raise ValueError(f"there is no section {name}; the sections are {', '.join(layout.sections)}")
+                raise ValueError(f"no such section: {name}; the sections are {', '.join(layout.sections)}")
         if len(set(numbers)) < len(numbers):
             raise ValueError("two trains have the same number")
         for train in self.trains:
@@ -148,8 +149,8 @@ class CentreFile(Settings):
     def with_stations(self, folder: Path) -> Self:
         """Return the settings with the stations of the network, whose files are relative to a folder.
 
-        InputFileError, MismatchError: when a map file cannot be read, or the network is no single line with passing
-        loops. SettingsError: when a train stands where there is no station.
+        InputFileError, MismatchError: a map file cannot be read, or the network is not a single line with passing
+        loops. SettingsError: a train stands outside all stations.
         """
         if not self.network:
             return self
@@ -193,11 +194,11 @@ async def run_centre(
 ) -> tuple[bool, dict[str, Any]]:
     """Run the centre of a file (`CentreFile`) until SIGINT or SIGTERM, or for a time.
 
-    Returns whether SIGTERM ended it, and figures of what happened.
+    Returns whether SIGTERM ended it, and figures of the session.
 
     The page is at a host and port, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
-    centre's certificate. `password` is for orders, those of `people` by their names; orders have an address of their
-    own where one is given, else that of the page. `announce` is called with each address once trains can connect.
+    centre's certificate. `password` is for orders, those of `people` by their names; orders have a separate address
+    where one is given, otherwise that of the page. `announce` is called with each address once trains can connect.
     InputFileError: the file, a key or the database cannot be read. SettingsError: a setting is wrong, or an address
     cannot be listened at.
     """
@@ -274,7 +275,7 @@ async def run_centre(
 def _centre(
     settings: CentreFile, keys: Path, store: Store, points: SimulatedPoints
 ) -> tuple[ControlCentre, CentreLinks]:
-    """Return the centre as its store has it, and its links, each of which hands over to the other."""
+    """Return the centre with its stored state, and its links, connected to each other."""
     supervision = Supervision(
         layout=settings.layout,
         state=at_start(settings.layout, settings.intervals()),
@@ -306,7 +307,7 @@ def _centre(
 
 
 def _stored_points(store: Store) -> dict[PointName, int]:
-    """Return where the simulated points lie: as they were detected, or commanded, when the process before ended."""
+    """Return the position of the simulated points: as detected, or commanded, when the previous process ended."""
     texts = store.documents(HEAD)
     points = from_documents(texts).points if texts else {}
     return {name: point.detected or point.wanted for name, point in points.items()}
@@ -319,7 +320,7 @@ def _call_in(loop: asyncio.AbstractEventLoop, work: Callable[[], None]) -> None:
 
 
 def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
-    """Return when each train was heard last over each bearer, as the page shows it."""
+    """Return when each train was last received over each bearer, as the page shows it."""
     now = time.monotonic()
     return [
         {"train": n, "bearer": bearer, "rate": None, "misses": None, "round_trip_ms": None,
@@ -330,7 +331,7 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 
 
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
-    """Work every `STEP_S`, at most half of the time: the links take in one frame a turn of the event loop."""
+    """Work every `STEP_S`, at most half of the time: the links receive one frame per turn of the event loop."""
     loop = asyncio.get_running_loop()
     due = loop.time()
     while True:
@@ -360,7 +361,7 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
 
 
 def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
-    """Note at the first start what the database belongs to; raise where the file is of something else later."""
+    """Store at the first start what the database belongs to; raise if the file differs later."""
     under = {f"station {s.name}": s.model_dump_json() for s in settings.stations}
     under |= {f"train {t.number}": f"{t.length_m:g} m" for t in settings.trains}
     under |= {"order of the stations": ", ".join(s.name for s in settings.stations)}

@@ -21,12 +21,13 @@ from railfix.ground.layout import PointName
 class InterlockingLimits(Settings):
     """Limits of the interlocking."""
 
-    margin_m: float = Field(default=20.0, ge=0)  #: Kept between the end of an authority and what limits it.
-    #: Kept beyond the end as well for a train that passes it at release speed; 0: there is no release speed.
+    margin_m: float = Field(default=20.0, ge=0)  #: Margin between the end of an authority and its limit.
+    #: Overlap beyond the end for a train that passes it at release speed; 0: no release speed.
     overlap_m: float = Field(default=0.0, ge=0)
     #: Points are released this long after the safe rear end has passed them.
     release_s: float = Field(default=3.0, ge=0)
-    #: The field answers the question for the detection of points within this time; else the trains on them are stopped.
+    #: The field answers a request for the detection of points within this time; otherwise the trains on them are
+    #: stopped.
     answer_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration, between two reports with speeds.
@@ -53,17 +54,18 @@ class TrainInterval:
     #: newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
     line: int | None = None  #: Line of the train's reports; None before the first.
-    #: Instant of the newest place, on the train's clock; None before the first report since a start on board.
+    #: Instant of the newest position, on the train's clock; None before the first report since a start on board.
     measured_ns: int | None = None
     speed_mps: float | None = None  #: Newest speed.
-    #: Ends of the train by the newest report with a place, whatever else was wrong with it, lower first; and what
-    #: that report contradicted.
+    #: Ends of the train by the newest report with a position, contradicted or not, lower first; and its contradiction.
     reported_m: tuple[float, float] | None = None
     contradiction: str | None = None
-    held_end_m: float | None = None  #: End of the authority that the train holds, by its newest report.
+    held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
+    #: Its reports have named an authority, and no order to brake since: it may run on by what it was granted.
+    unbraked: bool = False
     stop: str | None = None  #: Why the train is stopped, until it is released by hand.
-    asked_m: float | None = None  #: Shorter end of the authority that the train is asked to agree to.
-    asked_number: int = 0  #: Number of the first authority that asks for it.
+    asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
+    asked_number: int = 0  #: Number of the first authority that requests it.
     held: bool = False  #: A route was taken back: the next one is set by hand.
     parted: int | None = None  #: Train that was divided from the rear of this one, until they are apart.
 
@@ -83,11 +85,11 @@ class TrainInterval:
         return self.span_m[0] < high_m and low_m < self.span_m[1]
 
     def has_passed(self, low_m: float, high_m: float) -> bool:
-        """Return whether the rear end is beyond what lies between two chainages, in running direction."""
+        """Return whether the rear end is beyond a range of chainages, in running direction."""
         return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
 
     def outside_m(self) -> float:
-        """Return how far the newest reported place lies outside the interval, 0 where it may be inside [m]."""
+        """Return the distance of the newest reported position from the interval, 0 where it may be inside [m]."""
         if self.reported_m is None:
             return 0.0
         front = max(self.direction * end for end in self.reported_m)
@@ -113,7 +115,7 @@ class PointState:
 
     @property
     def lies(self) -> bool:
-        """Whether the points are detected where they are wanted."""
+        """Whether the points are detected in their commanded position."""
         return self.detected == self.wanted
 
 
@@ -200,7 +202,7 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
             values = json.loads(text or "")
             station, side = map(int, name.removeprefix(_POINTS).split())
             points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
-    # in the order of the line, whatever the order of the texts
+    # in the order of the line, in any order of the texts
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
         granted=head["granted"], bars=frozenset((name, kind) for name, kind in head["bars"]),

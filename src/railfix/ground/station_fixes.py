@@ -100,9 +100,9 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         usable[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k])
         states_of.append(states)
     there = np.stack([np.isin(time, epoch) for epoch in epochs])
-    # a receiver without an epoch takes no satellite away from the others: their own fixes still count
+    # a receiver without an epoch removes no satellite from the others: their own fixes still count
     shared = (usable | ~there[:, :, None]).all(axis=0)
-    # the same weights too, else an error common to the receivers moves each fix otherwise
+    # with the same weights too, as otherwise a common error moves each fix differently
     square = np.where(usable, sigma**2, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
     groups = clock_groups([name[0] for name in satellite.tolist()])
@@ -198,7 +198,7 @@ def _fallen(cn0: Floats) -> Masks:
     return np.asarray((level < usual - FALLEN_DBHZ).T)
 
 
-#: Epochs that may wait for the other receivers.
+#: Number of epochs that may wait for the other receivers.
 _LONGEST_QUEUE: Final = 1000
 #: Epochs over which the usual C/N0 of a receiver is taken.
 _USUAL_EPOCHS: Final = 600
@@ -232,7 +232,7 @@ class StationStreams:
         if tag_ns % 1_000_000_000 or tag <= self._done:
             return None
         for later, epochs in list(self._waiting.items()):
-            # the receiver's tags were in the future: they would push out those of the others
+            # future time tags of one receiver would displace those of the others
             if later > tag and epochs.pop(receiver, None) is not None and not epochs:
                 del self._waiting[later]
         together = self._waiting.setdefault(tag, {})

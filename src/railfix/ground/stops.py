@@ -22,7 +22,7 @@ CLOSED: Final = "closed"
 OCCUPIED: Final = "occupied by vehicles that report nothing"
 UNKNOWN: Final = "unknown to its detection"
 BARS: Final = (CLOSED, OCCUPIED)
-#: Bars that end where the detection of a section says that it is free.
+#: Bars that end when the detection of a section reports it free.
 SWEPT: Final = {OCCUPIED, UNKNOWN}
 
 
@@ -60,7 +60,7 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     """Return the state with the stop of one train released by hand, and the reason of a refusal.
 
     Points under its interval, which a train that has rolled back has passed, are locked for it again; its next
-    report names its line. Its station becomes the furthest that its front has reached, on the track that it has there.
+    report names its line. Its station becomes the farthest that its front has reached, on its track there.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:
@@ -123,7 +123,7 @@ def close_section(
 
 
 def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Interlocking:
-    """Return the state without a bar of a section; trains that were stopped by it are released one by one."""
+    """Return the state without a bar of a section; trains that it stopped are released one by one."""
     return replace(state, bars=state.bars - {(section, kind)})
 
 
@@ -141,10 +141,10 @@ def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[st
 def ask_route_back(
     state: Interlocking, train: int, layout: Layout, *, limits: InterlockingLimits
 ) -> tuple[Interlocking, str | None]:
-    """Return the state in which a train is asked to stay in its station, and the reason of a refusal."""
+    """Return the state in which a train is requested to stay in its station, and the reason of a refusal."""
     known = state.trains.get(train)
     if known is None:
-        return state, f"there is no train {train}"
+        return state, f"no such train: {train}"
     direction, base = known.direction, known.station - known.direction
     if base not in known.tracks:
         return state, "the train has no route to take back"
@@ -160,7 +160,7 @@ def ask_route_back(
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
     """Return the state after a report that may answer: the route goes where the train agrees, and stays where not.
 
-    Of a stopped train, whose report may be the contradicted one, no answer counts until it is released.
+    For a stopped train, whose report may be wrong, no answer counts until it is released.
     """
     known = state.trains[message.train]
     if known.asked_m is None or known.stop is not None or message.sequence != known.sequence:
@@ -181,13 +181,13 @@ def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
 
 
 def answers(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a report answers the authority that asks for a shorter end."""
+    """Return whether a report answers the authority that requests a shorter end."""
     held = message.authority
     return held is not None and message.authority_end_cm is not None and held >= known.asked_number
 
 
 def holds_more_than_asked(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a train holds more than it is asked to, or is further than that."""
+    """Return whether a train has a longer authority than requested, or is beyond that end."""
     d = known.direction
     assert known.asked_m is not None
     further = max(d * (message.authority_end_cm or 0) / 100.0, d * known.front_m)

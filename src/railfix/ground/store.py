@@ -50,7 +50,7 @@ LOG: Final = sql.Table(
 
 
 class DatabaseError(OutputError):
-    """The database does not take what has to be stored; it may do so later."""
+    """The database does not accept data at the moment."""
 
 
 class Store:
@@ -72,11 +72,11 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
-        self.abandoned = False  #: A commit hangs in another thread: the connection is left to it.
+        self.abandoned = False  #: A commit hangs in another thread, which keeps the connection.
         self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:
-        """Make this process the only one that writes: a centre in charge before cannot commit any more.
+        """Make this process the only writer: an earlier centre cannot commit any more.
 
         InputFileError: when another process on this machine has the database of SQLite.
         """
@@ -103,7 +103,7 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Commit the lines of the log that are left, where the database takes them, and close it."""
+        """Commit the remaining lines of the log, where the database accepts them, and close it."""
         if self.abandoned:
             return
         if self._notes and not self._connection.invalidated:
@@ -167,7 +167,7 @@ class Store:
         self._notes.append({"time_ns": time_ns, "train": train, "text": text})
 
     def records(self) -> dict[int, TrainRecord]:
-        """Return the records of all trains: unknown until they are heard, with their last places."""
+        """Return the records of all trains: unknown until they report, with their last positions."""
         with self._connection.begin():
             rows = self._connection.execute(sql.select(TRAINS).order_by(TRAINS.c.train)).all()
         return {
@@ -182,7 +182,7 @@ class Store:
         }
 
     def document(self, name: str) -> str | None:
-        """Return a named text, None where there is none."""
+        """Return a named text, None if it does not exist."""
         with self._connection.begin():
             return self._connection.execute(sql.select(DOCUMENTS.c.text).where(DOCUMENTS.c.name == name)).scalar()
 
@@ -202,7 +202,7 @@ class Store:
         return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
 
     def _put(self, key: sql.Column[Any], rows: list[dict[str, Any]]) -> None:
-        """Put rows in the place of those with the same key, the last of several with one."""
+        """Replace rows by their key; of several with one key the last counts."""
         if rows := list({row[key.name]: row for row in rows}.values()):
             self._connection.execute(
                 key.table.delete().where(key == sql.bindparam("of")), [{"of": row[key.name]} for row in rows]
@@ -211,7 +211,9 @@ class Store:
 
 
 def _time_outs(url: str) -> dict[str, Any]:
-    """Return what lets a connection fail rather than hang: times to connect, for a statement, and of a dead network."""
+    """Return options with which a connection fails rather than hangs: times to connect, for a statement, and for a dead
+    network.
+    """
     if url.startswith("postgresql"):
         return {"connect_timeout": 2, "tcp_user_timeout": 5000, "options": "-c statement_timeout=5000"}
     if url.startswith(("mysql", "mariadb")):

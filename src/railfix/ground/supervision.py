@@ -37,7 +37,7 @@ from railfix.ground.stops import (
 )
 from railfix.io.train_message import TrainMessage
 
-#: A train within this distance of the end of its track asks for the next route [m].
+#: A train within this distance of the end of its track requests the next route [m].
 ROUTE_AHEAD_M = 700.0
 #: A train is sent an authority at its report, at a stop, and otherwise this often [s].
 AUTHORITY_S = 1.0
@@ -53,7 +53,7 @@ class Supervision:
 
     layout: Layout
     state: Interlocking
-    #: Called with points that have to move and the track they are to lead to; `set_detected` takes what they report.
+    #: Called with points that have to move and the track they are to lead to; `set_detected` gets the field's reports.
     command: Callable[[PointName, int], None] = lambda *_: None
 
     routes: Literal["automatic", "by hand"] = "automatic"
@@ -68,8 +68,10 @@ class Supervision:
     #: When a train was sent the order to brake that it has not acknowledged yet, and the number of the order.
     ordered: dict[int, tuple[float, int]] = field(default_factory=dict)
     issued: dict[int, set[int]] = field(default_factory=dict)  #: Numbers of all orders to brake since the start.
-    awaited: set[int] = field(default_factory=set)  #: Trains to be heard before anything is granted (`begin_again`).
-    #: Sections whose detection says that they are occupied; None: not answered yet.
+    begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
+    #: Trains that must report before anything is granted (`begin_again`).
+    awaited: set[int] = field(default_factory=set)
+    #: Sections that are detected as occupied; None: not answered yet.
     detected: dict[str, bool | None] = field(default_factory=dict)
 
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -88,7 +90,7 @@ class Supervision:
             elapsed_s, clock = self._read_clock(message, before, now_s)
             self.state = report_received(self.state, message, self.layout, limits=self.limits, elapsed_s=elapsed_s)
             if self.state.trains[number].contradiction is None:
-                self._clocks[number] = clock  # that of a contradicted report would make ways possible later
+                self._clocks[number] = clock  # the time of a contradicted report would permit longer distances later
             self.state = answer_received(self.state, message)
             self.heard.add(number)
         if reason not in (Rejection.REPEATED, Rejection.EARLIER_START, Rejection.FAR_AHEAD):
@@ -96,10 +98,13 @@ class Supervision:
         return reason
 
     def _take_answer(self, message: TrainMessage) -> None:
-        """Take what a report says of the order to brake that the train obeys."""
+        """Process a report's statement on the order to brake that the train obeys."""
         number, held = message.train, message.brake_order
-        if number in self.ordered and is_obeyed(message, self.ordered[number][1]):
-            self.ordered[number] = math.inf, self.ordered[number][1]
+        sent_s, first = self.ordered.get(number, (0.0, 0))
+        if number in self.ordered and is_obeyed(message, first):
+            self.ordered[number] = math.inf, first
+        elif sent_s == math.inf:  # a start on board since then has reset it
+            self.ordered[number] = -math.inf, first
         elif held is not None and held not in self.issued.get(number, ()):
             reason = "the train obeys an order to brake from before this start"
             self.state = stop_trains(self.state, [number], reason)
@@ -107,9 +112,9 @@ class Supervision:
     def _read_clock(
         self, message: TrainMessage, record: TrainRecord, now_s: float
     ) -> tuple[float | None, tuple[float, float]]:
-        """Return the time since the train's place before at most (None: unknown), and the clock's delay.
+        """Return the longest time since the train's previous position (None: unknown), and the clock's delay.
 
-        By the least delay of the reports before; after a start on board, whose clock is new, by the centre's alone.
+        By the least delay of earlier reports; after a start on board, whose clock is new, by the centre's alone.
         """
         number = message.train
         known, tolerance_s = self.state.trains[number], self.centre.clock_s
@@ -126,29 +131,32 @@ class Supervision:
 
     @property
     def awaited_text(self) -> str:
-        """Trains that have not been heard since the start, in words."""
+        """Trains that have not reported since the start, in words."""
         return ", ".join(f"train {number}" for number in sorted(self.awaited))
 
     def set_detected(self, point: PointName, track: int | None) -> None:
-        """Take what points are detected at: a track, None where they are at neither end."""
+        """Process the detection of points: a track, None where they are at neither end."""
         self._asked_s.pop(point, None)
         self.state = points_reported(self.state, point, track, self.layout)
 
     def begin_again(self, now_s: float) -> tuple[PointName, ...]:
-        """Begin with a stored state, which may be an older copy; return the points that the field has to be asked of.
+        """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
-        Nothing is granted until every train has been heard, by a report that names an order of this start: what it
-        holds more than is known comes with it, and it takes no late authority of the centre before any more. What
-        points were detected at is forgotten.
+        Nothing is granted until every train has sent a report that names an order of this start: the report includes
+        authorities unknown to the database, and the train accepts no late authority of the earlier centre any more. The
+        stored detection of points is dropped.
         """
-        self.awaited, last = set(self.state.trains), self.state.granted
+        self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
+        trains = {n: replace(t, unbraked=t.sequence > 0) for n, t in self.state.trains.items()}
         points = {name: replace(p, detected=None, commanded=False) for name, p in self.state.points.items()}
-        self.state = replace(self.state, points=points, granted=last + SKIPPED, skipped=(last, last + SKIPPED))
+        self.state = replace(
+            self.state, trains=trains, points=points, granted=last + SKIPPED, skipped=(last, last + SKIPPED)
+        )
         self._asked_s = dict.fromkeys(points, now_s)
         return tuple(points)
 
     def set_section_detected(self, section: str, occupied: bool | None) -> None:
-        """Take what the detection of a section says; None where it is not known any more."""
+        """Process the detection of a section; None where it is unknown."""
         self.detected[section] = occupied
         cleared = SWEPT if occupied is False else {UNKNOWN}
         bars = {bar for bar in self.state.bars if bar[0] != section or bar[1] not in cleared}
@@ -158,23 +166,23 @@ class Supervision:
     def set_route(self, train: int, **step: Any) -> str | None:
         """Set a route to the next station; return the reason of a refusal.
 
-        `step` is what `route_requested` takes of the step at hand. Its points move once `command_points` is called.
+        `step` has the data of the current step for `route_requested`. Its points move once `command_points` is called.
         """
         if train not in self.state.trains:
-            return f"there is no train {train}"
+            return f"no such train: {train}"
         if self.awaited:
-            return f"not heard since the start: {self.awaited_text}"
+            return f"no report since the start: {self.awaited_text}"
         self.state, _, reason = route_requested(self.state, train, self.layout, **step)
         self.routes_set += reason is None
         return reason
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train to give its route to the next station back; return the reason of a refusal."""
+        """Request a train to return its route to the next station; return the reason of a refusal."""
         self.state, reason = ask_route_back(self.state, train, self.layout, limits=self.limits)
         return reason
 
     def command_points(self, stored: Interlocking) -> None:
-        """Give the commands to points that are due, of a state that is stored; none before every train is heard."""
+        """Return the commands to points that are due, in a stored state; none before every train has reported."""
         if self.awaited:
             return
         self.state, commands = due_commands(self.state, self.layout, stored)
@@ -182,7 +190,7 @@ class Supervision:
             self.command(point, track)
 
     def forget(self, trains: Iterable[int]) -> None:
-        """Keep nothing of trains that are no longer supervised."""
+        """Drop the data of trains that are not supervised any more."""
         for number in trains:
             for kept in (self.records, self.sent, self.ordered, self.issued, self._clocks):
                 kept.pop(number, None)
@@ -225,10 +233,10 @@ class Supervision:
         return orders
 
     def work(self, now_s: float) -> list[Authority]:
-        """Release points, set routes, extend authorities; return what is sent once the state is stored.
+        """Release points, set routes, extend authorities; return the messages to send once the state is stored.
 
-        Trains that have reported since the last call, whose stop has changed, or that were sent nothing for
-        `AUTHORITY_S` are looked at; the others wait for their report.
+        It processes trains that have reported since the last call, whose stop has changed, or that were sent nothing
+        for `AUTHORITY_S`; the others wait for their report.
         """
         stopped = stop_orders(self.state)
         if not self.awaited:
@@ -293,8 +301,8 @@ class Supervision:
 
 
 def is_obeyed(message: TrainMessage, number: int) -> bool:
-    """Return whether a report names an order to brake, or an authority from after it: that was an order as well."""
-    return (message.brake_order or -1) >= number or (message.authority or 0) > number
+    """Return whether a report names an order to brake, or one from after it."""
+    return (message.brake_order or -1) >= number
 
 
 def counts(reason: Rejection | None) -> bool:

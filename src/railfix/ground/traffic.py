@@ -17,7 +17,7 @@ from railfix.io.train_message import MessageStatus, TrainMessage
 BRAKING_MPS2: Final = 0.7
 ACCELERATION_MPS2: Final = 0.5
 STEP_S: Final = 1.0
-#: A train stops so far before the end of its authority [m].
+#: Distance before the end of its authority at which a train stops [m].
 STOP_SHORT_M: Final = 2.0
 
 
@@ -112,7 +112,7 @@ class SimulatedTrain:
 
     @property
     def safe_front_m(self) -> float:
-        """Front end with its error and bound, and what the driver leaves before the end of an authority [m]."""
+        """Front end with its error and bound, and the driver's margin before the end of an authority [m]."""
         return self.front_m + self.error_m + self.direction * (self.bound_m + STOP_SHORT_M)
 
     def permitted_mps(self) -> float:
@@ -125,13 +125,13 @@ class SimulatedTrain:
 class Traffic:
     """Traffic on a line: the trains and points, and the centre that supervises them.
 
-    Its messages are those of a subclass: `send_report` and `exchange`.
+    Its messages are sent by a subclass: `send_report` and `exchange`.
     """
 
     trains: dict[int, SimulatedTrain]
     centre: Supervision
     random: random.Random
-    centre_works: bool = True  #: False while the centre is stopped: it hears nothing, and no points are detected.
+    centre_works: bool = True  #: False while the centre is stopped: it receives nothing, and no points are detected.
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)  #: Invariants that were broken, by kind and in seconds.
     moving: dict[PointName, tuple[float, int]] = field(default_factory=dict)

@@ -18,11 +18,11 @@ from railfix.ground.on_board import REPORT_S, OnBoard, OnBoardLimits
 from railfix.ground.positions import Clock, read_positions, standard_input
 from railfix.io.train_message import MessageError, TrainMessage, encode
 
-#: Time between two looks at the age of the authority and the braking curve [s].
+#: Interval between checks of the age of the authority and of the braking curve [s].
 LOOK_S = 0.1
 #: Longest wait for the answer to the last report, after the end of the positions [s].
 ANSWER_S: Final = 5.0
-#: Largest age of what the integrity device has written [s].
+#: Largest age of the integrity device's statement [s].
 INTEGRITY_S = 2.0
 
 
@@ -42,10 +42,10 @@ async def run_train(
     Ends with the positions, once the last report is answered or `ANSWER_S` after it. Returns the number of reports and
     of authorities.
 
-    With the train's own two files and ``authority.pem`` of the folder `keys`. The positions are messages as
-    `railfix.io.train_message.to_json` writes them, from the standard input by default; lines that are none are written
-    as rejected (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, `is_complete` of
-    it takes the place of what the messages say. InputFileError: when a key is not there.
+    With the train's own two files and ``authority.pem`` of the folder `keys`. The positions are messages as written by
+    `railfix.io.train_message.to_json`, by default from the standard input; other lines are reported as rejected
+    (`railfix.ground.positions`). With `integrity`, a file of the train's integrity device, its `is_complete` replaces
+    that of the messages. InputFileError: when a key is not there.
     """
     check_keys(keys, f"train-{train}")
     limits = limits or OnBoardLimits()
@@ -68,7 +68,7 @@ async def run_train(
 def is_complete(path: Path) -> bool:
     """Return whether the train's integrity device has written "complete" in the last `INTEGRITY_S`.
 
-    A file that is absent, unreadable, older, from the future or says anything else is no confirmation.
+    A file that is absent, unreadable, older, from the future or of other content is no confirmation.
     """
     try:
         age_s = time.time() - path.stat().st_mtime
@@ -85,7 +85,7 @@ class _Desk:
     ) -> None:
         self._train, self._write, self._limits, self._integrity = train, write, limits, integrity
         self._newest: TrainMessage | None = None
-        # a start is known by a number drawn at random: no clock decides what is newer
+        # a start is identified by a random number: no clock decides what is newer
         self._session, self._sequence, self._answered = draw_session(), 0, 0
         self._on_board: OnBoard | None = None
         self._reason: str | None = ""

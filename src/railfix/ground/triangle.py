@@ -1,9 +1,9 @@
 """Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points; its monitor.
 
 P3 (reference triangle): each fix is compared with its point by a circle of allowable error, and the vectors between
-neighbouring fixes (distance and bearing) with those between the points. P3 takes a fix inside its circle as the point
-itself, so that a drift inside the circle cannot be seen. Here the vectors come from the raw fixes: errors common to
-the three receivers cancel in them, their limit can be far below the radius, and such a drift is seen.
+neighbouring fixes (distance and bearing) with those between the points. P3 treats a fix inside its circle as the point
+itself, so that a drift inside the circle cannot be detected. Here the vectors are between raw fixes: errors common to
+the three receivers cancel in them, their limit can be far below the radius, and such a drift is detected.
 
 The monitor is a pure state machine, suspension of satellite positioning with a latched stop and release by hand:
 `advance` takes the state and one sample, and returns the new state with the orders to be sent.
@@ -36,7 +36,7 @@ class TriangleVerdict(IntEnum):
 
     #: Every fix inside its circle, every side as it should be.
     HEALTHY = 0
-    #: Every fix inside its circle, but one side, or both sides of one receiver, differ: a warning.
+    #: Every fix is inside its circle, but one side, or both sides of one receiver, differ: a warning.
     RECEIVER_DRIFTING = 1
     #: One fix outside its circle, and both its sides differ.
     ONE_RECEIVER = 2
@@ -44,7 +44,7 @@ class TriangleVerdict(IntEnum):
     SATELLITES_OR_JAMMING = 3
     #: The fixes coincide: one false signal for all three receivers.
     SPOOFING = 4
-    #: Any other combination: the ground side cannot judge.
+    #: Any other combination: the ground side cannot decide.
     GROUND_LOST = 5
     #: A fix is absent.
     MONITOR_LOST = 6
@@ -84,7 +84,7 @@ def limits_for_false_stops(
     Parameters
     ----------
     sigma_m : float [m]
-        Standard deviation of a fix, an axis.
+        Standard deviation of a fix per axis.
     own_sigma_m : float [m]
         That of the part which the other receivers do not share; a side has it twice.
     stops_per_year : float
@@ -129,7 +129,7 @@ def compare_triangle(
     points_m : ndarray, shape (3, 2) [m]
         Known points, east and north of any origin.
     fixes_m : ndarray, shape (T, 3, 2) [m]
-        Raw fixes from the same satellites at the same epoch, in the same frame; NaN where there is none.
+        Raw fixes from the same satellites at the same epoch, in the same frame; NaN where missing.
     cn0_fallen : ndarray of bool, shape (T, 3), optional
         True where the C/N0 of a receiver has fallen.
 
@@ -150,7 +150,7 @@ def compare_triangle(
     measured = fixes_m[:, second] - fixes_m[:, first]
     error, side_error = np.hypot(*np.moveaxis(offset, -1, 0)), np.hypot(*np.moveaxis(measured - side, -1, 0))
     apart = np.hypot(*np.moveaxis(measured, -1, 0))
-    # comparisons with NaN are False: a fix that is absent is neither inside its circle nor in its place
+    # comparisons with NaN are False: an absent fix is neither inside its circle nor consistent
     inside, small = error <= limits.radius_m, side_error <= limits.side_m
     coincide = (apart <= limits.side_m).all(axis=1)
     fallen = np.zeros(error.shape, dtype=bool) if cn0_fallen is None else cn0_fallen
@@ -206,7 +206,7 @@ def _verdicts(
 class Order(Enum):
     """Order of the monitor to the trains, in the order they are sent."""
 
-    #: Satellite positioning is suspended: positions from it count no more.
+    #: Satellite positioning is suspended: its positions are not used any more.
     SUSPEND = "suspend satellite positioning"
     #: Trains that depend on it stop.
     STOP = "stop"
@@ -214,8 +214,8 @@ class Order(Enum):
     RESUME = "resume satellite positioning"
 
 
-#: Time after a stop in which `GROUND_LOST` is replaced by a more exact cause: an error that grows takes one fix out
-#: of its circle before the others.
+#: Time after a stop in which `GROUND_LOST` is replaced by a more exact cause: a growing error moves one fix out of its
+#: circle before the others.
 _SETTLE_S: Final = 10.0
 
 
@@ -313,7 +313,7 @@ class MonitoredLog:
     orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:
-        """Return one row an epoch: verdict, receiver, errors of the fixes and of the sides."""
+        """Return one row per epoch: verdict, receiver, errors of the fixes and of the sides."""
         triangle = self.triangle
         columns: dict[str, object] = {
             "time_gpst": self.fixes.time,
@@ -393,7 +393,7 @@ class LiveMonitor:
     state: MonitorState = field(default_factory=lambda: MonitorState(stopped=False))
 
     def judge(self, fixes: StationFixes, now_s: float) -> tuple[MonitoredLog, tuple[Order, ...]]:
-        """Take one epoch; return it judged, and the orders to be sent; SettingsError as `monitor_log`."""
+        """Process one epoch; return its verdict, and the orders to be sent; SettingsError as `monitor_log`."""
         triangle = judge_fixes(fixes, self.limits)
         verdict, receiver = TriangleVerdict(int(triangle.verdict[0])), int(triangle.receiver[0])
         self.state, orders = advance(self.state, now_s, verdict, receiver=receiver, limits=self.times)

@@ -1,6 +1,6 @@
 """Page of the control centre: the line with trains, intervals and authorities, links, alarms and log.
 
-Reading is open; orders need a log-in. Nothing comes from outside the server.
+Reading is open; orders need a log-in. The page loads nothing from other servers.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ MOST_WRONG: Final = 10
 WRONG_S: Final = 60.0
 #: A connection without a whole request for this time ends, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
-#: Connections at a time; further ones are refused. Of a peer, those without a whole request.
+#: Connections at a time; further ones are refused. Connections of one peer without a complete request.
 MOST_CONNECTIONS: Final = 500
 MOST_IDLE: Final = 20
-#: Name of who logs in by the password alone.
+#: Name for a log-in by the password alone.
 OPERATOR: Final = "operator"
 _COOKIE: Final = "railfix-session"
 _LONGEST_BODY: Final = 1000
@@ -49,7 +49,7 @@ _HEADERS: Final = {
     "Cache-Control": "no-store",
 }
 
-#: An order: takes the values of the request and who gives it, returns the reason of a refusal.
+#: An order: called with the values of the request and its author, returns the reason of a refusal.
 Order = Callable[..., str | None]
 
 
@@ -85,7 +85,7 @@ class Sessions:
         return token
 
     def name_of(self, token: str) -> str:
-        """Return who a session is of."""
+        """Return the owner of a session."""
         return self._names[token]
 
     def log_out(self, token: str) -> None:
@@ -158,7 +158,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     async def order(request: Request) -> Response:
         given = orders.get(request.path_params["name"])
         if given is None:
-            return _answer({"refused": "there is no such order"}, 404)
+            return _answer({"refused": "no such order"}, 404)
         token = request.cookies.get(_COOKIE, "")
         if not sessions.valid(token):
             return _answer({"refused": "log in first"}, 403)
@@ -187,7 +187,7 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 async def _values(request: Request) -> dict[str, Any] | None:
     """Return the JSON object of a request; None where it has none.
 
-    Another page cannot send this content type without being asked by the browser, which is refused.
+    Another site cannot send this content type unless the browser asks first, which is refused.
     """
     if request.headers.get("content-type") != "application/json":
         return None
@@ -207,14 +207,14 @@ async def _values(request: Request) -> dict[str, Any] | None:
 class _TimedProtocol(H11Protocol):
     """HTTP whose connections end without a whole request, however slowly its bytes come.
 
-    Of each peer at most `MOST_IDLE` wait for one: with another the one that has waited longest ends, so that a peer
-    that opens many takes no place of others, nor its own next request's.
+    At most `MOST_IDLE` connections of a peer wait for a request: one more ends the longest waiting, so that a peer that
+    opens many blocks neither others nor its own next request.
     """
 
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to look at the connection every `REQUEST_S`."""
+        """Begin to check the connection every `REQUEST_S`."""
         super().connection_made(transport)
         peer = id(self.server_state), self.client[0] if self.client else ""
         mine = self.waiting.setdefault(peer, {})

@@ -1,5 +1,5 @@
-"""Commits to the store beside the centre's work: in a thread, one at a time, so that a database that hangs holds up
-nothing but what waits for its commit.
+"""Commits to the store parallel to the centre's work: in a thread, one at a time, so that a hanging database delays
+only messages that wait for their commit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RETRY_S: Final = 1.0
 
 
 class Writer(Protocol):
-    """What carries a commit out: at once, or in a thread."""
+    """Executor of commits: immediate, or in a thread."""
 
     def submit(self, work: Callable[[], None]) -> Future[None]:
         """Begin some work; return its outcome."""
@@ -37,7 +37,7 @@ class DirectWriter:
 
 
 class ThreadWriter:
-    """Writer with a thread of its own, which does not keep the process from ending.
+    """Writer with a separate thread, which does not keep the process from ending.
 
     `done` is called, in that thread, after each work.
     """
@@ -55,7 +55,7 @@ class ThreadWriter:
         return outcome
 
     def stop(self, wait_s: float) -> bool:
-        """End the thread after the work that was begun; return whether it has ended in time."""
+        """End the thread after the work in progress; return whether it has ended in time."""
         self._queue.put(None)
         self._thread.join(wait_s)
         return not self._thread.is_alive()
@@ -69,7 +69,7 @@ class ThreadWriter:
 def _carry_out(work: Callable[[], None], outcome: Future[None]) -> None:
     try:
         work()
-    except Exception as error:  # noqa: BLE001 (whoever asks for the outcome gets it)
+    except Exception as error:  # noqa: BLE001 (the caller of `result` gets it)
         outcome.set_exception(error)
     else:
         outcome.set_result(None)
@@ -77,9 +77,9 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> None:
 
 @dataclass(kw_only=True)
 class Commits:
-    """Commits of the centre, one at a time, and what is wrong with them.
+    """Commits of the centre, one at a time, and their fault.
 
-    `alarm`: why the store does not take the state; nothing is granted meanwhile, and stops go out all the same.
+    `alarm`: why the store rejects the state; nothing is granted meanwhile, but stops are sent.
     """
 
     writer: Writer = field(default_factory=DirectWriter)
@@ -88,7 +88,7 @@ class Commits:
     _failed_s: float = float("-inf")
 
     def may_begin(self, now_s: float) -> bool:
-        """Return whether a commit may begin: none is under way, and none failed just before."""
+        """Return whether a commit may begin: none is in progress, and none has just failed."""
         return self._open is None and now_s - self._failed_s >= RETRY_S
 
     def begin(self, work: Callable[[], None], then: Callable[[], None], now_s: float) -> None:
@@ -96,7 +96,7 @@ class Commits:
         self._open = self.writer.submit(work), then, now_s
 
     def settle(self, now_s: float) -> None:
-        """Take the outcome of a commit that is done; raise what is no failure of the database."""
+        """Process the outcome of a completed commit; raise errors that are not failures of the database."""
         if self._open is None:
             return
         outcome, then, begun_s = self._open

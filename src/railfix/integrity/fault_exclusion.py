@@ -39,8 +39,8 @@ class RaimResult:
     scale: Floats  #: Noise scale that the residuals are compared with, from earlier epochs; shape (T,).
     excluded: Masks  #: Shape (T, K).
     own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
-    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN where
-    #: there is no position, where a fault is left in it, or where the level or RAIM is off; shape (T,).
+    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN without
+    #: a position, where a fault remains in it, or where the level or RAIM is off; shape (T,).
     protection_level_m: Floats
 
     @property
@@ -82,9 +82,9 @@ def exclude_faults(
 
     The sum of squared residuals is tested against chi-square (P4, false alarm 1e-3), or against 100 m^2 (P1 table 6,
     mode "fixed"). Every satellite, then every pair is left out; a set is excluded where the rest passes and each of its
-    own errors is over the limit. Of two satellites that disagree with the rest, the rest can be the faulty ones: a pair
-    of which the robust fit of the epoch keeps a range is not believed. Where a fault stays unresolved, the position is
-    that of the ranges that the robust fit keeps (`RaimResult.faulty`).
+    own errors is over the limit. If two satellites disagree with the rest, the rest can be the faulty ones: a pair is
+    not excluded if the epoch's robust fit keeps a range of it. Where a fault stays unresolved, the position is that of
+    the ranges that the robust fit keeps (`RaimResult.faulty`).
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices 
 
 
 def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
-    """Exclude the ranges that the robust fit rejects where no exclusion is believed."""
+    """Exclude the ranges that the robust fit rejects where no exclusion is accepted."""
     pair = raim.outcome[failing] == Outcome.EXCLUDED_TWO
     contradicted = pair & (raim.excluded[failing] & agreeing[failing]).any(axis=1)
     unresolved = contradicted | (raim.outcome[failing] == Outcome.UNRESOLVED)
@@ -179,6 +179,6 @@ def _second_attempt(
 
 
 def add_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, *, limits: RaimLimits) -> RaimResult:
-    """Return the RAIM result with P4's protection level, where no fault is left in the position."""
+    """Return the RAIM result with P4's protection level, where the position contains no fault."""
     level = reliability(model, limits=limits, scale=scale).protection_level_m
     return replace(raim, protection_level_m=np.where(raim.faulty, np.nan, level))

@@ -24,11 +24,11 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
 _BINS: Final = 100  #: Bins of an axis, up to twice the alarm limit.
-_GAP: Final = 1.5  #: Epochs whose distance is over this many usual intervals stand across a gap.
+_GAP: Final = 1.5  #: Epochs farther apart than this many usual intervals are separated by a gap.
 
 
 class Region(IntEnum):
-    """Where an epoch lies in the diagram."""
+    """Region of an epoch in the diagram."""
 
     NO_POSITION = 0
     NOMINAL = 1
@@ -41,7 +41,7 @@ class Region(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Continuity:
-    """Does what is available stay so? Windows that start at an available epoch."""
+    """Probability that an available epoch stays available? Windows that start at an available epoch."""
 
     window_s: float
     windows: int  #: Windows that the run covers to their end.
@@ -63,7 +63,7 @@ class Stanford:
     #: seconds, so that a block is worth an epoch of statistics.
     blocks: int
     misleading_blocks: int
-    #: Of the bins of error and level alike; the upper edge of the last one is infinite; shape (N + 1,).
+    #: Edges of the bins of error and level; the upper edge of the last one is infinite; shape (N + 1,).
     edges_m: Floats
     histogram: Integers  #: Epochs by bin of the absolute error (axis 0) and of the level (axis 1), shape (N, N).
 
@@ -84,9 +84,9 @@ def stanford(
     time : ndarray of datetime64, shape (T,)
         Ascending; every epoch of the run, with a position or without.
     error_m : array_like, shape (T,) [m]
-        Along the track, signed or not; NaN where there is no position or no reference.
+        Along the track, signed or not; NaN without a position or no reference.
     level_m : array_like, shape (T,) [m]
-        Infinite where no error can be excluded, NaN where there is no position. An error without a level counts as one
+        Infinite where no error can be excluded, NaN without a position. An error without a level counts as one
         with an infinite level.
     windows_s : sequence of float [s]
         Lengths of the windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next.

@@ -16,8 +16,8 @@ from railfix.gnss.observations import Observations, first_problems, stack_parts
 
 DUPLICATES: Final = "duplicate epochs"
 OUT_OF_ORDER: Final = "epochs out of order"
-#: An epoch that at most this many epochs with other tags have passed is put into its place; one that more have passed
-#: has a wrong time tag.
+#: An epoch that at most this many epochs with other tags have passed is sorted in; one passed by more has a wrong time
+#: tag.
 MOST_PASSED: Final = 20
 _HELD: Final = 2 * MOST_PASSED  #: Epochs that wait for later ones.
 #: A single tag that is farther than this from both neighbours, which follow each other, is wrong.
@@ -27,7 +27,7 @@ _ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_l
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """Consecutive epochs of a file in the order in which they stand there, and the line of each (0: no text)."""
+    """Consecutive epochs of a file in file order, and the line of each (0: no text)."""
 
     path: str
     epochs: Observations
@@ -35,7 +35,7 @@ class Run:
 
 
 class EpochOrder:
-    """Puts the epochs of one log into order, run by run; equal input cut otherwise gives the same."""
+    """Sorts the epochs of one log, run by run; the result does not depend on how the input is cut."""
 
     def __init__(self, broken_lines: BrokenLines) -> None:
         self._broken_lines = broken_lines
@@ -64,7 +64,7 @@ class EpochOrder:
         yield self._summary()
 
     def _rises(self) -> bool:
-        """Return whether all epochs that are held follow each other and those that were handed on."""
+        """Return whether all waiting epochs follow each other and the epochs already returned."""
         last = [self._times[-1][-1:]] if self._times else []
         time = np.concatenate([*last, *(run.epochs.time for run in self._held), np.empty(0, "datetime64[ns]")])
         return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
@@ -81,7 +81,7 @@ class EpochOrder:
         return part
 
     def _sort(self, *, final: bool) -> Observations:
-        """Sort and judge what is held; return what no later epoch can precede, and hold the rest."""
+        """Sort and check the waiting epochs; return those that no later epoch can precede, and keep the rest."""
         joined = stack_parts([run.epochs for run in self._held])
         line = np.concatenate([run.line for run in self._held])
         path = np.repeat([run.path for run in self._held], [len(run.epochs) for run in self._held])
@@ -122,7 +122,7 @@ class EpochOrder:
         return self._times[-1][-1] if self._times else np.datetime64(np.iinfo(np.int64).min + 1, "ns")
 
     def _handed_on(self, time: Datetimes) -> Masks:
-        """Return whether an epoch with the same tag was handed on before."""
+        """Return whether an epoch with the same tag was returned before."""
         if not self._times:
             return np.zeros(len(time), dtype=np.bool_)
         self._times = [np.concatenate(self._times)]
@@ -139,7 +139,10 @@ class EpochOrder:
 
     def _reject(self, rows: Indices, time: Datetimes, path: np.ndarray, line: Integers) -> None:
         for row in rows.tolist():
-            what = f"the time tag {str(time[row])[:23]} stands more than {MOST_PASSED} epochs or an hour from its place"
+            what = (
+                f"the time tag {str(time[row])[:23]} is out of order by more than {MOST_PASSED} epochs or an hour "
+                f"from its place"
+            )
             if self._broken_lines == "stop":
                 raise InputFileError(str(path[row]), f"{what}; {LENIENT}", line=int(line[row]) or None)
             self._found.append(f"{_where(str(path[row]), int(line[row]))}: {what}; the epoch was skipped")
@@ -194,7 +197,7 @@ def _passed(time: Datetimes) -> tuple[Integers, Integers]:
 
 
 def _is_repeated(time: Datetimes) -> Masks:
-    """Return whether a tag stands earlier in the array."""
+    """Return whether a tag occurs earlier in the array."""
     repeated = np.ones(len(time), dtype=np.bool_)
     repeated[np.unique(time, return_index=True)[1]] = False
     return repeated
@@ -209,7 +212,7 @@ def _is_lone(time: Datetimes) -> Masks:
 
 
 def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
-    """Return epochs in an order, those repeated filled into the first of the same tag."""
+    """Return epochs in an order; repeated ones are merged into the first of the same tag."""
     ordered = take_epochs(joined, order)
     if not repeated.any():
         return ordered

@@ -21,13 +21,13 @@ POSITIONS: Final[tuple[FileKind, ...]] = ("table", "rtklib", "nmea", "novatel", 
 #: Maps that GDAL reads, by their kind.
 GDAL: Final[tuple[FileKind, ...]] = ("gpkg", "shp", "fgb", "gml", "dxf", "pbf")
 MAPS: Final[tuple[FileKind, ...]] = ("table", "mate", "geojson", "kml", "gpx", "osm", "xml", "rdf", "ifc", *GDAL)
-#: Each kind in words, for messages, with the option that takes it.
+#: Each kind in words, for messages, with the option that accepts it.
 KIND_WORDS: Final[dict[FileKind, str]] = {
     "observations": "a RINEX observation file (--front, --rear)", "navigation": "a RINEX navigation file (--nav)",
     "rinex": "a RINEX file of clocks or meteorology", "sp3": "a file of precise orbits, SP3 (--sp3)",
     "sbas": "a log of SBAS messages (--sbas)", "receiver": "a receiver's log", "nmea": "an NMEA log",
     "novatel": "a NovAtel log", "rtklib": "a solution of RTKLIB (.pos)", "gpx": "a GPX file", "table": "a table",
-    "android": "a log of Android's GnssLogger, which writes a RINEX file beside it", "mate": "a table of EGNSS MATE",
+    "android": "a log of Android's GnssLogger, which also writes a RINEX file", "mate": "a table of EGNSS MATE",
     "geojson": "a JSON file", "kml": "a KML file", "osm": "a file of OpenStreetMap", "xml": "an XML file",
     "rdf": "an RDF file", "ifc": "an IFC file", "dxf": "a DXF file", "gml": "a GML file", "gpkg": "a GeoPackage",
     "shp": "a Shapefile", "fgb": "a FlatGeobuf file", "pbf": "a file of OpenStreetMap (.pbf)", "toml": "a TOML file",

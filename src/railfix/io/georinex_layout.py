@@ -1,6 +1,6 @@
-"""Observations and navigation records in the xarray layout of georinex, both ways.
+"""Observations and navigation records in the xarray layout of georinex, in both directions.
 
-A second record of a satellite at the same time (Galileo I/NAV beside F/NAV) is named "E01_1".
+A second record of a satellite at the same time (Galileo I/NAV and F/NAV) is named "E01_1".
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _NAMES: Final = {
     **{letter: [other.get(name, name) for name in _KEPLER.split()] for letter, other in _OTHER_NAMES.items()},
     "R": _GLONASS,
 }
-#: Numbers that RINEX writes in kilometres and georinex holds in metres.
+#: Numbers in kilometres in RINEX and in metres in georinex.
 _KILOMETRES: Final = frozenset("X dX dX2 Y dY dY2 Z dZ dZ2".split())
 _KLOBUCHAR: Final = {"G": "ionospheric_corr_GPS", "C": "ionospheric_corr_BDS", "J": "ionospheric_corr_QZS"}
 _UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.

@@ -79,7 +79,7 @@ def read_observations(
 def _by_georinex(
     paths: list[str], systems: list[str] | None, start: np.datetime64 | None, end: np.datetime64 | None
 ) -> list[Observations]:
-    """Read RINEX files by georinex, one after the other in order of time."""
+    """Read RINEX files by georinex in order of time."""
     import georinex
 
     from railfix.io.georinex_layout import observations_from_xarray
@@ -106,7 +106,7 @@ def _by_georinex(
 
 
 class _Selection(TypedDict, total=False):
-    """Arguments of `read_observations` that `scan_observations` takes as well."""
+    """Arguments that `read_observations` and `scan_observations` share."""
 
     broken_lines: BrokenLines
     systems: Iterable[str] | None
@@ -178,7 +178,7 @@ def _receiver_runs(
     limits: tuple[np.datetime64 | None, np.datetime64 | None, np.datetime64 | None],
     progress: Callable[[float], None] | None,
 ) -> Iterator[Observations]:
-    """Yield the blocks of all receiver logs in order of time, cut to constellations and times wanted."""
+    """Yield the blocks of all receiver logs in order of time, cut to the requested constellations and times."""
     from railfix.io.receiver.log import scan_receiver_log
 
     start, end, date = limits

@@ -74,7 +74,7 @@ _TEXTS: Final = ("SAT_ID", "SIGNAL_TYPE", "ANTENNA", "TRACK_EDGE_ID", "UTM_CELL"
 
 
 def mate_table(path: FilePath) -> str:
-    """Return which table of EGNSS MATE a file is by its name, blank where it is none: ``s_imu.parquet`` is S_IMU."""
+    """Return the EGNSS MATE table of a file by its name, blank if it is none: ``s_imu.parquet`` is S_IMU."""
     name, _, kind = Path(path).name.partition(".")
     return name.upper() if name.upper() in READ and kind.lower() in ("parquet", "csv", "csv.gz") else ""
 
@@ -140,7 +140,7 @@ def signal_code(satellite: str | None, signal: str) -> str:
 
 
 def read_mate_observations(path: str) -> Observations:
-    """Read the observations of one antenna: of several devices or antennas the one with the most rows."""
+    """Read the observations of one antenna: of several devices or antennas, the one with the most rows."""
     table = read_mate(path, _NEEDED).with_columns(
         pl.col("SAT_ID").cast(pl.String), pl.col("SIGNAL_TYPE").cast(pl.String)
     )
@@ -178,7 +178,7 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
 def _as_arrays(
     table: pl.DataFrame, time_ns: np.ndarray, problems: tuple[str, ...], skipped: Counter[str]
 ) -> Observations:
-    """Return the arrays of epochs by channels; of two rows of one signal at one epoch the last."""
+    """Return the arrays of epochs by channels; of two rows of one signal at one epoch the last counts."""
     times, row = np.unique(time_ns, return_inverse=True)
     names = table["SAT_ID"] + table["code"]
     channels, column = np.unique(names.to_numpy().astype(np.str_), return_inverse=True)
@@ -188,7 +188,7 @@ def _as_arrays(
         values[name][row, column] = table[source].cast(pl.Float64).fill_null(np.nan).to_numpy()
     time = times.astype("datetime64[ns]")
     lock = values.pop("lock_s")
-    # the lock time rises with the time, whole seconds, while the phase goes on
+    # the lock time rises with the time, whole seconds, while the phase is continuous
     lost = np.zeros(lock.shape, dtype=np.uint8)
     lost[1:] = lock[1:] < np.fmin(lock[:-1], lock[:-1] + seconds(np.diff(time))[:, None] - 1.0 + 1e-6)
     return Observations(

@@ -16,7 +16,7 @@ from railfix.core.files import FilePath, read_text
 
 _BLOCK: Final = 4096  #: Rows that are read before they become compact.
 _SEPARATORS: Final = (";", "\t", "|")  #: Separators of columns other than the comma.
-#: Usual names of columns of positions and maps, without case, blanks and underscores, by that of railfix. A height
+#: Usual names of columns of positions and maps, without case, blanks and underscores, by railfix name. A height
 #: without its unit is in metres.
 _USUAL: Final[dict[str, tuple[str, ...]]] = {
     "latitude_deg": ("lat", "latitude", "latdeg", "latitudedegrees", "gpslatitude"),
@@ -45,7 +45,7 @@ class NamedColumns:
     line: Integers  #: Shape (n,).
     cells: dict[str, pl.Series]  #: Cells of each column, stripped.
     separator: str = ","  #: Between the columns; numbers may have decimal commas where it is another.
-    #: Names in the file of columns that have got those of railfix (`with_usual_names`).
+    #: Original names of columns that were renamed to those of railfix (`with_usual_names`).
     usual: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -128,7 +128,7 @@ def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
 def read_named_columns(path: FilePath) -> NamedColumns:
     """Read a table with a header line of column names, separated by commas, semicolons, tabs or bars.
 
-    InputFileError: it is none.
+    InputFileError: not a table of this kind.
     """
     return parse_named_columns(read_text(path).splitlines(), path)
 
@@ -188,7 +188,7 @@ def _compact(rows: list[list[str]], width: int) -> pl.DataFrame:
 
 def _check_header(path: FilePath, header: list[str], line: int) -> None:
     if not header:
-        raise InputFileError(path, "there is no header line with the names of the columns")
+        raise InputFileError(path, "no header line with the names of the columns was found")
     if not any(fails(float, cell) for cell in header):
         raise InputFileError(path, "numbers where a header line with the names of the columns was expected", line=line)
     repeated = sorted({name for name in header if header.count(name) > 1})

@@ -20,7 +20,7 @@ from railfix.core.timescale import SECONDS_PER_DAY, timedelta, utc_to_gpst
 from railfix.gnss.observations import first_problems
 from railfix.io.position_log import PositionLog
 
-#: Counts of what is read or skipped without being broken.
+#: Counts of items that are read or skipped without being broken.
 _OTHER_LINES, _UNCHECKED = (
     "lines skipped that are no sentence of NMEA 0183",
     "sentences without checksum",
@@ -69,7 +69,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     -------
     PositionLog
         Times in GPS time; qualities as RTKLIB numbers them (`QUALITY`), 1 a fix. A fix without height or geoid
-        separation has no `ecef_m`, but a place in plan.
+        separation has no `ecef_m`, but a position in plan.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> li
             return []
         there = f"{height:.0f} m (EGM96)"
     return [
-        f"{path}: the geoid separation is 0 in every fix, the geoid lies {there} from the ellipsoid: the heights are "
+        f"{path}: the geoid separation is 0 in every fix, but the geoid is {there} from the ellipsoid: the heights are "
         "taken as ellipsoidal, and are wrong by that if the receiver wrote heights above sea level"
     ]
 

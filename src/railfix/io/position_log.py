@@ -26,7 +26,7 @@ CSV_COLUMNS: Final = (
 )  # fmt: skip
 #: Further columns of a table of positions, which `PositionLog.table` keeps.
 OTHER_COLUMNS: Final = ("antenna", "chainage_m", "speed_mps", "sigma_m", "source", "environment")
-#: Largest Unix time that is taken for seconds, in 2100.
+#: Largest Unix time that is interpreted as seconds, in 2100.
 _LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
@@ -68,7 +68,7 @@ class PositionLog:
         return bool((self.quality >= 0).any())
 
 
-#: Broken lines of a log after which it is none.
+#: Number of broken lines after which a file is not accepted as a log.
 _MOST_BROKEN: Final = 200
 Parsed = TypeVar("Parsed")
 
@@ -78,8 +78,8 @@ def skip_broken(
 ) -> tuple[Parsed, tuple[str, ...]]:
     """Parse the lines of a log; return the result, and a note on each line that was skipped.
 
-    With "count" every broken line below the first is skipped, else a last line alone that has no end, as a power cut
-    leaves it. InputFileError: a line is broken, and the message names the option that skips it.
+    With "count" every broken line below the first is skipped, otherwise only an incomplete last line, as after a power
+    cut. InputFileError: a line is broken, and the message names the option that skips it.
     """
     text = read_text(path)
     lines = text.splitlines()
@@ -161,7 +161,7 @@ def qualities_in_words(log: PositionLog) -> str:
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return the names of columns in railfix and in the file, of ``NAME=COLUMN`` texts; else SettingsError."""
+    """Return the names of columns in railfix and in the file, of ``NAME=COLUMN`` texts; otherwise SettingsError."""
     columns: dict[str, str] = {}
     for pair in pairs:
         ours, equals, theirs = pair.partition("=")

@@ -1,7 +1,7 @@
 """Write positions of a run as KML, GPX, GeoJSON, GeoPackage or GeoParquet, with a style for QGIS.
 
 Templates write KML and GPX, because pyogrio gives KML no styles and GPX no description; polars writes GeoParquet, which
-the wheels of pyogrio cannot. Every file is made in memory, because GDAL does not always report a full disk.
+the wheels of pyogrio cannot. Every file is built in memory, because GDAL does not always report a full disk.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ATTRIBUTES: Final = (
     "protection_level_ground_m", "protection_status", "speed_mps", "track", "track_chainage_m", "track_probability",
 )  # fmt: skip
 COORDINATES: Final = ("longitude_deg", "latitude_deg", "height_m")
-#: Colour of each status that has coordinates, by what it says of the position; "other" is that of any further status.
+#: Colour of each status with coordinates, by its reliability; "other" is that of any further status.
 STATUS_COLOURS: Final[Mapping[str, str]] = {
     "ok": "#00805e",
     "tracking": "#00805e",
@@ -43,6 +43,7 @@ STATUS_COLOURS: Final[Mapping[str, str]] = {
     "lost": "#d55e00",
     "off_map": "#a3487e",
     "map_offset": "#a3487e",
+    "map_end": "#e69f00",
     "jamming_suspected": "#e69f00",
     "spoofing_suspected": "#d55e00",
     "other": "#767676",
@@ -61,7 +62,7 @@ def style_file(path: Path) -> Path | None:
 
 
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates in the format of the ending, with style; NoPositionError: there is none."""
+    """Write the rows with coordinates in the format of the ending, with style; NoPositionError: no position exists."""
     points = _points(rows)
     if points.is_empty():
         raise NoPositionError(f"{path}: no epoch has a position; nothing was written")

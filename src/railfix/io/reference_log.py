@@ -90,7 +90,7 @@ def read_reference(
     Returns
     -------
     dict of str to AntennaReference
-        Of rows with the same time the first is used. ``source`` is that of the file; else "truth" for files of the
+        Of rows with the same time the first is used. ``source`` is that of the file; otherwise "truth" for files of the
         simulator, "rtk" for position logs.
 
     Raises
@@ -177,7 +177,7 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
 
 _ISO: Final = "%Y-%m-%dT%H:%M:%S%.9f"  #: Format of times.
 
-LONGEST_STEP_S = 1.0  #: Rows further apart than this are a gap, within which values are unknown [s].
+LONGEST_STEP_S = 1.0  #: Rows farther apart than this are a gap, within which values are unknown [s].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,8 +256,8 @@ def read_acceleration(path: FilePath) -> Acceleration:
     """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
 
     ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
-    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is that of the motion.
-    InputFileError: none or several of the columns, or times that do not rise.
+    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the acceleration of the
+    motion. InputFileError: none or several of the columns, or times that do not rise.
     """
     table = _sensor_table(path)
     kinds = {

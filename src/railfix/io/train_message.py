@@ -23,11 +23,11 @@ Signed = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
 
 
 class MessageStatus(IntEnum):
-    """What the position of a message is worth."""
+    """Reliability of a message's position."""
 
     POSITION = 0  #: Position with every check passed.
     COASTING = 1  #: Position carried by sensors alone.
-    DOUBTFUL = 2  #: Position with a failed check, or several tracks or places possible.
+    DOUBTFUL = 2  #: Position with a failed check, or several possible tracks or positions.
     NO_POSITION = 3  #: Observations, but no position.
     NO_INPUT = 4  #: Nothing received in this period.
     #: Satellite positioning is suspended by order of the ground side; railfix itself sends no such message.
@@ -35,7 +35,7 @@ class MessageStatus(IntEnum):
 
 
 class Source(IntFlag):
-    """What a position rests on."""
+    """Source of a position."""
 
     FRONT_RECEIVER = 1
     REAR_RECEIVER = 2
@@ -59,10 +59,10 @@ class SuspectedInterference(IntEnum):
 
 
 class Unknown(IntFlag):
-    """What a message cannot say of the train."""
+    """Unknown properties of the train."""
 
     FACING = 1  #: The direction in which the front end looks: `over_cm` and `under_cm` cover both.
-    FRONT_END = 2  #: Where the front end is: `chainage_cm` is that of the reference point, an antenna or its vehicle.
+    FRONT_END = 2  #: Where the front end is: `chainage_cm` refers to the reference point, an antenna or its vehicle.
     LENGTH = 4  #: The train's length.
 
 
@@ -91,16 +91,16 @@ class TrainMessage(Settings):
     track_permille: Annotated[int, Field(ge=0, le=1000)] | None = None
     length_cm: Unsigned = 0  #: Train length.
     complete: bool = False  #: Train integrity confirmed.
-    sigma_cm: Unsigned | None = None  #: Standard deviation of the place along the line, rounded up.
+    sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
     #: Number of the newest authority that the train has taken: its acknowledgement to the ground side.
     authority: Unsigned | None = None
-    authority_end_cm: Signed | None = None  #: Where the authority ends that the train holds, rounded away from it.
+    authority_end_cm: Signed | None = None  #: End of the authority that the train has, rounded away from it.
     interference: SuspectedInterference | None = None  #: None from trains that do not look for it.
-    #: Safe front and rear end: no part of the train is ahead of the one or behind the other, as `facing` looks. None
-    #: without bounds, or where the end or the direction is unknown.
+    #: Safe front and rear end: no part of the train is ahead of the first or behind the second, in the direction of
+    #: `facing`. None without bounds, or where the end or the direction is unknown.
     safe_front_cm: Signed | None = None
     safe_rear_cm: Signed | None = None
-    unknown: Unknown = Unknown(0)  #: What the sender does not know of the train.
+    unknown: Unknown = Unknown(0)  #: Properties of the train unknown to the sender.
     #: Start of the train's unit, a number drawn at random: `sequence` begins again with each.
     session: Annotated[int, Field(ge=0, lt=1 << 62)] | None = None
     brake_order: Unsigned | None = None  #: Number of the order to brake that the train obeys, None without one.
@@ -138,7 +138,7 @@ def encode(message: TrainMessage) -> bytes:
 
 
 def decode(data: bytes) -> TrainMessage:
-    """Decode CBOR, skipping unknown keys; MessageError where it is no message of this version."""
+    """Decode CBOR, skipping unknown keys; MessageError where it is not a message of this version."""
     import cbor2
 
     if len(data) > LONGEST:

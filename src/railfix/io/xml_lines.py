@@ -21,13 +21,13 @@ class XmlLine:
 
     fields: dict[str, str]  #: ``name``, blank where the file has none, and ``ExtendedData`` of KML.
     points: Floats  #: Longitude, latitude [deg], height as the file has it [m], NaN without one; shape (n, 3).
-    geoid_m: Floats  #: ``geoidheight`` of GPX, NaN where there is none; shape (n,).
-    time: tuple[str, ...]  #: UTC as the file has it, blank where there is none.
+    geoid_m: Floats  #: ``geoidheight`` of GPX, NaN where missing; shape (n,).
+    time: tuple[str, ...]  #: UTC as in the file, blank where missing.
 
 
 def read_root(path: FilePath) -> Element:
-    """Return the root of an XML file; InputFileError where it is none."""
-    content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros
+    """Return the root of an XML file; InputFileError where it is not such a file."""
+    content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros behind
     try:
         text: str | bytes = content.decode("utf-8")
     except UnicodeDecodeError:  # in the encoding that the file declares
@@ -49,7 +49,7 @@ def _texts(element: Element) -> dict[str, str]:
 
 
 def read_gpx_lines(path: FilePath) -> list[XmlLine]:
-    """Return the segments of tracks and the routes of a GPX file; InputFileError where a point has no place."""
+    """Return the segments of tracks and the routes of a GPX file; InputFileError where a point has no position."""
     lines = []
     for owner in read_root(path):
         if tag(owner) not in ("trk", "rte"):
@@ -70,9 +70,9 @@ def read_gpx_lines(path: FilePath) -> list[XmlLine]:
 
 
 def read_kml_lines(path: FilePath) -> list[XmlLine]:
-    """Return the lines and tracks of a KML file; heights that are clamped to the ground are none.
+    """Return the lines and tracks of a KML file; heights that are clamped to the ground are ignored.
 
-    InputFileError: a coordinate is no number, or heights are relative to the ground or the sea floor.
+    InputFileError: a coordinate is not a number, or heights are relative to the ground or the sea floor.
     """
     lines = []
     for mark in (element for element in read_root(path).iter() if tag(element) == "Placemark"):

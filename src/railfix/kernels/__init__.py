@@ -1,7 +1,7 @@
 """Compiled functions of arrays, with numba: the filter along the track, and the stages of single epochs.
 
-A module of this package is imported when one of its functions is first asked for (``kernels.ranges.misfits``): numba
-takes half a second to load. They see arrays and numbers alone, and import nothing of railfix but this package and
+A module of this package is imported at the first use of one of its functions (``kernels.ranges.misfits``): numba takes
+half a second to load. They operate on arrays and numbers only, and import nothing of railfix except this package and
 `railfix.core`. With ``NUMBA_DISABLE_JIT=1`` they are plain Python, for a debugger and for tests.
 """
 

@@ -1,8 +1,8 @@
 """Compilation with numba; the machine code is kept on disk.
 
-It is kept beside the source, or in the user's cache folder where that cannot be written, or in ``NUMBA_CACHE_DIR``.
-numba compiles a function again when its file changes, and does not look at the files of the functions that it calls:
-`_remove_outdated` does.
+It is stored in the folder of the source, or in the user's cache folder where that is not writable, or in
+``NUMBA_CACHE_DIR``. numba compiles a function again when its file changes, and does not check the files of the
+functions that it calls: `_remove_outdated` does.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def inner(function: Function) -> Function:
 
 @cache
 def _files(package: Path, module: str) -> set[Path]:
-    """Return the file of a module of this package, or of all of a room's, and those of all that it imports from it."""
+    """Return the file of a module of this package, or of all modules of a room, with those of all its imports."""
     path = package / f"{module.replace('.', '/')}.py"
     if not path.exists():
         return set(path.with_suffix("").glob("*.py"))

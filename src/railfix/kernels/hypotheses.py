@@ -1,4 +1,4 @@
-"""What each fault hypothesis does to the position."""
+"""Effect of each fault hypothesis on the position."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class _Tails(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """What one base of hypotheses needs: whether each channel belongs to it, and what is left without it.
+    """Inputs of one base of hypotheses: whether each channel belongs to it, and the remainder without it.
 
-    `others` has priors of the rest (n,), `removed` what the base takes with it (4,), `own` work space (n,).
-    By depth, for sets of channels left out one after the other: the system `reduced` (2, n + 4, n), what has been
-    `taken` (3, 4), whether nothing bounds a fault (`undetectable`), the next channel (`start`), where its sets are
-    written (`place`), and the product of the priors; shape (3,).
+    `others` has priors of the rest (n,), `removed` the effect of the base (4,), `own` work space (n,).
+    By depth, for sets of channels left out in sequence: the system `reduced` (2, n + 4, n), the part `taken` (3, 4),
+    whether nothing bounds a fault (`undetectable`), the next channel (`start`), where its sets are written (`place`),
+    and the product of the priors; shape (3,).
     """
 
     member: Masks
@@ -59,7 +59,7 @@ class _Work(NamedTuple):
 
 
 class _Sets(NamedTuple):
-    """Offset, sigma and separation over its threshold of sets of channels left out, written one after the other."""
+    """Offset, sigma and separation over its threshold of sets of left-out channels, written in sequence."""
 
     offset: Floats
     sigma: Floats
@@ -68,9 +68,10 @@ class _Sets(NamedTuple):
 
 @inner
 def _downdate(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, removed: Floats) -> bool:
-    """Leave out channels one after the other; return whether nothing bounds a fault of them.
+    """Leave out channels in sequence; return whether nothing bounds a fault of them.
 
-    `removed` becomes what they take with them; `work` the rows of what is left, for all channels where `every` says so.
+    `removed` becomes their effect; `work` has the rows of the remainder, for all channels if `every` is
+    set.
     """
     n, undetectable = rows.shape[1], False
     for i in range(n + 4):
@@ -109,57 +110,31 @@ def _with_each_later(
 ) -> None:
     """Write the sets of channel i and one after it, left out together from the system `rows`.
 
-    `removed` and `undetectable` are of what has been left out of it before.
+    `removed` and `undetectable` are those of the channels left out before.
     """
     n, own, limit = rows.shape[1], ranges.own, common[LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
-    share, of_first = rows[i, i], rows[n, i]
-    inverse = 1.0 / share if share > LEAST_REDUNDANCY else 0.0
-    weight = inverse * of_first
-    undetectable = undetectable or (inverse == 0.0 and abs(of_first) > limit)
-    square, distance = removed[0] + weight * of_first, removed[1] + weight * rows[n + 1, i]
-    across, up = removed[2] + weight * rows[n + 2, i], removed[3] + weight * rows[n + 3, i]
-    residual, map_across, map_up = rows[n + 1, i], rows[n + 2, i], rows[n + 3, i]
-    first, gains, residuals = rows[i, i + 1 :], rows[n, i + 1 :], rows[n + 1, i + 1 :]
-    of_across, of_up = rows[n + 2, i + 1 :], rows[n + 3, i + 1 :]
-    rests = own[: n - 1 - i]
-    for at in range(n - 1 - i):
-        rests[at] = rows[i + 1 + at, i + 1 + at]
-    lost = False
-    for at in range(n - 1 - i):
-        coupling = inverse * first[at]
-        of_gain = gains[at] - coupling * of_first
-        rest = rests[at] - coupling * first[at]
-        last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
-        lost |= not rest > LEAST_REDUNDANCY
-        offset[at], sigma[at], ratio[at] = separate(
-            square + last * of_gain,
-            distance + last * (residuals[at] - coupling * residual),
-            across + last * (of_across[at] - coupling * map_across),
-            up + last * (of_up[at] - coupling * map_up),
-            (0.0, 0.0, 0.0),
-            common,
-        )
-    if not (ranges.any or undetectable or lost):
-        return
+    first = rows[i, i] > LEAST_REDUNDANCY
+    inverse = 1.0 / rows[i, i] if first else 0.0
+    weight = inverse * rows[n, i]
+    undetectable = undetectable or (not first and abs(rows[n, i]) > limit)
+    with_first, taken, more = np.empty(4), np.empty(4), (0.0, 0.0, 0.0)
+    for c in range(4):
+        with_first[c] = removed[c] + weight * rows[n + c, i]
     for at in range(n - 1 - i):
         j = i + 1 + at
         coupling = inverse * rows[i, j]
-        of_gain = rows[n, j] - coupling * of_first
-        rest = rows[j, j] - coupling * rows[i, j]
-        last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
+        gain, rest = rows[n, j] - coupling * rows[n, i], rows[j, j] - coupling * rows[i, j]
+        checked = rest > LEAST_REDUNDANCY
+        last = gain / rest if checked else 0.0
+        for c in range(4):
+            taken[c] = with_first[c] + last * (rows[n + c, j] - coupling * rows[n + c, i])
         if ranges.any:
             for m in range(n):
                 own[m] = rows[n, m] - weight * rows[i, m] - last * (rows[j, m] - coupling * rows[i, m])
-            offset[at], sigma[at], ratio[at] = separate(
-                square + last * of_gain,
-                distance + last * (rows[n + 1, j] - coupling * residual),
-                across + last * (rows[n + 2, j] - coupling * map_across),
-                up + last * (rows[n + 3, j] - coupling * map_up),
-                of_ranges(own, ranges),
-                common,
-            )
-        if undetectable or (not rest > LEAST_REDUNDANCY and abs(of_gain) > limit):
+            more = of_ranges(own, ranges)
+        offset[at], sigma[at], ratio[at] = separate(taken[0], taken[1], taken[2], taken[3], more, common)
+        if undetectable or (not checked and abs(gain) > limit):
             offset[at], sigma[at], ratio[at] = 0.0, np.inf, 0.0
 
 
@@ -170,7 +145,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
     Returns
     -------
     channel : ndarray of int, shape (T, n)
-        Channels in use, side by side.
+        Channels in use, adjacent.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
         As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
     separation : ndarray, shape (T,)
@@ -267,7 +242,7 @@ def _write_one(
     common: Floats,
     tails: _Tails,
 ) -> None:
-    """Write a hypothesis by what it takes with it; without a bound where nothing shows it."""
+    """Write a hypothesis by its effect; unbounded where it is undetectable."""
     tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = separate(
         removed[0], removed[1], removed[2], removed[3], more, common
     )
@@ -299,7 +274,7 @@ def _write_singles(
 
 @inner
 def _write_together(t: int, order: int, system: System, ranges: RangeErrors, work: _Work, tails: _Tails) -> None:
-    """Write sets of two and more: all but the last channel are left out one after the other, `depth` so far."""
+    """Write sets of two and more: all but the last channel are left out in sequence, `depth` so far."""
     n, limit, depth = len(work.own), system.common[LIMIT], 0
     while depth >= 0:
         i = work.start[depth]

@@ -1,4 +1,4 @@
-"""The level at which Gaussian tails of many hypotheses together keep within a risk."""
+"""The level at which Gaussian tails of many hypotheses sum to a risk."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import inner, kernel
 
-#: Share of the level, up to which a step is exact to a millionth of it: the last one.
+#: Fraction of the level up to which a step is exact to a millionth of it: the last one.
 _CLOSE = 5e-4
 #: Steps at most; a level that they do not come close to stays at the lowest one found within the risk.
 _STEPS = 60
-#: From this step on every other one halves the bracket: steps between two points would go on for ever.
+#: From this step on every other one halves the bracket: steps between two points would continue for ever.
 _HALVING = 8
-#: Share of the risk that is left over.
+#: Fraction of the risk that remains unused.
 _AIM = 0.002
-#: Share of the largest part within which two hypotheses require the same level: the first is named.
+#: Fraction of the largest part within which two hypotheses require the same level: the first is named.
 _ALIKE = 1e-9
 #: Q(x) is the density at x over ``(1 - a) x + a sqrt(x^2 + b)`` to 0.3 %, x >= 0 (Borjesson and Sundberg 1979).
 _MILLS = (0.339, 5.510)
@@ -109,9 +109,9 @@ def solve_level(
 ) -> tuple[Floats, Codes, Floats, Floats, Indices]:
     """Find the level at which the tails of all hypotheses keep within the risk: ``weight Q((L - offset)/sigma)`` each.
 
-    What nothing bounds goes into the risk with its whole weight; the rest of it is for what is checked. The largest
-    part is a level within the risk, as the parts have shares of it. From there it is lowered as far as the sum of the
-    tails allows, to 0.998 of the risk.
+    Undetectable faults use the risk with their full weight; the rest of it is for checked ones. The largest
+    part is a level within the risk, as the risk is divided among the parts. From there it is lowered as far as the sum
+    of the tails allows, to 0.998 of the risk.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def solve_level(
     share : ndarray, shape (T, kinds)
         Risk that each kind may use.
     reserved : ndarray, shape (T,)
-        Risk taken off their sum beforehand.
+        Risk subtracted from their sum beforehand.
 
     Returns
     -------
@@ -166,7 +166,7 @@ def solve_level(
 def _require(
     offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
 ) -> tuple[float, float, float, int]:
-    """Return what is left of a kind's share of the risk, its k, the largest level required, and by which hypothesis."""
+    """Return the remainder of a kind's part of the risk, its k, the largest required level, and its hypothesis."""
     total, whole = 0.0, 0.0
     for m in range(len(prior)):
         total += checked[m]

@@ -1,4 +1,4 @@
-"""The equations of an epoch that fault hypotheses are taken from: channels, their projector, gains and residuals."""
+"""Equations of an epoch for fault hypotheses: channels, their projector, gains and residuals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from railfix.kernels.compiling import inner
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 _NO_EFFECT = 1e-6
-#: Separations below this share of sigma are none.
+#: Separations below this fraction of sigma count as zero.
 _SAME = 1e-9
 #: Entries of `System.common`: squared noise scale, variance of the distance, response of the position to the map
 #: across and up, mean error of the map across and up, sigmas of the threshold, least threshold, 1 without the map,
@@ -21,9 +21,9 @@ _NOISE, _VARIANCE, _MAP_ACROSS, _MAP_UP, _BIAS_ACROSS, _BIAS_UP, _K, _LEAST, _FR
 
 
 class Channels(NamedTuple):
-    """The channels of an epoch side by side, those in use first; zero for others. Shape (n,) each."""
+    """The channels of an epoch adjacent, those in use first; zero for others. Shape (n,) each."""
 
-    number: Indices  #: Of the channel in the model.
+    number: Indices  #: Index of the channel in the model.
     root: Floats  #: Root of its weight [1/m].
     clock: Indices
     along: Floats  #: Whitened design.
@@ -32,14 +32,14 @@ class Channels(NamedTuple):
     prior: Floats  #: Of a fault.
     bias: Floats  #: Mean error, whitened.
     beyond: Floats  #: Variance beyond the noise, whitened.
-    shared: Floats  #: What two channels share by their clocks; shape (n, n).
+    shared: Floats  #: Common part of two channels by their clocks; shape (n, n).
 
 
 class System(NamedTuple):
     """The equations of an epoch.
 
     `rows`: the projector of the channels, and below it their gains, residuals, and responses to the map across and up;
-    shape (n + 4, n). `common`: what holds for all of them; shape (11,).
+    shape (n + 4, n). `common`: values for all of them; shape (11,).
     """
 
     rows: Floats
@@ -70,7 +70,7 @@ class RangeErrors(NamedTuple):
 
 @inner
 def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
-    """Return what the gains of single ranges add to bias, variance of the distance, and variance."""
+    """Return the contributions of the gains of single ranges to bias, variance of the distance, and variance."""
     bias, apart, total = 0.0, 0.0, 0.0
     for m in range(len(left)):
         bias += abs(left[m]) * ranges.bias[m]
@@ -83,7 +83,7 @@ def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
 def separate(
     square: float, distance: float, across: float, up: float, more: tuple[float, float, float], common: Floats
 ) -> tuple[float, float, float]:
-    """Return offset, sigma, and the distance over its threshold, of what a set takes with it."""
+    """Return offset, sigma, and the distance over its threshold, of a set by its effect."""
     noise, whole_across, whole_up = common[_NOISE], across + common[_MAP_ACROSS], up + common[_MAP_UP]
     apart = noise * square + (1.0 - noise) * (across * across + up * up)
     whole = whole_across * whole_across + whole_up * whole_up
@@ -113,7 +113,7 @@ def new_fit(clocks: int) -> _Fit:
 
 @inner
 def choose_channels(root: Floats, number: Indices) -> None:
-    """Write the numbers of the channels in use, then those of others."""
+    """Write the indices of the used channels, then those of the others."""
     at = 0
     for m in range(len(root)):
         if root[m] > 0.0:
@@ -127,7 +127,7 @@ def choose_channels(root: Floats, number: Indices) -> None:
 
 @inner
 def write_channels(model: Any, errors: Any, prior: Floats, t: int, channels: Channels) -> None:
-    """Write the channels of an epoch side by side."""
+    """Write the channels of an epoch adjacent."""
     n = len(channels.number)
     for i in range(n):
         m = channels.number[i]
@@ -222,7 +222,7 @@ def write_without_map(
 ) -> bool:
     """Write the equations without the map, and return whether they determine a position.
 
-    Its distance from the position with the map counts whole, and nothing is tested.
+    Its distance from the position with the map counts in full, without a test.
     """
     n, rows, common = len(channels.root), system.rows, system.common
     information, variance = errors.map_information[t], errors.scale[t] ** 2
@@ -246,7 +246,7 @@ def write_without_map(
 
 @inner
 def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: float) -> tuple[Floats, bool]:
-    """Return the covariance of the place with other information in place of the map, and whether there is one."""
+    """Return the covariance of the position with other information instead of the map, and whether it exists."""
     normal, regular = _inverse(covariance)
     for a in range(3):
         for b in range(3):

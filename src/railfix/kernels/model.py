@@ -1,4 +1,4 @@
-"""Ranges linearised at a place, whitened, clocks taken out; their residuals."""
+"""Ranges linearised at a position, whitened, clocks eliminated; their residuals."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from railfix.kernels.sight import sight
 
 @inner
 def _write_clock_covariance(totals: Floats, tie_sigma_m: Floats, rho: Floats, covariance: Floats) -> None:
-    """Write the covariance of the clocks of one epoch at a known place, shape (G, G).
+    """Write the covariance of the clocks of one epoch at a known position, shape (G, G).
 
-    Of a clock on its own 1/T, T the summed weight of its satellites. Clocks that keep an offset to a common one to
+    For a separate clock 1/T, T the summed weight of its satellites. Clocks that keep an offset to a common one to
     sigma: ``diag(sigma^2 rho) + rho rho^T / sum(T rho)``, ``rho = 1/(1 + sigma^2 T)``. 0 for clocks without satellites.
     """
     groups, mass = len(totals), 0.0
@@ -97,7 +97,7 @@ def linearise_ranges(
                     rows[m, i] = -(u0 * axes[t, i, 0] + u1 * axes[t, i, 1] + u2 * axes[t, i, 2])
                     sums[i, g] += w * rows[m, i]
             total += totals[g]
-        # A constant common to all ranges is no residual; subtracting it keeps the digits of the sums.
+        # A constant common to all ranges is no residual; subtracting it preserves digits of the sums.
         common = common / total if total > 0.0 else 0.0
         _write_clock_covariance(totals, sigma_m[t] if tied else no, rho, clocks[t])
         for i in range(3):
@@ -130,7 +130,9 @@ def linearise_ranges(
 
 @kernel
 def residuals(model: Any) -> tuple[Floats, Floats, Floats]:
-    """Compute what the best fit leaves of the misfits of `ModelArrays`: step, residual, redundancy of `LinearModel`."""
+    """Compute the remainder of the misfits of `ModelArrays` after the best fit: step, residual, redundancy of
+    `LinearModel`.
+    """
     root_weight, clock, clock_covariance_m2, design, covariance_m2, _, misfit = model
     epochs, channels = root_weight.shape
     groups = clock_covariance_m2.shape[1]

@@ -1,4 +1,4 @@
-"""Risk of places of a line off its tangent."""
+"""Risk of positions on a line off its tangent."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 @inner
 def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
-    """Return the tail of the form that is ``1 - tau`` times that of all at least."""
+    """Return the tail of the form that is at least ``1 - tau`` times that of all channels."""
     if not tau < 1.0:
         return 1.0
     form = (start + math.sqrt(max(tau, 0.0)) * misfit) ** 2 / (1.0 - tau)
@@ -41,7 +41,8 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
 
 @inner
 def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, float]:
-    """Return the place at which a form is lowest, the diagonal of the cofactors of its matrix, 1 over the determinant.
+    """Return the position at which a form is lowest, the diagonal of the cofactors of its matrix, 1 over the
+    determinant.
 
     Forms are `constant`, `slope` (3), and the matrix by its elements xx, xy, xz, yy, yz, zz. The last number is 0 where
     the matrix is singular.
@@ -75,7 +76,7 @@ def _compute_tail(form: Floats, clear_m: float) -> float:
 
 
 class _Residuals(NamedTuple):
-    """Residuals of the channels in use, their projector, and their change with the place."""
+    """Residuals of the used channels, their projector, and their change with the position."""
 
     projector: Floats  # (M, M)
     residual: Floats  # (M,)
@@ -141,7 +142,7 @@ def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> Non
 
 @inner
 def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, form: Floats) -> bool:
-    """Write the form without the channels of a side, left out one after the other; return whether it has two."""
+    """Write the form without the channels of a side, left out in sequence; return whether it has two."""
     projector, residual, rows, _, _ = residuals
     n, count = len(used), 0
     member, work = np.empty(n, dtype=np.intp), np.empty((n, n + 4))
@@ -198,7 +199,7 @@ def _whiten(
             asked[clock[m]] += roots[n] * misfit[t, m]
             x, y, z = x + misfit[t, m] * along[n], y + misfit[t, m] * across[n], z + misfit[t, m] * up[n]
             n += 1
-    # The map error alike in all horizontal directions, and the place that the residuals then imply.
+    # Map error, equal in all horizontal directions, and the position implied by the residuals.
     normal = _inverse(covariance_m2[t])
     of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
     of_map[2] = (noise / sigma_m[1]) ** 2
@@ -247,10 +248,10 @@ def risk_off_tangent(
     sigma_m: tuple[float, float],
     enough: float,
 ) -> Floats:
-    """Return an upper bound of the probability that the true place lies off the tangent beyond a distance.
+    """Return an upper bound of the probability that the true position lies off the tangent beyond a distance.
 
-    At a distance D along and across a form exceeds its value at the position by ``(D - |c|)^2 / trace(C) - c . s`` at
-    least: c its lowest place and C the inverse of its matrix, both along and across, and s its slope. Without the
+    At a distance D along and across, a form exceeds its value at the position by at least ``(D - |c|)^2 / trace(C) - c
+    . s``: c is its lowest point and C the inverse of its matrix, both along and across, and s its slope. Without the
     channels J the matrix is at least ``1 - tau`` times that of all, ``tau = trace(F_J C F_J^T S_JJ^-1)`` with their
     rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the others each subset has
     its own bound.
@@ -291,7 +292,7 @@ def risk_off_tangent(
             for b in range(a, 3):
                 matrix[a, b] = matrix[b, a] = every[at]
                 at += 1
-        # The largest tau of one channel and of two.
+        # Largest tau of one channel and of two.
         of_all = _inverse(matrix)
         spread, start, one, two = of_all[0, 0] + of_all[1, 1], 0.0, 0.0, 0.0
         for a in range(3):
@@ -402,7 +403,7 @@ def risk_beyond(
     length_m: Floats,
     beyond_m: Floats,
 ) -> Floats:
-    """Return the probability that the true place lies beyond a level off the tangent, over K hypotheses, shape (T,).
+    """Return the probability that the true position lies beyond a level off the tangent, over K hypotheses, shape (T,).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Pseudoranges at a place, clocks eliminated; positions from them."""
+"""Pseudoranges at a position, clocks eliminated; positions from them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Epoch(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """One epoch of what `reduced_equations` returns, and the weights of the groups."""
+    """Results of `reduced_equations` for one epoch, and the weights of the groups."""
 
     system: Floats
     means: Floats
@@ -37,7 +37,7 @@ class _Equations(NamedTuple):
 def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
     """Compute the normal equations of one epoch.
 
-    Loops without branches, over all channels, are done several channels at a time: unused ones have finite places.
+    Loops without branches over all channels are vectorised: unused ones have finite positions.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
     system, means, rows, totals, _ = equations
@@ -115,7 +115,7 @@ def _tie(epoch: _Epoch, equations: _Equations) -> None:
 
 @kernel
 def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats, Floats, Masks]:
-    """Compute the normal equations of place and residual with the clocks eliminated.
+    """Compute the normal equations of position and residual with the clocks eliminated.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
 
 @kernel
 def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
-    """Compute `fit` of arrays in C order, with a place for each of `epochs`."""
+    """Compute `fit` of arrays in C order, with a position for each of `epochs`."""
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     channels, groups = weight.shape[1], len(starts)
     tied = len(offset_m) == len(code_m)
@@ -197,7 +197,7 @@ def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
     """Clocks and residuals of one epoch after a step, to first order.
 
-    A step of 5 m leaves 0.03 mm (the gradient of the Earth's turning, which the design leaves out).
+    A step of 5 m leaves an error of 0.03 mm (the gradient of the Earth's rotation, which the design neglects).
     """
     for g in range(len(totals)):
         moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])
@@ -286,7 +286,7 @@ def iterate_points(
 
 @kernel
 def dilutions(ranges: Any, place_ecef_m: Floats) -> Floats:
-    """Return the position dilution of precision at places (T, 3), shape (T,); NaN where the geometry is singular."""
+    """Return the position dilution of precision at positions (T, 3), shape (T,); NaN where the geometry is singular."""
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
     groups, no, tied = len(starts), np.empty(0), len(offset_m) == epochs
@@ -319,7 +319,7 @@ def _along(
 ) -> tuple[float, float, float, float]:
     """Return the step, sigma, sigma of an exact map and least WSSE along a section, map error allowed for.
 
-    The Schur complement of the map error leaves what depends on the distance along the line alone.
+    The Schur complement of the map error leaves only the dependence on the distance along the line.
     """
     own, a, c = _form(system, tangent, tangent), _form(system, across, across), _form(system, up, up)
     to_plan, to_height, b = _form(system, tangent, across), _form(system, tangent, up), _form(system, across, up)

@@ -1,4 +1,4 @@
-"""Lines of a text, fields of observation lines, their places in arrays."""
+"""Lines of a text, fields of observation lines, their indices in arrays."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def decode_fields(
 def place_fields(
     kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
 ) -> tuple[Floats, Bytes]:
-    """Put fields in their places of the dense arrays, which are filled in place and returned; zeros are absent.
+    """Write fields into the dense arrays, which are filled in place and returned; zeros mean absent.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def place_fields(
 
 @kernel
 def line_ends(data: Bytes) -> Integers:
-    """Return the places of the line feeds in a text."""
+    """Return the offsets of the line feeds in a text."""
     ends, found = np.empty(1024, dtype=np.int64), 0
     for at in range(0, len(data), 8):
         if at + 8 <= len(data):

@@ -16,11 +16,11 @@ _LEAST_SCALE = 0.05
 
 
 class _Room(NamedTuple):
-    """Work space of an epoch: its channels in use side by side, those of clock g from ``begin[g]`` on.
+    """Work space of an epoch: its used channels adjacent, those of clock g from ``begin[g]`` on.
 
-    Of each channel (M,): its `channel` in the ranges, `base` weight and the `root` of it, unit vector to the satellite
+    For each channel (M,): its `channel` in the ranges, `base` weight and its `root`, unit vector to the satellite
     `sight` (3, M), `misfit`, robust `factor` of the weight, `white` residual, `order` by it, weight in the `row`s,
-    which are sights and misfits without the clock's mean (4, M). Of each clock (G,): the `total` weight, the `mean`
+    which are sights and misfits without the clock's mean (4, M). For each clock (G,): the `total` weight, the `mean`
     row (4, G), and of the ties its weight `mass` and its distance from the others, `apart` (4, G).
     """
 
@@ -113,7 +113,7 @@ def _new_room(channels: int, clocks: int) -> _Room:
 
 @inner
 def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
-    """Write the channels in use side by side, their sights and misfits, and return how many they are."""
+    """Write the channels in use adjacent, their sights and misfits, and return how many they are."""
     channels, clocks, count = ranges.weight.shape[1], len(ranges.starts), 0
     for g in range(clocks):
         room.begin[g], stop = count, ranges.starts[g + 1] if g + 1 < clocks else channels
@@ -156,7 +156,7 @@ def _sum_clocks(room: _Room) -> None:
 
 @inner
 def _sum_normal(count: int, room: _Room, normal: Floats, vector: Floats) -> None:
-    """Write the normal equations of the place, the clocks eliminated."""
+    """Write the normal equations of the position, the clocks eliminated."""
     for a in range(3):
         for b in range(a, 3):
             total = 0.0
@@ -171,7 +171,7 @@ def _sum_normal(count: int, room: _Room, normal: Floats, vector: Floats) -> None
 
 @inner
 def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, vector: Floats) -> None:
-    """Add what the known offsets between the clocks say of the place."""
+    """Add the information of the known clock offsets on the position."""
     clocks, whole = len(room.total), 0.0
     for g in range(clocks):
         room.mass[g] = 1.0 / (1.0 / room.total[g] + sigma_m[g] ** 2) if room.total[g] > 0.0 else 0.0
@@ -213,7 +213,7 @@ def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
 
 @inner
 def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
-    """Write the whitened residuals after the step of the place and of each clock; zero where there is none."""
+    """Write the whitened residuals after the step of the position and of each clock; zero without a step."""
     for g in range(len(room.total)):
         known = 1.0 if solved and room.total[g] > 0.0 else 0.0
         clock = room.mean[3, g]

@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
-#: A suspicion that there is none of: NaT as a number.
+#: Marks a condition without a suspicion: NaT as a number.
 NEVER = np.iinfo(np.int64).min
 _NS = 1_000_000_000
 
@@ -53,7 +53,7 @@ def suspicions(
             suspected = suspected and not math.isnan(value) and time_ns[t] <= start + hold_ns
             if suspected:
                 total += value
-                suspected = abs(total) > limit[t, m]  # the epoch of coming back is not judged again
+                suspected = abs(total) > limit[t, m]  # the epoch of return is not checked again
             elif abs(value) > limit[t, m]:
                 start, total, suspected = time_ns[t], value, True
             if suspected:
@@ -65,7 +65,7 @@ def suspicions(
 
 @kernel
 def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
-    """Return the median of the values (T, M) of each clock at its channels; NaN is left out.
+    """Return the median of the values (T, M) of each clock at its channels; NaN is ignored.
 
     NaN below `least` satellites with a finite value; clock and satellite of each channel are numbers, shape (M,).
     """
@@ -193,9 +193,9 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return which conditions have held for their time, which count still, and the state: see `held`.
+    """Return which conditions have been true for their time, which are still active, and the state: see `held`.
 
-    `before`: how long each has held, and when it last counted, shape (C,).
+    `before`: duration of each, and time of its last activity, shape (C,).
     """
     epochs, conditions = signs.shape
     run, last, previous = before[0].copy(), before[1].copy(), time_before

@@ -34,7 +34,7 @@ def radii_of_balls(
     freedom: Integers,
     limit: float,
 ) -> Floats:
-    """Return the radius of the ball around each 3-D position that holds every point worth looking at, shape (n,) [m].
+    """Return the radius of the ball around each 3-D position that contains every candidate point, shape (n,) [m].
 
     NaN where errors of the linear model leave it open.
 
@@ -79,7 +79,7 @@ def points_within(
 ) -> tuple[Indices, Indices, int]:
     """Find the points of a line in a ball, by `SearchIndex.stretches`.
 
-    Returns the array of the two of work space that has them, the other, and how many they are.
+    Returns the one of two work arrays that has them, the other, and their number.
     """
     middle, reach_m, first = stretches
     x, y, z = centre_m
@@ -116,7 +116,7 @@ def points_in_balls(
     least: Floats,
     weight_norm: Floats,
 ) -> tuple[Indices, Indices, Floats, Floats, Masks]:
-    """Find the points of a line in one ball an epoch, and their q by the quadratic form around its centre.
+    """Find the points of a line in one ball per epoch, and their q by the quadratic form around its centre.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def best_points(
     separation_m: float,
     turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
-    """Select the best point of each epoch, and the best of the other places.
+    """Select the best point of each epoch, and the best of the other positions.
 
     Parameters
     ----------

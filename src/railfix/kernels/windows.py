@@ -1,4 +1,4 @@
-"""Sums over earlier epochs with exponential forgetting, of the epochs of several antennas one after the other."""
+"""Sums over earlier epochs with exponential forgetting, for the epochs of several antennas in sequence."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def window_ages(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return ages of T epochs of A antennas, which end at rows `ends`; `last_ns`: before the first, NaT for none.
 
-    Time since the epoch before [s], age in its span of `SPAN` windows, and spans begun since the epoch before, shapes
-    (T,); and the ages at the end, shape (A,) [windows].
+    Time since the previous epoch [s], age in its span of `SPAN` windows, and spans begun since the previous epoch,
+    shapes (T,); and the ages at the end, shape (A,) [windows].
     """
     epochs = len(time_ns)
     step, in_span, begun, end_age = np.zeros(epochs), np.empty(epochs), np.empty(epochs), last_age.copy()

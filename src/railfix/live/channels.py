@@ -1,6 +1,6 @@
 """Two channels: the same input through two processes, every message compared byte by byte (P1 2.1).
 
-The second channel is a process of its own. Both get the same epochs, records and clock readings; each returns its
+The second channel is a separate process. Both get the same epochs, records and clock readings; each returns its
 messages with digests of its stages. At the first difference the output stops and the first stage that differs is named.
 """
 
@@ -26,7 +26,7 @@ P = ParamSpec("P")
 
 #: First word of the second channel.
 _READY: Final = "ready"
-#: Stages in the order of processing, by the arrays that tell them apart.
+#: Stages in the order of processing, with their distinguishing arrays.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -93,7 +93,7 @@ def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Co
 
 
 class TwoChannels(LiveEngine):
-    """A `LiveEngine` with a second one beside it, in a process of its own, that gets every call as well."""
+    """A `LiveEngine` with a second one in another process, which gets every call as well."""
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
@@ -103,7 +103,7 @@ class TwoChannels(LiveEngine):
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
-        # before there is anything to process: waiting for it later would hold up data, and the end by a signal
+        # before there is data to process: a later wait would delay data, and the end by a signal
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
@@ -137,7 +137,7 @@ class TwoChannels(LiveEngine):
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
 
     def close(self) -> None:
-        """End the second channel: at once, as it holds nothing that is kept."""
+        """End the second channel at once; it has no data to store."""
         self._connection.close()
         self._process.kill()
         self._process.join(timeout=5.0)

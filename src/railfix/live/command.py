@@ -1,4 +1,4 @@
-"""A live session from its inputs, and the tables of its results: what ``railfix live`` does."""
+"""A live session from its inputs, and the tables of its results: implementation of ``railfix live``."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class ResultTables:
         return self
 
     def add(self, output: LiveOutput) -> None:
-        """Take the rows of one output."""
+        """Write the rows of one output."""
         if output.result is None or output.part == "message":
             return
         for name, table_of in TABLES.items():
@@ -82,7 +82,7 @@ class ResultTables:
         self._folder.__exit__(kind, error, trace)
 
 
-#: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
+#: Longest distance from the reference location that an ETCS position report can state, without the doubts [m].
 _REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
@@ -109,8 +109,8 @@ def _check_outputs(inputs: LiveInputs) -> None:
 async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
     """Run a session until its sources end, or SIGINT or SIGTERM; return a summary, a line each, and whether by SIGTERM.
 
-    SIGHUP reloads nothing: it is logged and counted. RailfixError: when a source, sink, file or setting is not what it
-    should be, or two channels disagree.
+    SIGHUP reloads nothing: it is logged and counted. RailfixError: a source, sink, file or setting is invalid, or two
+    channels disagree.
     """
     for source in (*inputs.sources.values(), *inputs.sensors.values()):
         check_source(source)
@@ -251,7 +251,7 @@ def _hooks(
 
 
 def _close(outlet: Outlet[Any], log: SessionLog) -> None:
-    """Close an outlet; what it lacks is logged."""
+    """Close an outlet; missing outputs are logged."""
     outlet.close()
     if outlet.dropped or outlet.failed:
         log.say(f"{outlet.name}: {outlet.dropped} items dropped, {outlet.failed} refused {outlet.failure}")

@@ -1,4 +1,4 @@
-"""What a person sees of a session: a log, and a status line where the terminal can show one.
+"""Display of a session: a log, and a status line if the terminal supports it.
 
 Counts and times of a session, as Prometheus text over HTTP. Checks that write into the log: sensors on board against
 the satellites, the track against the positions.
@@ -95,7 +95,7 @@ _LINE: Final = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} ")
 
 
 def check_log_file(path: Path) -> None:
-    """Raise OutputError where a file is there that is no log of a session: nothing is appended to it."""
+    """Raise OutputError where an existing file is not the log of a session: nothing is appended to it."""
     try:
         with path.open("rb") as file:
             begin = file.read(64)
@@ -111,7 +111,7 @@ class SessionLog:
     """Log of a session, on the standard error output and in a rotating file, and the status line.
 
     At `LiveSettings.log_bytes` the file is put aside as ``path.1``, and so on (OutputError when it cannot be opened). A
-    status line that is wanted is shown where the standard error output is a terminal.
+    requested status line is shown where the standard error output is a terminal.
     """
 
     def __init__(self, path: Path | None, settings: LiveSettings, *, status: bool = True) -> None:
@@ -148,7 +148,7 @@ class SessionLog:
             self._screen.send(Text(status, no_wrap=True, overflow="ellipsis"))
 
     def close(self) -> None:
-        """Write what is left; lines that the file lacks are printed."""
+        """Write the remaining lines; lines missing in the file are printed."""
         for handler in self._handlers:
             self._logger.removeHandler(handler)
         self._logger.propagate = True
@@ -161,7 +161,7 @@ class SessionLog:
         self._terminal.close()
 
 
-#: Messages that the times are taken of.
+#: Number of messages over which times are averaged.
 _LAST: Final = 1000
 
 
@@ -170,7 +170,7 @@ class Metrics:
     """Counts and times of a session."""
 
     messages: Counter[MessageStatus] = field(default_factory=Counter)
-    epochs: Mapping[str, int] = field(default_factory=dict)  #: What became of the epochs: `LiveEngine.counts`.
+    epochs: Mapping[str, int] = field(default_factory=dict)  #: Outcomes of the epochs: `LiveEngine.counts`.
     skipped: Counter[str] = field(default_factory=Counter)  #: Bytes and messages of the receivers that were not used.
     lost: Counter[str] = field(default_factory=Counter)  #: Connections that broke, by source.
     sinks: Sequence[Sink] = ()
@@ -183,7 +183,7 @@ class Metrics:
     _sent: float | None = None
 
     def took(self, seconds: float, outputs: Sequence[LiveOutput]) -> None:
-        """Count messages that go out now, and the time they took together."""
+        """Count messages that are sent now, and their total processing time."""
         now = time.monotonic()
         for output in outputs:
             self.processing_s.append(seconds / len(outputs))
@@ -214,7 +214,7 @@ class Metrics:
         return "\n".join(lines) + "\n"
 
     def summary(self) -> list[str]:
-        """Return what happened, a line each, for the end of the session."""
+        """Return a summary, one line per event, for the end of the session."""
         lines = [f"{sum(self.messages.values()):,} messages"]
         lines += [f"  {status.name.lower()}: {number:,}" for status, number in sorted(self.messages.items())]
         lines += [f"epochs {fate}: {number:,}" for fate, number in sorted(self.epochs.items())]
@@ -254,7 +254,7 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
             head = f"HTTP/1.1 {'200 OK' if found else '404 Not Found'}\r\nContent-Type: text/plain; version=0.0.4\r\n"
             writer.write(f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
             await writer.drain()
-        except (OSError, ValueError):  # whoever asked has gone, or does not ask in HTTP: there is nobody to answer
+        except (OSError, ValueError):  # the client has gone, or does not speak HTTP
             pass
         finally:
             writer.close()
@@ -265,7 +265,7 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
         raise SettingsError(f"--metrics {address}: cannot be listened at ({error})") from None
 
 
-#: The sensors are judged after so long, by places at least so far apart; the radar every so often [ns].
+#: The sensors are checked after this time, at positions at least this far apart; the radar at this interval [ns].
 WATCHED_NS: Final = 600_000_000_000
 _RADAR_NS: Final = 60_000_000_000
 _EVERY_NS: Final = 500_000_000
@@ -275,9 +275,10 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 
 class SensorWatch:
-    """Places and speeds of the first antenna and the samples of the sensors, until they have been judged.
+    """Positions and speeds of the first antenna and the samples of the sensors, until they have been checked.
 
-    `say` takes a sentence on each sensor that contradicts the satellites (`railfix.run.sensor_checks.SensorChecks`).
+    `say` is called with a sentence on each sensor that contradicts the satellites
+    (`railfix.run.sensor_checks.SensorChecks`).
     """
 
     def __init__(self, processor: EpochProcessor, say: Callable[[str], None]) -> None:
@@ -295,7 +296,7 @@ class SensorWatch:
         self._watch, self._radar = RadarWatch(), SensorSamples()
 
     def take(self, item: LiveOutput | Sensed) -> None:
-        """Take an output of the engine, or what a sensor's source has completed."""
+        """Process an output of the engine, or samples from a sensor's source."""
         if isinstance(item, Sensed):
             self._hear(item)
         elif item.result is not None and self._name in item.result.antennas:
@@ -317,7 +318,7 @@ class SensorWatch:
                 self.judge()
 
     def _hear(self, sensed: Sensed) -> None:
-        """Keep samples, of streams no longer than they can be needed: there may be no place for hours."""
+        """Store samples, limited to the time for which they can be needed: there may be no position for hours."""
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
@@ -383,9 +384,9 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
 
 
 class PlaceWatch:
-    """Compare 3-D positions with the line until enough were seen, and report once that it lies elsewhere.
+    """Compare 3-D positions with the line until enough were collected, and report once if it lies elsewhere.
 
-    `say` takes the sentence with which `railfix run` ends there.
+    `say` is called with the sentence with which `railfix run` ends in that case.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:

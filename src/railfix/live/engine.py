@@ -1,6 +1,6 @@
-"""Live positioning: epochs of one or two antennas in, one result and one message a period out.
+"""Live positioning: epochs of one or two antennas in, one result and one message per period out.
 
-The same `EpochProcessor` as for logs, fed one epoch at a time; its state is carried here. Nothing is read from files
+It uses the same `EpochProcessor` as for logs, one epoch at a time, and carries its state. Nothing is read from files
 and nothing grows: at most a few epochs wait for their pair, and expired records and SBAS messages are dropped.
 """
 
@@ -32,27 +32,27 @@ from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].
 END_NS: Final = 1 << 62
-#: Epochs of one antenna that may wait; more than that means the other antenna's clock is elsewhere.
+#: Number of epochs of one antenna that may wait; more than that means that the other antenna's clock differs.
 _LONGEST_QUEUE = 100
-#: Distance after which the order of the antennas is looked at again [m].
+#: Distance after which the order of the antennas is examined again [m].
 _ORDER_STEP_M = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOutput:
-    """One message, and the result it was made from (None without input)."""
+    """One message, and its result (None without input)."""
 
     message: TrainMessage
     result: Result | None
-    place: TrainPlace | None = None  #: Place that the message was made from; None without input.
-    #: What of it goes out: both; the rows of the result alone, because the message of its period has gone out before;
+    place: TrainPlace | None = None  #: Position of the message; None without input.
+    #: Parts that are sent: both; the rows of the result alone, because the message of its period has been sent before;
     #: or such a message later, alone.
     part: Literal["both", "rows", "message"] = "both"
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineState:
-    """What a restarted session continues from."""
+    """State from which a restarted session continues."""
 
     state: State
     done_ns: int  #: Time tag of the last epoch, GPS time since 1980; 0 before the first.
@@ -86,7 +86,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """An epoch that waits for its pair; `heard` counts the data from satellites that came before it."""
+    """An epoch that waits for its pair; `heard` counts the data from satellites received before it."""
 
     epoch: Observations
     arrived_ns: int
@@ -111,7 +111,7 @@ class LiveEngine:
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
+        Sentences for the log on what happened: what is used in place of what was requested, and when that ends,
         restarts, what became of a saved state.
     """
 
@@ -168,14 +168,14 @@ class LiveEngine:
             self._samples = self._samples.merge(sensed.samples)
 
     def _late_sensors(self, tag_ns: int) -> frozenset[str]:
-        """Return the sensors that have not been heard up to an epoch."""
+        """Return the sensors that have not been received up to an epoch."""
         time = GPS_EPOCH + np.timedelta64(tag_ns, "ns")
         return frozenset(name for name, heard in self._heard_to.items() if not heard >= time)
 
     def _hear(self, item: _FromSatellites) -> None:
         self._heard = item.heard
         last = self._from_satellites[-1] if self._from_satellites else None
-        if last is not None and last.heard > self._heard_at_push:  # no epoch came between
+        if last is not None and last.heard > self._heard_at_push:  # no epoch was received between
             self._from_satellites[-1] = last.with_later(item)
         else:
             self._from_satellites.append(item)
@@ -185,9 +185,11 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return what a restarted session continues from; `reserved` numbers of messages are left out for a crash."""
+        """Return the state from which a restarted session continues; `reserved` numbers of messages are left out for a
+        crash.
+        """
         sequence = self._sequence + reserved
-        if self._saved is not None:  # no epoch has come to continue from it
+        if self._saved is not None:  # no epoch to continue from has been received
             return replace(self._saved, sequence=sequence)
         return EngineState(
             state=State() if self._state is None else self._state, done_ns=self._done_ns if self._state else 0,
@@ -243,12 +245,12 @@ class LiveEngine:
                 f"state file: not used but for ephemerides and the sequence number: its last epoch is "
                 f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
             )
-        # What was known from the start of this session counts beside what the file has.
+        # Data known from the start of this session are merged with those of the file.
         known = self.processor.received.navigation
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Return whether an epoch is new; restart after a receiver that comes back with older tags."""
+        """Return whether an epoch is new; restart after a receiver returns with older tags."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -272,7 +274,7 @@ class LiveEngine:
         return True
 
     def _restart(self) -> None:
-        """Restart after a receiver's restart: only what was received from satellites is kept."""
+        """Restart after a receiver's restart: only data received from satellites are kept."""
         self.counts["restart"] += 1
         self.lag.reset()
         self.reports.append("a receiver came back with older time tags: positioning restarts")
@@ -285,9 +287,9 @@ class LiveEngine:
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """Return the messages due: of complete pairs, of epochs that waited long enough, of periods without input.
 
-        `now_ns` is of the clock that `push` was given, `sent_ns` the GPS time of sending for the message; then one
-        message goes out a period, that of the newest epoch. Without it (recorded epochs, the clock is that of their
-        tags) every epoch has its message; at `END_NS` all that wait are due, and no period without input follows.
+        `now_ns` is on the clock that `push` was given, `sent_ns` the GPS time of sending for the message; one message
+        is then sent per period, for the newest epoch. Without it (recorded epochs, the clock is that of their tags)
+        every epoch has its message; at `END_NS` all waiting epochs are due, and no period without input follows.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
@@ -308,14 +310,14 @@ class LiveEngine:
         return numbered
 
     def _patience_ns(self) -> int:
-        """Return the longest time without a message: half a period more than one after an epoch, then one period."""
+        """Return the longest time without a message: half a period more than one after per epoch, then one period."""
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
         """Outputs of which at most one carries the message: the newest, half a period after the last one at least.
 
-        The newest message of epochs that came too early for that waits until a period after the last one, unless a
-        newer one takes its place.
+        The newest message of epochs that came too early waits until a period after the last one, unless a newer one
+        replaces it.
         """
         if self._due_ns is None:
             self._due_ns = now_ns - self._period_ns
@@ -407,7 +409,7 @@ class LiveEngine:
         return LiveOutput(message=message, result=result, place=place)
 
     def _samples_until(self, tag_ns: int) -> SensorSamples:
-        """Return the samples since the epoch before up to an epoch; later ones wait."""
+        """Return the samples since the previous epoch up to an epoch; later ones wait."""
         time, silent = GPS_EPOCH + np.timedelta64(tag_ns, "ns"), self._late_sensors(tag_ns)
         self.counts.update(f"{name} silent" for name in silent)
         samples = self._samples.between(np.datetime64("NaT", "ns"), time)
@@ -415,7 +417,7 @@ class LiveEngine:
         return replace(samples, silent=silent)
 
     def _tell_changes(self, notes: tuple[str, ...]) -> None:
-        """Report what is used in place of what was asked for since the received data changed, and what no longer is."""
+        """Report replacements of requested data since the received data changed, and replacements that have ended."""
         if notes is not self._notes:
             self.reports.extend(note for note in notes if note not in self._notes)
             self.reports.extend(f"no longer so: {note}" for note in self._notes if note not in notes)

@@ -40,7 +40,7 @@ def cbor_bytes(output: LiveOutput) -> bytes:
 
 
 def nmea_bytes(output: LiveOutput) -> bytes:
-    """Return NMEA 0183 sentences GGA, RMC and GST of the place of the first antenna; nothing without input."""
+    """Return NMEA 0183 sentences GGA, RMC and GST of the position of the first antenna; nothing without input."""
     place = _geodetic(output)
     if output.result is None:
         return b""
@@ -89,7 +89,7 @@ def tpv_bytes(output: LiveOutput) -> bytes:
 def etcs_form(settings: LiveSettings) -> Form:
     """Position reports of SUBSET-026, packet 0, against the reference location of the settings, a line of JSON each.
 
-    Nothing without a position of the front end, and where a doubt is longer than the packet can say (327 km).
+    Nothing without a position of the front end, and where a doubt exceeds the range of the packet (327 km).
     """
 
     def etcs_bytes(output: LiveOutput) -> bytes:
@@ -127,7 +127,7 @@ ROW_FORMS: Final = {name: _rows_form(table_of) for name, table_of in TABLES.item
 
 
 def _json_rows(table: pl.DataFrame) -> bytes:
-    """Return the rows as lines of JSON, all digits; null where there is no number, infinities as words."""
+    """Return the rows as lines of JSON, all digits; null for missing numbers, infinities as words."""
     texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
     lines = []
     for row in texts.iter_rows(named=True):

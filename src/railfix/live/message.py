@@ -20,7 +20,7 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: Sigmas that the speed's bound stands for: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
+#: Sigmas of the speed's bound: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
 _SPEED_K = 5.33
 #: Bounds are wider by this, so that they hold for chainages that are rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
@@ -47,34 +47,35 @@ def no_input_message(settings: LiveSettings, frame: TrainFrame, running: int, ti
 
 @dataclass(frozen=True, kw_only=True)
 class TrainPlace:
-    """Place of the train's reference point at the last epoch of a result."""
+    """Position of the train's reference point at the last epoch of a result."""
 
     antenna: str  #: Antenna that it is from.
     #: Chainage of the reference point; NaN without a place.
     chainage_m: float
     sigma_m: float
-    #: Bound of its error, and the protection level under it; infinite where none is promised.
+    #: Bound of its error, and the protection level under it; infinite where no bound exists.
     bound_m: float
     level_m: float
     status: MessageStatus
-    moving: int  #: Direction of the speed against chainage, 0 where it does not tell.
+    moving: int  #: Direction of the speed against chainage, 0 where the speed is too small.
     #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna there; None without a place.
     geodetic: tuple[float, float, float] | None
 
 
 def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
-    """Return the place of the train: of the antennas, each reduced to the reference point, that with the best bound.
+    """Return the position of the train: of the antennas, each reduced to the reference point, the one with the best
+    bound.
 
-    The place is that of the filter along the track where it runs, else that of the single epoch. The bound is the
-    filter's over- and under-reading amount where it has a level (`tracking.level`); else the protection level of the
-    single epoch, widened by the distance of the filter's place from it, so that it holds for both.
+    The position is that of the filter along the track where it runs, otherwise that of the single epoch. The bound is
+    the filter's over- and under-reading amount where it has a level (`tracking.level`); otherwise the protection level
+    of the single epoch, widened by the distance of the filter's position from it, so that it is valid for both.
     """
     places = [_locate_antenna(name, result, frame) for name in result.antennas]
     return min(places, key=lambda place: (math.isnan(place.chainage_m), place.level_m))
 
 
 def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
-    """Return the place of the train by one antenna."""
+    """Return the position of the train by one antenna."""
     antenna, track = result.antennas[name], result.fusion.get(name)
     place, status = _place_and_status(antenna, track)
     arc, sigma = float(antenna.arc_m[-1]), float(antenna.along_sigma_m[-1])
@@ -83,7 +84,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
         arc, sigma = float(track.tracked.arc_m[-1]), float(track.tracked.sigma_m[-1])
         amount = float(track.tracked.amount_m[-1])
     bound = level + abs(place - single) + _ROUNDING_M if math.isfinite(single) else math.inf
-    if math.isfinite(amount) and track is not None:  # the filter has a level of its own
+    if math.isfinite(amount) and track is not None:  # the filter has a separate level
         bound, level = amount + _ROUNDING_M, float(track.tracked.level_m[-1])
     chainage, geodetic = math.nan, None
     if math.isfinite(place):
@@ -94,10 +95,10 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
     bounded = math.isfinite(bound)
     if status is MessageStatus.POSITION and not bounded:
         status = MessageStatus.DOUBTFUL
-    # The bound of a position that failed a check is none for the place that the sensors carry.
+    # The bound of a position that failed a check does not apply to the dead-reckoned position.
     if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
         status = MessageStatus.DOUBTFUL
-    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # no bound is promised, so none is sent
+    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # without a bound none is sent
         bound = math.inf
     moving = int(track.direction[-1]) if track is not None and len(track) else 0
     return TrainPlace(
@@ -107,7 +108,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
 
 
 def _geodetic(name: str, result: Result, frame: TrainFrame, arc_m: float) -> tuple[float, float, float] | None:
-    """Return latitude, longitude [deg] and ellipsoidal height [m] of the first antenna for a place of an antenna."""
+    """Return latitude, longitude [deg] and ellipsoidal height [m] of the first antenna for a position of an antenna."""
     source = result.fusion[name] if _has_place(result.fusion.get(name)) else result.antennas[name]
     values = np.array([source.latitude_deg[-1], source.longitude_deg[-1], source.height_m[-1]])
     if name != frame.first:
@@ -120,9 +121,9 @@ def create_message(
 ) -> TrainMessage:
     """Return the message of one processed epoch; the sender numbers it.
 
-    `running` is the direction in which the train's front end looks. The chainage is that of the front end, its bounds
-    are those of the place, wider where either end of the train may be ahead. Where the front end is unknown they are
-    those of the reference point. A doubtful place has no bounds.
+    `running` is the direction in which the train's front end looks. The chainage is that of the front end; its bounds
+    are those of the position, wider where either end of the train may be ahead. Where the front end is unknown they are
+    those of the reference point. A doubtful position has no bounds.
     """
     antenna, track = result.antennas[place.antenna], result.fusion.get(place.antenna)
     sources = Source(0)
@@ -154,7 +155,7 @@ def create_message(
 
 
 def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
-    """Return the fields that say which train it is, and what is not known of it."""
+    """Return the fields that identify the train, and the unknown ones."""
     length, front = frame.length_m, frame.ends(running).front_m
     unknown = Unknown(0)
     for what, known in (
@@ -165,7 +166,7 @@ def _describe_train(frame: TrainFrame, running: int) -> dict[str, Any]:
 
 
 def _describe_place(place: TrainPlace, frame: TrainFrame, running: int) -> dict[str, Any]:
-    """Return chainage, bounds and safe ends of a place, rounded so that the bounds hold."""
+    """Return chainage, bounds and safe ends of a position, rounded so that the bounds remain valid."""
     values: dict[str, Any] = {}
     if not math.isfinite(place.chainage_m):
         return values
@@ -191,13 +192,13 @@ _INTERFERENCE: Final = frozenset(SuspectedInterference)
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """Return the worst interference of the antennas at the last epoch; None where it is not looked for."""
+    """Return the worst interference of the antennas at the last epoch; None without this check."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 
 
 def _name_sources(track: AlongTrack) -> Source:
-    """Return what the filter measured the last epoch with, beside codes."""
+    """Return the measurements of the filter at the last epoch, besides codes."""
     sources = Source(0)
     for kind in np.flatnonzero(track.tracked.used[-1]).tolist():
         sources |= _SOURCE_OF_KIND.get(Kind(kind), Source(0))
@@ -207,12 +208,12 @@ def _name_sources(track: AlongTrack) -> Source:
 
 
 def _has_place(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
-    """Return whether the filter along the track has a place."""
+    """Return whether the filter along the track has a position."""
     return track is not None and len(track) > 0 and math.isfinite(float(track.chainage_m[-1]))
 
 
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
-    """Place [m], NaN without one, and what it is worth."""
+    """Position [m], NaN without one, and its accuracy."""
     place = float(antenna.chainage_m[-1])
     if not _has_place(track):
         if not math.isfinite(place):
@@ -235,7 +236,7 @@ def _has_passed(antenna: AntennaResult) -> bool:
 
 
 def _level_m(antenna: AntennaResult) -> float:
-    """Return the protection level of the last epoch; infinite where there is none."""
+    """Return the protection level of the last epoch; infinite without one."""
     if antenna.protection is None:
         return math.inf
     level = float(antenna.protection.level.level_m[-1])

@@ -32,7 +32,7 @@ from railfix.live.stream import (
 )
 from railfix.ranges.sbas import from_receiver
 
-#: Items that may wait for the processor before a source is held back.
+#: Number of items that may wait for the processor before a source is paused.
 _LONGEST_QUEUE: Final = 64
 #: How often the status is shown [s].
 _STATUS_S: Final = 0.5
@@ -46,11 +46,11 @@ _Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
 
 @dataclass(frozen=True, kw_only=True)
 class Hooks:
-    """What else a session does."""
+    """Optional parts of a session."""
 
     observe: Callable[[LiveOutput], None] | None = None  #: Called with every output, after the sinks.
-    sensed: Callable[[Sensed], None] | None = None  #: Called with what each source of a sensor completes.
-    #: Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
+    sensed: Callable[[Sensed], None] | None = None  #: Called with the completed samples of each sensor source.
+    #: Called every `LiveSettings.state_every_s`, in idle time, with the state for a restart.
     save: Callable[[SavedSession], None] | None = None
     show: Callable[[str], None] | None = None  #: Called with a text for the status line, twice a second.
     metrics: Metrics = field(default_factory=Metrics)  #: Counted in, and returned.
@@ -76,7 +76,7 @@ async def run_session(
         RINEX observation files are replayed as well.
     speed : float or None
         For recorded files: times as fast as recorded. None: as fast as they go; the clock is then that of the time
-        tags (set `LiveSettings.no_input` to "skip" for one message an epoch and no more).
+        tags (set `LiveSettings.no_input` to "skip" for one message per epoch and no more).
     sensors : mapping of str to str, optional
         Streams of sensors on board (`railfix.live.stream`) by name; the engine has tables of files before.
     date : datetime64, optional
@@ -89,7 +89,7 @@ async def run_session(
     InputFileError
         A source cannot be opened, or breaks and is not opened again; a sensor's stream begins with another table.
     OutputError
-        A sink of a replay cannot be written: raised at the end, when the others have everything, or when none is left.
+        A sink of a replay cannot be written: raised at the end, when the others are complete, or when none is left.
     ChannelsDisagreeError
         Two channels differ.
     """
@@ -129,10 +129,10 @@ async def run_session(
 
 @dataclass(kw_only=True)
 class _Session:
-    """A session at work: what it consists of, the states of its streams, and when things were done last (monotonic).
+    """A running session: its parts, the states of its streams, and times of the last actions (monotonic).
 
-    `read_to_ns` has the latest tag taken from each source that has not ended, -1 before the
-    first; `place` is the last position as a GGA sentence, for a virtual base station.
+    `read_to_ns` has the latest tag received from each source that has not ended, -1 before the first; `place` is the
+    last position as a GGA sentence, for a virtual base station.
     """
 
     engine: LiveEngine
@@ -150,7 +150,7 @@ class _Session:
     ended: dict[str, OutputError] = field(default_factory=dict)  #: Sinks that could not be written.
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
-        """Process what the pumps bring until all have ended; a restart can continue from there."""
+        """Process the items of the pumps until all have ended; a restart can continue from there."""
         read_to_ns, due = self.read_to_ns, 0
         self.reserved_from = self.engine.export_state().sequence
         self.save(reserved=self.reserved)
@@ -158,7 +158,7 @@ class _Session:
             while read_to_ns.keys() - {BASE}:  # a base station's stream alone has no end
                 for pump in pumps:
                     if pump.done() and queue.empty():
-                        pump.result()  # an error of a source ends the session, after what came before it
+                        pump.result()  # an error of a source ends the session, after the items before it
                 wait = None if replay else max(self.engine.wait_s(now_ns=time.monotonic_ns()), 0.001)
                 item = await next_arrival(queue, pumps, wait_s=wait)
                 now = time.monotonic_ns()
@@ -185,7 +185,7 @@ class _Session:
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
                     self.in_idle_time(outputs)
-            if not replay:  # what still waits for its pair or for its period
+            if not replay:  # epochs that still wait for their pair or for their period
                 self.emit(END_NS, self.clock())
         except asyncio.CancelledError:
             self.save()
@@ -193,7 +193,7 @@ class _Session:
         self.save()
 
     async def pump(self, name: str, source: str, turn: _Pace | _InTurn | None, queue: _Queue) -> None:
-        """Move what a source's data complete into the queue, then None; recorded epochs wait for their turn."""
+        """Move the completed items of a source into the queue, then None; recorded epochs wait for their turn."""
         async for received in self.received(name, source):
             if turn is not None and received.epochs:
                 await turn.wait(name, received.epochs[-1].time[-1])
@@ -203,7 +203,7 @@ class _Session:
         await queue.put((name, None))
 
     async def listen(self, sensor: str, source: str, queue: _Queue) -> None:
-        """Move what a sensor's stream completes into the queue; where it has ended, no epoch waits for it."""
+        """Move the completed samples of a sensor into the queue; when it has ended, no epoch waits for it."""
         lines = SensorLines(sensor=sensor, source=hidden(source))
         async for part in read_source(source, self.engine.settings):
             if isinstance(part, bytes):
@@ -214,7 +214,7 @@ class _Session:
         await queue.put(Sensed(sensor=sensor, until=FOREVER))
 
     async def received(self, name: str, source: str) -> AsyncIterator[ReceivedData]:
-        """Yield what a source's data complete, item by item; breaks of its connection are logged and counted."""
+        """Yield the completed items of a source one by one; connection losses are logged and counted."""
         place = (lambda: self.place) if name == BASE else None
         async for item in arrivals(source, self.streams[name], self.engine.settings, place):
             if isinstance(item, ReceivedData):
@@ -223,7 +223,7 @@ class _Session:
                 self.tell(name, source, item)
 
     def tell(self, name: str, source: str, item: Connected | Lost) -> None:
-        """Log and count what became of a connection."""
+        """Log and count the events of a connection."""
         if isinstance(item, Lost):
             self.metrics.lost[hidden(source)] += 1
             _LOG.warning("%s: %s: %s; next attempt in %.1f s", name, hidden(source), item.reason, item.wait_s)
@@ -232,7 +232,7 @@ class _Session:
             _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
     def take(self, name: str, received: ReceivedData, now_ns: int | None) -> int:
-        """Hand what one source has completed to the engine; without a clock the epochs arrive at their tags.
+        """Pass the completed items of one source to the engine; without a clock the epochs arrive at their tags.
 
         Returns the tag of the last epoch [ns], -1 without one.
         """
@@ -259,7 +259,7 @@ class _Session:
         return tag_ns
 
     def emit(self, now_ns: int, sent_ns: int | None) -> list[LiveOutput]:
-        """Give what is due to the sinks."""
+        """Pass due outputs to the sinks."""
         began = time.perf_counter()
         outputs = self.engine.poll(now_ns=now_ns, sent_ns=sent_ns)
         if outputs:
@@ -277,7 +277,7 @@ class _Session:
         return outputs
 
     def send(self, sink: Sink, output: LiveOutput) -> None:
-        """Give an output to a sink; one that cannot be written has ended, the others go on.
+        """Pass an output to a sink; a sink that cannot be written has ended, the others continue.
 
         OutputError: none is left.
         """
@@ -307,7 +307,7 @@ class _Session:
         return math.ceil(10.0 * settings.state_every_s / settings.period_s)
 
     def save(self, *, reserved: int = 0) -> None:
-        """Hand over what a restart needs, where somebody wants it."""
+        """Pass the state for a restart, where requested."""
         if self.hooks.save is not None:
             streams = {name: state.after_break() for name, state in self.streams.items()}
             self.hooks.save(SavedSession(engine=self.engine.export_state(reserved=reserved), streams=streams))
@@ -348,7 +348,7 @@ class _Pace:
 
 
 class _InTurn:
-    """Holds back a file that has been read further than another one, so that none of its epochs pile up unpaired."""
+    """Holds back a file that has been read farther than another one, so that none of its epochs pile up unpaired."""
 
     def __init__(self, read_to_ns: Mapping[str, int]) -> None:
         self._read_to_ns = read_to_ns
@@ -362,11 +362,11 @@ class _InTurn:
             await asyncio.sleep(0)
 
     def ended(self, name: str) -> None:
-        """Nothing: what has ended is no longer in the table."""
+        """No wait: ended sources are not in the table."""
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:
-    """Return the status line: time, status, place, speed, satellites, processing time, what was lost."""
+    """Return the status line: time, status, position, speed, satellites, processing time, losses."""
     message = output.message
     at = GPS_EPOCH + np.timedelta64(message.time_ns, "ns")
     words = [f"{np.datetime_as_string(at, unit='ms')[11:]} GPST", message.status.name.lower()]

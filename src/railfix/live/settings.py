@@ -20,8 +20,8 @@ class LiveSettings(Settings):
     period_s: float = Field(default=0.1, gt=0.0, le=60.0)
     #: Longest wait for the other antenna's epoch after the first one of a pair has arrived.
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
-    #: Longest wait for the sensors on board to be heard up to an epoch; what one of them says since the epoch before is
-    #: left out then.
+    #: Longest wait for samples of the sensors on board up to an epoch; missing samples since the previous epoch are
+    #: then left out.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     no_input: Literal["send", "skip"] = "send"  #: Whether a period without input has a message.
     #: Epochs in a row with tags before the last one after which the receiver counts as restarted.
@@ -32,20 +32,20 @@ class LiveSettings(Settings):
 
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
     reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: A connection without a byte for so long counts as broken.
+    #: A connection without a byte for this time counts as broken.
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
     #: How often the caster of the base station is sent the train's position (GGA), for a virtual station; 0: never.
     gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
-    #: Certificates (PEM) that casters over TLS may have beside those that the system trusts.
+    #: Additional certificates (PEM) of casters over TLS, besides those of the system.
     ntrip_certificates: Path | None = None
     #: Messages that may wait for a slow target; further ones are dropped for it and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
-    #: Delay above the shortest one seen with which epochs are skipped up to the present, said in the log; not where the
-    #: epochs are recorded ones.
+    #: Delay above the shortest one seen at which epochs are skipped up to the present, with a log line; not for
+    #: recorded epochs.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
     state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: How often the state file is written.
     #: Longest time from the last epoch of a state file to the first new one; after it only ephemerides and the sequence
-    #: number are taken from the file.
+    #: number are used.
     state_age_s: float = Field(default=60.0, gt=0.0, le=3600.0)
     #: Size at which a log file is put aside, and how many of these are kept.
     log_bytes: int = Field(default=1_000_000, ge=1000)
@@ -54,9 +54,9 @@ class LiveSettings(Settings):
     train: int = Field(default=0, ge=0)
     line: int = Field(default=0, ge=0)
     #: Direction in which the end of the train looks that runs ahead at the start, against rising chainage; 0 where
-    #: unknown. None: that of the vehicle file. A train that runs the other way for 50 m has changed ends.
+    #: unknown. None: from the vehicle file. A train that runs the other way for 50 m has changed ends.
     facing: Literal[-1, 0, 1] | None = None
-    #: Front end of the train ahead of the front antenna. None: that of the vehicle file, by its length.
+    #: Front end of the train ahead of the front antenna. None: from the vehicle file, by its length.
     front_offset_m: float | None = Field(default=None, ge=0.0)
     length_m: float | None = Field(default=None, gt=0.0)  #: Train length. None: that of the vehicle file.
     #: Identity of the reference location of ETCS position reports (NID_LRBG).
@@ -78,7 +78,7 @@ class LiveInputs(Settings):
         metavar="SOURCE",
     )
     track: tuple[Path, ...] = input_option("Track map; repeat it for a route.", metavar="TRACK")
-    rear: str | None = input_option("The same of the rear antenna.", None, metavar="SOURCE")
+    rear: str | None = input_option("Source of the rear antenna.", None, metavar="SOURCE")
     vehicle: Path | None = input_option("Vehicle of the antennas.", None, metavar="TOML")
     nav: tuple[Path, ...] = input_option("Navigation files known from the start.", (), metavar="FILE")
     base: str | None = input_option(
@@ -91,15 +91,15 @@ class LiveInputs(Settings):
     )
     tachometer: str | None = input_option(
         "Pulses of a tachometer: the rows of the table of `railfix run` as lines of CSV, header first, from a "
-        "source as of --front; or the whole table, a file. A row with the time alone says that no pulse came.",
+        "source as of --front; or the whole table, a file. A row with the time alone reports that no pulse came.",
         None,
         metavar="SOURCE",
     )
-    inertial: str | None = input_option("The same of an inertial unit.", None, metavar="SOURCE")
-    radar: str | None = input_option("The same of the speeds of a Doppler radar.", None, metavar="SOURCE")
-    ranging: str | None = input_option("The same of two-way ranges to ground units.", None, metavar="SOURCE")
+    inertial: str | None = input_option("Source of an inertial unit.", None, metavar="SOURCE")
+    radar: str | None = input_option("Source of the speeds of a Doppler radar.", None, metavar="SOURCE")
+    ranging: str | None = input_option("Source of two-way ranges to ground units.", None, metavar="SOURCE")
     ranging_units: Path | None = input_option("Surveyed ground units: unit, x_m, y_m, z_m (ECEF).", None, metavar="CSV")
-    balises: str | None = input_option("The same of balises that are read.", None, metavar="SOURCE")
+    balises: str | None = input_option("Source of balise readings.", None, metavar="SOURCE")
     balise_list: Path | None = input_option(BALISE_LIST, None, metavar="CSV")
     virtual_balises: Path | None = input_option(VIRTUAL_BALISES, None, metavar="CSV")
     send: tuple[str, ...] = option(
@@ -114,7 +114,7 @@ class LiveInputs(Settings):
     channels: Literal["1", "2"] = option("2: a second process checks every message; a difference ends the output.", "1")
     metrics: str | None = option("Serve Prometheus text at /metrics.", None, metavar="HOST:PORT")
     state: Path | None = option(
-        "Write what a restarted session needs into this file now and then, and continue from it.", None, metavar="FILE"
+        "Write the state regularly into this file, and continue from it after a restart.", None, metavar="FILE"
     )
     log: Path | None = option("Also log into this file, which rotates.", None, metavar="FILE")
     out: Path | None = option("Also write the tables of results into this folder.", None, metavar="DIR")

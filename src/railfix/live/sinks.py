@@ -35,9 +35,9 @@ _CLOSE_S = 5.0
 class Outlet(Generic[Item]):
     """A target behind a queue and a thread of its own, in which `send` takes one item.
 
-    `full` says what happens to an item for which there is no room: dropped and counted ("drop", live), or waited for
-    ("wait", replay of recorded files, which has the time). `dropped` counts those, `failed` the items that the target
-    refused; `failure` is why the last one was, blank after one that was taken.
+    `full` selects the treatment of an item when the queue is full: dropped and counted ("drop", live), or waited for
+    ("wait", replay of recorded files). `dropped` counts those, `failed` the items that the target refused; `failure` is
+    why the last one was, blank after one that was taken.
     """
 
     def __init__(self, name: str, send: Callable[[Item], None], *, waiting: int, full: str = "drop") -> None:
@@ -77,11 +77,11 @@ class Outlet(Generic[Item]):
                 self.failed += 1
 
     def close(self) -> None:
-        """Wait for the items that are left, some seconds at most; what is left then is counted as dropped.
+        """Wait for the remaining items, some seconds at most; the rest is counted as dropped.
 
         OutputError: as `send`.
         """
-        with suppress(queue.Full):  # then the thread is given up below
+        with suppress(queue.Full):  # then the thread is abandoned below
             self._items.put(None, timeout=_CLOSE_S)
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
@@ -103,7 +103,7 @@ _HELP: Final = (
 
 
 class Sink(Protocol):
-    """Something that takes outputs, never waits, and counts what its reader has missed."""
+    """A receiver of outputs that never waits, and counts the outputs that its reader has missed."""
 
     name: str  #: For counts and messages.
     dropped: int  #: Messages that the reader was too slow for.
@@ -114,12 +114,12 @@ class Sink(Protocol):
         """Take one output."""
 
     def close(self) -> None:
-        """Send what is left, and release what is held."""
+        """Send the remaining items, and release resources."""
 
 
 @dataclass
 class ByteTarget:
-    """A file or the standard output, unbuffered: a reader sees a message at once, and no lock is held meanwhile."""
+    """A file or the standard output, unbuffered: a reader sees a message at once, and no lock is kept meanwhile."""
 
     form: Form
     file: IO[bytes]
@@ -148,7 +148,7 @@ class UdpTarget:
     socket: socket.socket = field(default_factory=lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
 
     def send(self, output: LiveOutput) -> None:
-        """Send one datagram, none where the form has nothing to say."""
+        """Send one datagram, none where the form yields nothing."""
         if data := whole_message(self.form, output):
             self.socket.sendto(data, self.address)
 
@@ -188,9 +188,9 @@ class MqttTarget:
             raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: the broker refuses the connection ({answer})")
 
     def send(self, output: LiveOutput) -> None:
-        """Publish one message, none where the form has nothing to say.
+        """Publish one message, none where the form yields nothing.
 
-        OutputError: when there is no connection, or the broker does not keep up.
+        OutputError: no connection, or the broker is too slow.
         """
         data = whole_message(self.form, output)
         if not data:
@@ -208,32 +208,32 @@ class MqttTarget:
         self._sent.append(sent)
 
     def close(self) -> None:
-        """Send what is left within `_LEFT_S`, and disconnect."""
+        """Send the remaining messages within `_LEFT_S`, and disconnect."""
         until = time.monotonic() + _LEFT_S
         for info in self._sent:
             if self._client.is_connected():
                 info.wait_for_publish(max(until - time.monotonic(), 0.0))
         self._client.disconnect()
-        # a broker that reads no more would hold the end up for as long as its connection lives
+        # a broker that stops reading would delay the end for the lifetime of its connection
         ending = threading.Thread(target=self._client.loop_stop, daemon=True)
         ending.start()
         ending.join(max(until - time.monotonic(), 0.5))
 
 
 class OutletSink(Outlet[LiveOutput]):
-    """A target behind a queue of its own, closed with it."""
+    """A target with its own queue, closed with it."""
 
     def __init__(self, name: str, target: Any, *, waiting: int, full: str) -> None:
         super().__init__(name, target.send, waiting=waiting, full=full)
         self._target = target
 
     def send(self, item: LiveOutput) -> None:
-        """Hand over one output, if it has what the form takes."""
+        """Pass on one output, if the form applies to it."""
         if wants(self._target.form, item):
             super().send(item)
 
     def close(self) -> None:
-        """Send what is left, and close the target; OutputError as `Outlet.close`."""
+        """Send the remaining outputs, and close the target; OutputError as `Outlet.close`."""
         try:
             super().close()
         finally:
@@ -241,7 +241,7 @@ class OutletSink(Outlet[LiveOutput]):
 
 
 class TcpServerSink:
-    """Everybody who connects gets the messages from then on; who does not keep up is disconnected."""
+    """Every connected client gets the messages from then on; a client that is too slow is disconnected."""
 
     def __init__(self, form: Form, name: str) -> None:
         self.form, self.name = form, name
@@ -259,7 +259,7 @@ class TcpServerSink:
         try:
             while await reader.read(1024):
                 pass
-        except OSError:  # the reader has gone, as at the end of its data
+        except OSError:  # the reader has closed the pipe, as at the end of its data
             pass
         finally:
             self._readers.discard(writer)

@@ -1,4 +1,4 @@
-"""Where a receiver's bytes come from: files, TCP, serial lines, NTRIP casters, standard input."""
+"""Sources of a receiver's bytes: files, TCP, serial lines, NTRIP casters, standard input."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
 
 Item = TypeVar("Item")
-#: The present position as a GGA sentence, empty while there is none.
+#: The present position as a GGA sentence, empty without one.
 Place = Callable[[], bytes]
 #: Sends to the other end of a connection until cancelled.
 Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
@@ -36,14 +36,14 @@ _NTRIP = ("ntrip", "ntrips")
 _CONNECT_S = 10.0
 #: Longest wait for a byte of a serial line in one call [s].
 _SERIAL_S = 0.05
-#: Wait for what has come already [s].
+#: Wait for bytes that have already arrived [s].
 _ONCE_MORE_S = 0.02
 #: Wait for a first position to send to a caster [s].
 _NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
-_TELLING_BYTES: Final = 16  #: First bytes of a content that tell what it is not.
-_OK: Final = 200  #: Status of an answer that is what was asked for.
+_TELLING_BYTES: Final = 16  #: First bytes of a content that identify wrong kinds.
+_OK: Final = 200  #: HTTP status of a successful answer.
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Lost:
 
 
 def check_source(source: str) -> None:
-    """Raise SettingsError where a source is none of the forms that can be opened."""
+    """Raise SettingsError where a source has none of the supported forms."""
     parts = urlsplit(source)
     if parts.scheme in ("tcp", *_NTRIP):
         try:
@@ -93,8 +93,8 @@ async def read_source(
 ) -> AsyncIterator[bytes | Connected | Lost]:
     """Yield bytes of a source as they arrive; connections that break are opened again, see `LiveSettings.reconnect`.
 
-    `place` gives the present GGA sentence, which a caster is sent every `LiveSettings.gga_s`; none while it is empty.
-    InputFileError: when the source cannot be opened, or breaks and is not opened again.
+    `place` returns the present GGA sentence, which is sent to a caster every `LiveSettings.gga_s`; none while it is
+    empty. InputFileError: when the source cannot be opened, or breaks and is not opened again.
     """
     parts = urlsplit(source)
     if source == "-":
@@ -117,7 +117,9 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield bytes of a connection, opened again with growing waits where it breaks; empty bytes say that it is open."""
+    """Yield bytes of a connection, which is opened again after growing waits when it breaks; empty bytes report that it
+    is open.
+    """
     broken, wait_s, ever_open = 0, settings.reconnect_first_s, False
     while True:
         reason = "the other end has closed the connection"
@@ -149,10 +151,10 @@ async def _file(path: str) -> AsyncIterator[bytes]:
 
 
 async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
-    """Return what a call waits for, or raise TimeoutError.
+    """Return the result of a call, or raise TimeoutError.
 
-    It is asked once more at the end: what came while this program itself was busy counts. (`asyncio.wait_for` may lose
-    a cancellation that comes at the same moment.)
+    The result is checked once more at the end: data that arrived while this program was busy count. (`asyncio.wait_for`
+    may lose a cancellation that comes at the same moment.)
     """
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
@@ -164,7 +166,7 @@ async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
 async def _tcp(
     source: str, request: bytes, silence_s: float, *, tls: ssl.SSLContext | None = None, send: Send | None = None
 ) -> AsyncIterator[bytes]:
-    """Yield empty bytes once connected, then what arrives; `send` writes to the other end meanwhile."""
+    """Yield empty bytes once connected, then received bytes; `send` writes to the other end meanwhile."""
     parts = urlsplit(source)
     try:
         async with asyncio.timeout(_CONNECT_S):
@@ -200,8 +202,8 @@ async def _tcp(
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
     """Yield the bytes of a mount point of an NTRIP caster, version 2, or 1 where the caster answers so.
 
-    With `LiveSettings.gga_s` it gets the train's position: in the request where that is known (NTRIP 2), and as lines
-    from then on, for the virtual station that it makes there.
+    With `LiveSettings.gga_s` it gets the train's position: in the request where it is known (NTRIP 2), and as lines
+    from then on, for the virtual station at that position.
     """
     if settings.gga_s == 0.0:
         place = None
@@ -236,7 +238,7 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
 class _Answer:
     """Answer of a caster: HTTP 1.1 by h11 (NTRIP 2), or ``ICY 200 OK`` and bytes (NTRIP 1).
 
-    `begun`: it is a stream of a mount point; `ended`: the caster has ended it.
+    `begun`: the mount point sends a stream; `ended`: the caster has ended it.
     """
 
     def __init__(self, source: str) -> None:
@@ -252,7 +254,7 @@ class _Answer:
         self._plain = self.begun = self.ended = False
 
     def request(self, sentence: bytes) -> bytes:
-        """Return the request, with the position that the caster is told."""
+        """Return the request, with the position for the caster."""
         parts = urlsplit(self._source)
         head = [
             ("Host", f"{parts.hostname}:{parts.port}"), ("Ntrip-Version", "Ntrip/2.0"),
@@ -270,7 +272,7 @@ class _Answer:
             raise SettingsError(f"source {hidden(self._source)!r}: cannot be asked for ({error})") from None
 
     def take(self, data: bytes) -> bytes:
-        """Return the content of some more bytes; InputFileError where it is no stream of a mount point."""
+        """Return the content of some more bytes; InputFileError where the mount point has no stream."""
         if self._first is not None:
             self._first += data
             if b"\n" not in self._first and len(self._first) < _HEADER_BYTES:
@@ -302,7 +304,7 @@ class _Answer:
                 elif isinstance(event, self._h11.EndOfMessage):
                     self.ended = True
                     break
-        except self._h11.RemoteProtocolError as error:  # what came before it counts
+        except self._h11.RemoteProtocolError as error:  # bytes received before it count
             self._broken = InputFileError(hidden(self._source), f"the caster's answer is no HTTP ({error})")
         return bytes(content)
 
@@ -327,7 +329,7 @@ class _Answer:
             raise self._no_stream(f"content coded as {coding.decode('latin-1')[:20]!r}, which was not asked for")
 
     def _check_content(self, content: bytes) -> None:
-        """Raise InputFileError where the first bytes are none of a receiver."""
+        """Raise InputFileError where the first bytes are not those of a receiver."""
         if content.startswith(b"\x1f\x8b"):
             raise self._no_stream("compressed content (gzip), which was not asked for")
         if content.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
@@ -345,7 +347,7 @@ class _Answer:
 
 
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
-    """Return TLS with the certificates that the system trusts, and those of a file."""
+    """Return TLS with the certificates of the system, and those of a file."""
     context = ssl.create_default_context()
     if certificates is not None:
         try:
@@ -371,7 +373,7 @@ def _baud(source: str) -> int:
 
 
 async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
-    """Yield empty bytes once the line is open, then what arrives; a thread reads, so that no byte overflows."""
+    """Yield empty bytes once the line is open, then received bytes; a thread reads, so that no byte overflows."""
     try:
         import serial
     except ModuleNotFoundError:
@@ -386,7 +388,7 @@ async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
         item: bytes | OSError = b""
         while not ended.is_set() and isinstance(item, bytes):
             try:
-                # The first byte, waited for, and what has come with it: nothing waits for more than there is.
+                # The first byte, waited for, and all bytes that have arrived with it.
                 item = bytes(port.read(1))
                 item += bytes(port.read(port.in_waiting)) if item else b""
             except OSError as error:

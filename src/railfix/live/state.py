@@ -1,8 +1,8 @@
-"""State file: what a restarted session continues from, written now and then, checked before it is used.
+"""State file: the state from which a restarted session continues, written regularly, checked before use.
 
-A line of JSON says what the state belongs to: versions, hashes of map, vehicle and settings, length and SHA-256 of
-what follows, the state itself. It is read back only if all of these are the same, and holds plain values, arrays and
-data classes of this package alone (`railfix.live.state_values`): nothing in it is executed.
+A line of JSON identifies the state: versions, hashes of map, vehicle and settings, length and SHA-256 of the rest; the
+state itself follows. It is read back only if all of these are equal, and contains only plain values, arrays and data
+classes of this package (`railfix.live.state_values`): nothing in it is executed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from railfix.live.engine import EngineState
 from railfix.live.state_values import StateFormatError, decode, encode
 from railfix.live.stream import ReceiverState
 
-_FORM: Final = "railfix live state 4"
+_FORM: Final = "railfix live state 5"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ class Loaded:
 def belongs_to(
     files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...]
 ) -> dict[str, Any]:
-    """What a state is made under (files by their role, settings, antennas); a state of anything else is not used."""
+    """Inputs that a state depends on (files by their role, settings, antennas); a state of other inputs is not used."""
     own = f"{railfix.__version__} ({source_commit()})"
     return {
         "version": f"railfix {own}, numpy {np.__version__}, Python {platform.python_version()}",
@@ -62,7 +62,7 @@ def belongs_to(
 
 
 def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
-    """Write a state file whole, or leave the one before and raise OutputError."""
+    """Write a complete state file, or keep the previous one and raise OutputError."""
     content = encode(session)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     part = path.with_name(f".{path.name}.part")

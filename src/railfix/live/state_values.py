@@ -1,7 +1,7 @@
 """Values of a live state as JSON and arrays, and back: nothing is executed while they are read.
 
-Plain values, arrays, containers, enumerations, named tuples and data classes of this package are written. A data
-class is made again by its own constructor from its fields, so that its checks hold for what a file says.
+Plain values, arrays, containers, enumerations, named tuples and data classes of this package are written. A data class
+is rebuilt by its own constructor from its fields, so that its checks apply to the file's values.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _SEQUENCES: Final[dict[str, Any]] = {"list": list, "tuple": tuple, "set": set, "
 
 
 class StateFormatError(ValueError):
-    """A value that cannot be part of a state, or bytes that are no state."""
+    """A value that cannot be part of a state, or bytes that are not a state."""
 
 
 def encode(value: Any) -> bytes:
-    """Return a value of a state as the bytes of a NumPy archive; StateFormatError: it holds something else."""
+    """Return a value of a state as the bytes of a NumPy archive; StateFormatError: it contains something else."""
     arrays: list[np.ndarray[Any, Any]] = []
     tree = json.dumps(_encode(value, arrays))
     file = io.BytesIO()
@@ -131,7 +131,7 @@ def _name(kind: Any) -> str:
 
 
 def _find(name: str, fits: Any) -> Any:
-    """Return a class of this package by its name; StateFormatError where it is none of the kind asked for."""
+    """Return a class of this package by its name; StateFormatError where it is not of the requested kind."""
     module, _, own = str(name).partition(":")
     if module.split(".")[0] == "railfix" and own.isidentifier():
         found = getattr(import_module(module), own, None)

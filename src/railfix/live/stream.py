@@ -1,9 +1,9 @@
 """Epochs, navigation records, SBAS messages and sensor samples that the data of a source complete as they arrive.
 
-Samples come as lines: the rows of a CSV table as they are measured. The first line names the columns, as in the tables
-of ``railfix run``; it may come again after a break. A row of which the time alone is given says that nothing was
-measured until then: a tachometer that stands still sends no pulse, and is heard by such rows. `Lag` is how far behind
-its receivers a session is, and which epochs it skips to come back to the present.
+Samples arrive as lines: the rows of a CSV table as they are measured. The first line names the columns, as in the
+tables of ``railfix run``; it may come again after a break. A row with the time alone reports that nothing was measured
+until then: a tachometer at standstill sends no pulses, but such rows. `Lag` is the delay of a session behind its
+receivers, and selects the epochs to skip to return to the present.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class ReceiverState:
 
 @dataclass(frozen=True, kw_only=True)
 class ReceivedData:
-    """What some bytes completed."""
+    """Items completed by a chunk of bytes."""
 
     epochs: tuple[Observations, ...]  #: One epoch each, with the channels observed in it.
     navigation: Navigation | None = None
@@ -55,15 +55,16 @@ class ReceivedData:
     skipped_bytes: int = 0
     bad_checksums: int = 0
     passed_over: dict[str, int] = field(default_factory=dict)
-    after: ReceiverState = field(default_factory=ReceiverState)  #: Of the stream after these bytes.
+    after: ReceiverState = field(default_factory=ReceiverState)  #: State of the stream after these bytes.
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
-    """Yield what some bytes of a receiver complete, in the order of the stream; any cutting of it gives the same.
+    """Yield the items completed by a chunk of a receiver's bytes, in the order of the stream, independent of the
+    chunks.
 
-    Each item ends with the message that completes an epoch, so that its navigation records came before its epoch.
-    The state to go on with is that of the last item, `ReceivedData.after`; there is always one. Epochs with repeated or
-    older time tags are kept: `LiveEngine.push` judges them.
+    Each item ends with the message that completes an epoch, so that its navigation records precede its epoch.
+    The state for the next chunk is that of the last item, `ReceivedData.after`; there is always one. Epochs with
+    repeated or older time tags are kept: `LiveEngine.push` judges them.
     """
     kept = len(state.stream.rest)
     ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept
@@ -75,7 +76,9 @@ def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
 
 
 def epoch_ends(buffer: Bytes) -> Indices:
-    """Return places after the messages that complete an epoch: RXM-RAWX, MeasEpoch, and the last MSM of an epoch."""
+    """Return positions in the bytes after the messages that complete an epoch: RXM-RAWX, MeasEpoch, and the last MSM of
+    an epoch.
+    """
     frames = find_frames(buffer, at_end=False)
     raw, msm = frames.of("ubx", ubx.RXM_RAWX), frames.of("rtcm3", *rtcm.MSM_NUMBERS)
     last = msm[rtcm.completes_epoch(frames, msm)]
@@ -132,7 +135,7 @@ def fresh_state(source: str, date: np.datetime64 | None = None) -> ReceiverState
 async def arrivals(
     source: str, state: ReceiverState, settings: LiveSettings, place: Place | None = None
 ) -> AsyncIterator[ReceivedData | Connected | Lost]:
-    """Yield what a source's data complete, by items, and the breaks of its connection; `place`: see `read_source`."""
+    """Yield the completed items of a source, and the breaks of its connection; `place`: see `read_source`."""
     path = source.removeprefix("file:")
     if source != "-" and is_file(source) and find_kind(path) != "receiver":
         for piece in scan_observations(path, epochs=200):
@@ -169,23 +172,23 @@ async def next_arrival(
 
 #: After every epoch.
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
-#: Columns without which a row says nothing but its time.
+#: Columns without which a row contains only its time.
 _NEEDED: Final = ("pulse", "range_m")
 #: Columns of names.
 _NAMES: Final = ("unit", "balise")
-#: Longest line; a longer one is no row.
+#: Longest line; a longer one is not a row.
 _LINE_BYTES: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sensed:
-    """What some bytes of a sensor's stream completed."""
+    """Samples decoded from a chunk of a sensor's bytes."""
 
     sensor: str
     samples: SensorSamples = field(default_factory=SensorSamples)
-    #: Time up to which the sensor has been heard; NaT before the first row, `FOREVER` of a whole table.
+    #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` of a whole table.
     until: np.datetime64
-    skipped: int = 0  #: Lines that are no rows, or whose time is before that of the row before.
+    skipped: int = 0  #: Lines that are not rows, or whose time is before that of the previous row.
 
     def count_unsurveyed(self, units: GroundUnits | None) -> int:
         """Count the ranges to ground units that are not among these, which are not used."""
@@ -200,7 +203,7 @@ class SensorLines:
     sensor: str
     source: str
     columns: tuple[str, ...] = ()  #: Names of the columns; empty before the header line.
-    until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last row.
+    until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last row.
     rest: bytes = b""  #: Line that has no end yet.
 
     def after_break(self) -> None:
@@ -246,7 +249,9 @@ class SensorLines:
         return tuple(cells)
 
     def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float | str]] | None:
-        """Return the time and values of a row, none of them where the time stands alone; None for what is no row."""
+        """Return the time and values of a row, without values if it has the time alone; None for a line that is not a
+        row.
+        """
         if len(cells) != len(self.columns):
             return None
         given = dict(zip(self.columns, cells, strict=True))
@@ -276,8 +281,8 @@ class SensorLines:
 
 #: Largest drift of the computer's clock against the receivers' time; the shortest delay is forgotten at this rate.
 DRIFT: Final = 1e-4
-#: A delay that stays the same, to within `STEADY_S`, for this time and number of skipped epochs is one of the tags, not
-#: of the session: that of a session becomes shorter, and longer where the computer is too busy even to skip [s].
+#: A delay that is constant within `STEADY_S` for this time and number of skipped epochs is one of the tags, not of the
+#: session: a session's delay becomes shorter, or longer where the computer is too busy even to skip [s].
 ADMITTED_S: Final = 2.0
 STEADY_S: Final = 0.2
 STEADY_EPOCHS: Final = 5
@@ -285,9 +290,9 @@ STEADY_EPOCHS: Final = 5
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs above the shortest one seen, so that the clocks need not agree."""
+    """Delay of epochs above the shortest observed one, so that the clocks need not agree."""
 
-    behind_s: float  #: With more delay epochs are skipped until it is a quarter of that; infinite: never.
+    behind_s: float  #: With a larger delay epochs are skipped until it is a quarter of that; infinite: never.
     skipped: int = 0  #: Epochs skipped since the session fell behind.
     reports: list[str] = field(default_factory=list)  #: Sentences that the session has not logged yet.
     _shortest_ns: float | None = None

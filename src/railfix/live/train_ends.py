@@ -14,7 +14,7 @@ from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
 
-#: Distance against the end that runs ahead after which the train has changed ends: further than it rolls back [m].
+#: Distance against the end that runs ahead after which the train has changed ends: farther than it rolls back [m].
 CHANGED_ENDS_M: Final = 50.0
 
 
@@ -24,9 +24,9 @@ class Ends(NamedTuple):
     Without a running direction they are on either side.
     """
 
-    front_m: float  #: Middle of the possible places of the front end.
+    front_m: float  #: Middle of the possible positions of the front end.
     spread_m: float  #: Largest distance of the front end from it.
-    foremost_m: float  #: No part of the train is further ahead.
+    foremost_m: float  #: No part of the train is farther ahead.
     rearmost_m: float  #: No part of the train is further behind.
 
 
@@ -35,12 +35,12 @@ class TrainFrame:
     """Reference point of a train, and its ends.
 
     The reference point is the middle between the bogies of the vehicle that carries the antennas. Without a vehicle
-    file it is the first antenna itself; the position of another antenna says nothing of it then.
+    file it is the first antenna itself; the position of another antenna does not determine it then.
     """
 
     trajectories: Mapping[str, Trajectory]
     facing: int  #: Direction of the vehicle's front along the line, 0 where unknown.
-    running: int  #: Direction in which the end that runs ahead looks at the start, 0 where unknown.
+    running: int  #: Direction of the leading end at the start, 0 where unknown.
     #: Front end of the train ahead of the reference point, its rear end behind it, and its length [m]; NaN where
     #: unknown.
     front_m: float
@@ -80,23 +80,25 @@ class TrainFrame:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what is not known of the train, and what to give."""
+        """Sentences on unknown properties of the train, and the settings that give them."""
         notes = []
         if not self.running:
             notes.append("the direction in which the train's front end looks is unknown until it has run 50 m: give a "
                          "vehicle file, or --live facing")  # fmt: skip
         if not math.isfinite(self.front_m):
-            notes.append("where the train's front end is is unknown, messages have the place of the antenna or its "
-                         "vehicle: give length_m in the vehicle file, or --live front_offset_m")  # fmt: skip
+            notes.append(
+                "the position of the train's front end is unknown, messages have the position of the antenna or its "
+                "vehicle: give length_m in the vehicle file, or --live front_offset_m"
+            )
         if not math.isfinite(self.length_m):
             notes.append("the train's length is unknown, messages have no safe rear end: give length_m in the vehicle "
                          "file, or --live length_m")  # fmt: skip
         if len(self.trajectories) > 1 and self.trajectories[self.first].body_chainage_m is None:
-            notes.append("there is no vehicle file: messages have places of the first antenna alone")
+            notes.append("there is no vehicle file: messages have positions of the first antenna alone")
         return tuple(notes)
 
     def reference_m(self, name: str, arc_m: float) -> float:
-        """Return the chainage of the reference point for a place of an antenna [m]; NaN where it is not known."""
+        """Return the chainage of the reference point for a position of an antenna [m]; NaN where it is not known."""
         trajectory = self.trajectories[name]
         if trajectory.body_chainage_m is not None:
             return float(trajectory.body_at(arc_m))
@@ -108,7 +110,7 @@ class TrainFrame:
         return next(iter(self.trajectories))
 
     def first_antenna_ecef_m(self, name: str, arc_m: float) -> Floats:
-        """Return the place of the first antenna for a place of any antenna, shape (3,) [m]; NaN where unknown."""
+        """Return the position of the first antenna for a position of any antenna, shape (3,) [m]; NaN where unknown."""
         first, trajectory = self.trajectories[self.first], self.trajectories[name]
         if name != self.first:
             arc_m = float(first.arc_of_body(trajectory.body_at(arc_m)))
@@ -132,19 +134,19 @@ class TrainFrame:
 class RunningEnd:
     """Direction in which the end of the train that runs ahead looks, from the vehicle file and from motion.
 
-    The train has changed ends, or runs with an end ahead that was not known before, once its reference point lies
-    `CHANGED_ENDS_M` and both bounds beyond the furthest place in the other direction, while it moves that way.
+    The train has changed ends, or runs with an end ahead that was unknown before, once its reference point lies
+    `CHANGED_ENDS_M` and both bounds beyond the farthest position in the other direction, while it moves that way.
     """
 
     direction: int  #: 1 toward rising chainage, -1 toward falling, 0 where unknown.
     #: Chainage of the reference point since the last change: the lowest at most, the highest at least, by the bounds;
-    #: infinite before the first place.
+    #: infinite before the first position.
     low_m: float = math.inf
     high_m: float = -math.inf
     last_m: float = math.inf  #: Last chainage; infinite before the first.
 
     def after(self, reference_m: float, bound_m: float, moving: int) -> RunningEnd:
-        """Return the direction after an epoch with a place and its bound; `moving` is the direction of its speed."""
+        """Return the direction after an epoch with a position and its bound; `moving` is the direction of its speed."""
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
@@ -165,5 +167,5 @@ class RunningEnd:
             return None
         side = "rising" if self.direction > 0 else "falling"
         if not before.direction:
-            return f"the train runs toward {side} chainage: its front end is taken to look there"
+            return f"the train runs toward {side} chainage: its front end is assumed to point there"
         return f"the train has changed ends: it has run {CHANGED_ENDS_M:g} m toward {side} chainage"

@@ -1,6 +1,6 @@
 """Compilation of all kernels at the first command on a machine: later ones load them from disk.
 
-During a live session it would delay epochs by seconds, in a run nobody would know why nothing happens.
+During a live session it would delay epochs by seconds, and a run would pause without a message.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import TrackState
 
-#: Settings and numbers of epochs that together call every kernel but those of `_look_beyond`; the second has too few
+#: Settings and numbers of epochs that together call every kernel except those of `_look_beyond`; the second has too few
 #: satellites for 3-D positions.
 _SINGLE_EPOCHS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
@@ -43,9 +43,9 @@ _WITH_FILTER: Final[tuple[dict[str, Any], int]] = ({"filter": "track", "protecti
 
 
 def prepare_kernels() -> bool:
-    """Compile the kernels that this machine has no code of, and say so on a terminal; return whether there were any.
+    """Compile the kernels without cached machine code, with a message on a terminal; return whether there were any.
 
-    Epochs of the demonstration are processed at once and one by one: kernels are compiled for the arrays of both.
+    Epochs of the demonstration are processed in one call and one by one: kernels are compiled for the arrays of both.
     InputFileError: neither the package nor the clone has the files of the demonstration.
     """
     if kernels.is_compiled():
@@ -73,7 +73,8 @@ def compile_filter() -> None:
     """Compile the recursion of the filter along the track; it is kept on disk for other processes."""
     nothing = np.full((1, 1), np.nan)
     epochs = GnssEpochs(
-        time=np.array(["2024-01-01"], dtype="datetime64[ns]"), satellite=np.array(["G01"]), clock=np.array(["G"]),
+        time=np.array(["2024-01-01"], dtype="datetime64[ns]"), satellite=np.array(["G01"]),
+        signal=np.array(["1C"]), clock=np.array(["G"]),
         sat_ecef_m=np.full((1, 1, 3), np.nan), sat_velocity_mps=np.full((1, 1, 3), np.nan), code_m=nothing,
         code_sigma_m=nothing, phase_m=nothing, phase_joined=np.zeros((1, 1), dtype=np.bool_), rate_mps=nothing,
         cn0_dbhz=nothing, off_map=np.zeros(1, dtype=np.bool_),
@@ -81,7 +82,7 @@ def compile_filter() -> None:
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     line = Line.of(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
-    state, limits = TrackState.empty(), TrackingLimits()
+    state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
     recursion.advance(state, len(epochs), trace=None)  # of no epoch: the call compiles it
@@ -96,7 +97,7 @@ def _read_logs() -> dict[str, Observations]:
 
 
 def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations]) -> None:
-    """Process epochs at once and one by one."""
+    """Process epochs in one call and one by one."""
     inputs = demo_inputs()
     assert inputs.vehicle is not None
     track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
@@ -108,7 +109,7 @@ def _process(chosen: dict[str, Any], epochs: int, logs: dict[str, Observations])
 
 
 def _look_beyond() -> None:
-    """Look for places beyond a level: the line does not turn where these epochs are."""
+    """Search for positions beyond a level: the line does not turn near these epochs."""
     nothing, clock = np.zeros((1, 1)), np.zeros(1, dtype=np.intp)
     model = ModelArrays(
         nothing, clock, np.zeros((1, 1, 1)), np.zeros((1, 1, 3)), np.zeros((1, 3, 3)), np.zeros((3, 3)), nothing

@@ -1,7 +1,7 @@
-"""Absolute places from changes of gradient and curvature (P2 2.3): features of a map, and where a measured one lies.
+"""Positions from changes of gradient and curvature (P2 2.3): features of a map, and matching of a measured feature.
 
-P2 takes the points of change, not the values: slow biases do not matter then. A place is accepted where its distance to
-the features before agrees, the other quantity fits, and no other place explains the measurement nearly as well.
+P2 takes the points of change, not the values: slow biases do not matter then. A position is accepted where its distance
+to the earlier features agrees, the other quantity fits, and no other position explains the measurement nearly as well.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
 #: Least change: 3 permille, and from straight to a radius of 1000 m.
 _GRADIENT_CHANGE: Final = 0.003
 _CURVATURE_CHANGE_1PM: Final = 1e-3
-_LIKELIHOOD_RATIO: Final = 1e3  #: Of the place found to any other place of the window.
+_LIKELIHOOD_RATIO: Final = 1e3  #: Distance of the accepted position to any other position in the window.
 _GAP_SIGMAS: Final = 3.0  #: Disagreement with the distance to the last accepted feature.
 _FIT_LIMIT: Final = 3.0  #: Mean square of the other quantity's residual over its variance.
-SCALE_SIGMA: Final = 2e-3  #: Of a distance by wheel, as a share.
+SCALE_SIGMA: Final = 2e-3  #: Error of a distance by wheel, as a fraction.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
 HALF_LENGTH_M: Final = 60.0  #: Line before and behind a feature that is compared.
-#: Length over which a change is taken: about that between the bogies of a vehicle, which rounds what is shorter.
+#: Length over which a change is computed: about the distance of a vehicle's bogies, which smooths shorter changes.
 BASE_M: Final = 15.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineSeries:
-    """Gradient and curvature along a line, N places `STEP_M` apart."""
+    """Gradient and curvature along a line, at N points `STEP_M` apart."""
 
     arc_m: Floats  #: Shape (N,).
     gradient: Floats  #: Climb over horizontal length in rising arc length, shape (N,).
@@ -74,10 +74,11 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 
 
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
-    """Return the features of a line in order: where gradient or curvature change most within `BASE_M`.
+    """Return the features of a line in order: where gradient or curvature change most within `BASE_M`, the middle of a
+    change that is longer.
 
-    `least`, by quantity, shape (N,), of a measured line: a change must also be larger than that of either side together
-    (root sum of squares).
+    `least`, by quantity, shape (N,), of a measured line: a change must also exceed the root sum of squares of both
+    sides.
     """
     reach = 2 * max(round(BASE_M / STEP_M), 1)
     found: list[Feature] = []
@@ -89,17 +90,21 @@ def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None 
             size[size < np.hypot(least[quantity][reach:], least[quantity][:-reach])] = 0.0
         while len(size) and size.max() >= limit:
             k = int(np.argmax(size))
-            found.append(Feature(arc_m=float(series.arc_m[k + reach // 2]), quantity=quantity, change=float(change[k])))
-            size[max(k - reach, 0) : k + reach + 1] = 0.0
+            # a change that is longer lies in the middle of where it is half as large
+            less = np.flatnonzero(np.where(change * change[k] > 0.0, size, 0.0) < 0.5 * size[k])
+            first, end = int(np.max(less[less < k], initial=-1)) + 1, int(np.min(less[less > k], initial=len(size)))
+            arc = 0.5 * float(series.arc_m[first] + series.arc_m[end - 1 + reach])
+            found.append(Feature(arc_m=arc, quantity=quantity, change=float(change[k])))
+            size[max(first - reach // 2, 0) : end + reach // 2] = 0.0
     return sorted(found, key=lambda feature: feature.arc_m)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocatedFeature:
-    """Where a measured series lies on the line."""
+    """Position of a measured series on the line."""
 
     verdict: Literal["accepted", "ambiguous", "none"]
-    arc_m: float  #: Of the middle of the series; NaN unless accepted.
+    arc_m: float  #: Position of the middle of the series; NaN unless accepted.
     sigma_m: float  #: ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity.
     reason: str = ""  #: Why it is not accepted.
 
@@ -114,7 +119,7 @@ def locate(
     noise: tuple[float, float],
     last: tuple[float, float, float] | None = None,
 ) -> LocatedFeature:
-    """Return the place of a measured stretch by maximum likelihood within four sigmas of the predicted one.
+    """Return the position of a measured stretch by maximum likelihood within four sigmas of the predicted one.
 
     A constant offset of the quantity is free: a bias of the sensor does not matter.
 

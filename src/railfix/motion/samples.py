@@ -16,7 +16,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Row
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import nearest_rows
 
-#: The ratio is taken over windows of this length [ns] with so many speeds, of a train faster than this [m/s].
+#: The ratio is computed over windows of this length [ns] with this many speeds, of a train faster than this [m/s].
 _WINDOW_NS: Final = 30_000_000_000
 _LEAST_SPEEDS: Final = 10
 _NEAR_NS: Final = 150_000_000  #: A speed of the radar belongs to one by satellites that is so near [ns].
@@ -78,7 +78,7 @@ class RadarSpeeds(Samples):
 
 @dataclass(frozen=True, kw_only=True)
 class StationRanges(Samples):
-    """Two-way ranges to radio stations beside the track, N of them."""
+    """Two-way ranges to N radio stations near the track."""
 
     #: Name of the station on the ground, shape (N,).
     station: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
@@ -89,7 +89,7 @@ class StationRanges(Samples):
 
 @dataclass(frozen=True, kw_only=True)
 class GroundUnits:
-    """Surveyed radio stations beside the track, U of them."""
+    """Positions of U surveyed radio stations near the track."""
 
     name: Strings  #: Shape (U,).
     ecef_m: Floats  #: Shape (U, 3).
@@ -100,7 +100,7 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings(Samples):
-    """Balises that the train's reader has passed, at `time`; of a group the reading that the list places."""
+    """Balises that the train's reader has passed, at `time`; of a group, the reading that matches the list."""
 
     balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity, shape (N,).
     #: Standard deviation along the line that the reader reports; NaN where it reports none; shape (N,).
@@ -109,12 +109,12 @@ class BaliseReadings(Samples):
 
 @dataclass(frozen=True, kw_only=True)
 class ListedBalises:
-    """Balises, or places without one, along a line, M of them."""
+    """Balises, or reporting points without one, along a line, M of them."""
 
     name: Strings  #: Shape (M,).
     chainage_m: Floats  #: Shape (M,).
     sigma_m: Floats  #: Standard deviation of the chainage, shape (M,).
-    virtual: Masks  #: Places whose passing is reported; there is no balise; shape (M,).
+    virtual: Masks  #: Points whose passing is reported, without a balise; shape (M,).
 
     def __len__(self) -> int:
         return len(self.name)
@@ -127,16 +127,16 @@ class ListedBalises:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSamples:
-    """Samples of all sensors on board received since the chunk before."""
+    """Samples of all sensors on board received since the previous chunk."""
 
     tachometer: TachometerPulses = field(default_factory=TachometerPulses)
     inertial: InertialSamples = field(default_factory=InertialSamples)
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
-    #: Each without rows where the sensor is absent or has sent nothing.
+    #: Each has no rows where the sensor is absent or has sent nothing.
     balises: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Sensors not yet heard up to the epoch that the samples are given with (live): what they say since the epoch
-    #: before is not known. Their samples may come with the next epoch.
+    #: Sensors not received up to the epoch of the samples (live): their values since the epoch before are unknown.
+    #: Their samples may arrive with the next epoch.
     silent: frozenset[str] = frozenset()
 
     @property
@@ -154,7 +154,7 @@ class SensorSamples:
         return SensorSamples(**parts, silent=self.silent)
 
     def merge(self, later: SensorSamples) -> SensorSamples:
-        """Return these samples and others in order of time; some of the others may be older than some of these."""
+        """Return both sets of samples in order of time; late samples are sorted in."""
         parts: dict[str, Any] = {}
         for name, after in later.tables.items():
             before: Samples = getattr(self, name)
@@ -170,7 +170,7 @@ class SensorSamples:
 
 @dataclass(frozen=True, kw_only=True)
 class RadarAlarm:
-    """What the radar's speeds show against those by satellites."""
+    """Comparison of the radar's speeds with those by satellites."""
 
     kind: Literal["mounting", "silent"]  #: A step of the ratio of the speeds; no speed while the train moves.
     time: np.datetime64  #: From when on.
@@ -180,7 +180,7 @@ class RadarAlarm:
 
     @property
     def sentence(self) -> str:
-        """What to say of it."""
+        """Note for the user."""
         at = np.datetime_as_string(self.time, unit="s")
         if self.kind == "silent":
             return f"radar: from {at} on it has no speed while the train moves; is it covered, by snow or dirt?"
@@ -193,12 +193,13 @@ class RadarAlarm:
 
 @dataclass(kw_only=True)
 class RadarWatch:
-    """Ratios by window of GPS time, taken in order of time; nothing grows with the length of a session."""
+    """Ratios by window of GPS time, added in order of time; memory does not grow with the length of a session."""
 
-    ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))  #: Of the last windows.
-    #: Their numbers since the epoch of the clock.
+    #: Ratios of the last windows.
+    ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
+    #: Window numbers since the epoch of the clock.
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
-    silent: int = 0  #: Windows without a speed, one after the other.
+    silent: int = 0  #: Consecutive windows without a speed.
     _open: int = -1
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 

@@ -1,17 +1,17 @@
 r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
 
-``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; else it becomes
-one that no line has. Two rules:
+``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; otherwise it
+becomes one that no line has. Two rules:
 
-* ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It sees the acceleration of a
-  slip, not its speed: at the top of a slip the rule is silent.
-* ``"map"``: against the gradient of the line at the present place, with a latch: a slip ends only when the wheel has
-  come back to the speed carried by inertia and the pitch fits.
+* ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
+slip, not its speed: at constant slip speed the rule is silent. * ``"map"``: against the gradient of the line at the
+present position, with a latch: a slip ends only when the wheel has returned to the speed carried by inertia and the
+pitch fits.
 
-While a slip lasts, speed and distance come from the accelerometer less the pitch and its offset, learnt while the wheel
-rolls, from `LOOK_BACK_S` before the detection. The pitch is that of the line where the place is known; with a gyro the
-integral of the pitch rate, which follows the line slowly, or without the line the pitch by wheel and accelerometer (P2
-2.1(3)).
+During a slip, speed and distance come from the accelerometer less the pitch and its offset, estimated while the wheel
+rolls, from `LOOK_BACK_S` before the detection. The pitch is that of the line where the position is known; with a gyro
+it is the integral of the pitch rate, which follows the line slowly, or without the line the pitch by wheel and
+accelerometer (P2 2.1(3)).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from railfix.core.settings import Settings
 
 
 class MotionState(IntEnum):
-    """What the speed of a sample rests on."""
+    """Source of the speed of a sample."""
 
     INIT = 0  #: Nothing known yet.
     STANDING = 1  #: No pulse for a second and the body at rest.
@@ -46,11 +46,11 @@ class MotionState(IntEnum):
 
 #: Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
 _MAP_LIMIT: Final = 0.015
-#: The limit is at least so many standard deviations while the wheel rolls, over such a time: a body that pitches
-#: shakes its accelerometer too, the more the higher it is mounted.
+#: The limit is at least this many standard deviations while the wheel rolls, over this time: a pitching body shakes its
+#: accelerometer too, more so the higher it is mounted.
 _NOISE_SIGMAS: Final = 5.0
 _NOISE_S: Final = 30.0
-#: A slip ends when wheel and inertia agree so well for so long.
+#: A slip ends when wheel and inertia agree within this limit for this time.
 _LATCH_MPS: Final = 0.15
 _LATCH_SHARE: Final = 0.01
 _LATCH_S: Final = 0.5
@@ -59,9 +59,9 @@ LOOK_BACK_S: Final = 0.3  #: How long before the detection the carry begins.
 _LONGEST_CARRY_S: Final = 30.0
 #: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
 SMOOTHING_S: Final = 0.2
-_STANDING_S: Final = 1.0  #: Time without a pulse after which a vehicle at rest stands.
+_STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle counts as standing.
 _PITCH_S: Final = 20.0
-#: Time for which the body swings after a stop; its pitch then is the one of the standstill.
+#: Time for which the body swings after a stop; its pitch afterwards is that of standstill.
 _SETTLING_S: Final = 2.0
 #: Change of the pitch at standstill, duration and speed that mean rolling away.
 _ROLLING_LIMIT: Final = 0.002
@@ -77,11 +77,11 @@ class SlipLimits(Settings):
     #: Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
     p2_limit: float = Field(default=0.045, gt=0)
     confirm_s: float = Field(default=0.1, ge=0)  #: Time over the limit after which a slip is one.
-    #: The two may differ by so much more a second of the carry: 1e-3 of gravity, the offset of the accelerometer and
-    #: the error of the pitch together.
+    #: The limit grows by this much per second of carrying: 1e-3 of gravity, the offset of the accelerometer and the
+    #: error of the pitch together.
     carry_drift_mps2: float = Field(default=0.01, ge=0)
     offset_s: float = Field(default=60.0, gt=0)  #: Time constant of the accelerometer's offset.
-    #: Time constants of the gyro's pitch and bias. Without a line the pitch by wheel and accelerometer takes its place.
+    #: Time constants of the gyro's pitch and bias. Without a line the pitch by wheel and accelerometer is used instead.
     bias_s: float = Field(default=200.0, gt=0)
 
 
@@ -90,27 +90,27 @@ class SlipResult:
     """Speed and its source at N samples."""
 
     state: Codes  #: `MotionState`, shape (N,).
-    speed_mps: Floats  #: Of the wheel where it rolls, else carried; NaN in INIT and EXPIRED; shape (N,).
-    #: Integral of the speed from the first sample, each slip corrected from its look-back on; at its end by what wheel
-    #: and inertia differ by then, which has grown evenly since; shape (N,).
+    speed_mps: Floats  #: Speed of the wheel where it rolls, otherwise carried; NaN in INIT and EXPIRED; shape (N,).
+    #: Integral of the speed from the first sample. Each slip is corrected from its look-back on; at its end by the
+    #: difference of wheel and inertia, which is assumed to have grown linearly; shape (N,).
     distance_m: Floats
     #: Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses; shape (N,).
     metric: Floats
     smooth: Floats  #: Mean of the metric over `SMOOTHING_S` less the accelerometer's offset; shape (N,).
     pitch: Floats  #: Sine of the reference pitch; NaN before it is known; shape (N,).
-    gyro_bias_radps: Floats  #: Of the pitch rate, as learnt; 0 without a gyro; shape (N,).
+    gyro_bias_radps: Floats  #: Estimated offset of the pitch rate; 0 without a gyro; shape (N,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlipState:
-    """What one call of `find_slips` leaves to the next."""
+    """State of `find_slips` after a call."""
 
     time_s: float  #: Of the last sample.
     automaton: _Automaton
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the rate of the pitch from body rates (N, 3), the roll in curves taken out, shape (N,) [rad/s].
+    """Return the rate of the pitch from body rates (N, 3), the roll in curves eliminated, shape (N,) [rad/s].
 
     The body leans with the cant: ``w_y cos(phi) - w_z sin(phi)`` with ``sin(phi) = (v w_z - f_y) / g``. Raw it would be
     wrong by 3.4 mrad/s in a curve of 400 m at 17 m/s.
@@ -126,7 +126,7 @@ def heading_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats
 
 
 def roll_sine(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the sine of the roll to the right, shape (N,): what the force to the right lacks of ``v w_z``."""
+    """Return the sine of the roll to the right, shape (N,): difference of the force to the right from ``v w_z``."""
     return np.clip((speed_mps * rate_radps[:, 2] - force_mps2[:, 1]) / GRAVITY_MPS2, -0.5, 0.5)
 
 
@@ -140,11 +140,12 @@ class MotionSamples(NamedTuple):
     force_mps2: Floats  #: Specific force along the vehicle, shape (N,).
     #: Sine of the line's gradient at the vehicle, + up forward; NaN where it is not known; shape (N,).
     line_sine: Floats
-    #: Specific force to the right, pitch rate and yaw rate of the body, for the rate of the pitch (`pitch_rate_radps`)
-    #: at the speed carried through a slip: that of the wheel would lean the body; NaN for none; shape (N, 3) [m/s2,
-    #: rad/s, rad/s].
+    #: Specific force to the right, pitch rate and yaw rate of the body, for the pitch rate (`pitch_rate_radps`) at the
+    #: speed carried through a slip; the speed of the slipping wheel would yield a false lean; NaN for none; shape (N,
+    #: 3) [m/s2, rad/s, rad/s].
     body: Floats | None = None
-    #: Time since the last pulse: who creeps has pulses without a speed; else that of the last speed; shape (N,).
+    #: Time since the last pulse, since a creeping train has pulses without a speed; otherwise since the last speed;
+    #: shape (N,).
     since_pulse_s: Floats | None = None
 
 
@@ -153,7 +154,7 @@ def find_slips(
 ) -> tuple[SlipResult, SlipState | None]:
     """Return the state of the motion, its speed and distance, each sample from itself and earlier ones.
 
-    `state` is what the samples before have left; the one returned goes on with the next samples, None before the first.
+    `state` is the state after the samples before, None at the start; the returned state is for the next samples.
     """
     limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
@@ -180,7 +181,7 @@ def find_slips(
 
 
 class _Automaton:
-    """One sample after the other; the numbers that lead from one to the next."""
+    """Sequential state from one sample to the next."""
 
     def __init__(self, limits: SlipLimits) -> None:
         self.limits = limits
@@ -190,11 +191,11 @@ class _Automaton:
         self._smooth, self._limit, self._square = 0.0, _MAP_LIMIT, 0.0
         self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = 0.0
         self._rest = float("nan")
-        #: Time since a sample, speed and acceleration by inertia: what a detection looks back on.
+        #: Time, speed and acceleration by inertia of past samples, to which a detection looks back.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
 
     def copy(self, limits: SlipLimits) -> _Automaton:
-        """Return the same with numbers of its own: states handed on stay as they are."""
+        """Return a copy: states that were returned stay unchanged."""
         other = copy.copy(self)
         other.limits, other._past = limits, self._past.copy()
         return other
@@ -222,7 +223,7 @@ class _Automaton:
         if self.metric == self.metric:
             share = min(dt / SMOOTHING_S, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
-        # A held pitch is that of some place behind.
+        # A constant pitch is that of an earlier position.
         least = _MAP_LIMIT if sine == sine or rate == rate else limits.p2_limit
         self._limit = max(least, _NOISE_SIGMAS * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
@@ -244,7 +245,7 @@ class _Automaton:
         return float(pitching * (1.0 - lean * lean) ** 0.5 - yawing * lean)
 
     def _follow(self, dt: float, sine: float, by_wheel: float, rate: float) -> None:
-        """The reference pitch: the line's, with the gyro what is fast; without a line that by the wheel, slowly."""
+        """Reference pitch: from the line, with a gyro its fast part; without a line from the wheel, slowly."""
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel
         if self.pitch != self.pitch:
@@ -269,7 +270,7 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _release(self, dt: float, wheel: float, *, heard: bool) -> None:
-        """Latch: the wheel must come back to the carried speed, with a pitch that fits."""
+        """Latch: the wheel must return to the carried speed, with a pitch that fits."""
         limits = self.limits
         if limits.rule == "p2":
             back = heard and abs(self.metric) <= limits.p2_limit
@@ -286,7 +287,7 @@ class _Automaton:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
-        """The wheel turns: it is believed unless the pitch contradicts."""
+        """The wheel turns: its distance is used unless the pitch contradicts."""
         limits = self.limits
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")
@@ -333,14 +334,16 @@ class _Automaton:
         if self.state in (MotionState.STANDING, MotionState.ROLLING):
             self._watch(dt, force)
         elif self.state == MotionState.INIT:
-            return  # a sensor that was never heard may be dead
+            return  # a sensor that never sent a sample may be dead
         elif self._silent >= _STANDING_S and not abs(self.speed) > 0.5:
             self.state, self.speed, self._rest, self._apart, self._carried = MotionState.STANDING, 0.0, force, 0.0, 0.0
         elif self._carried > _LONGEST_CARRY_S:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """At rest the force is gravity's share; freed, it falls toward zero and the change is the motion."""
+        """At rest the force is the component of gravity; when released it falls toward zero, and the change is the
+        motion.
+        """
         limits = self.limits
         if self.state == MotionState.STANDING and self._silent < _STANDING_S + _SETTLING_S:
             self._rest = force

@@ -21,38 +21,38 @@ from railfix.motion.samples import TachometerPulses
 
 #: Ratios of a speed in a wrong unit to one in m/s, and the names of the units.
 _UNITS: Final = {3.6: "km/h", 2.2369: "miles per hour", 1.94384: "knots"}
-#: A ratio within this share of a unit's is that unit: more than a worn wheel (2 %), less than between two units.
+#: A ratio within this fraction of a unit's is that unit: more than a worn wheel (2 %), less than between two units.
 _UNIT_SHARE: Final = 0.05
-LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Below it there is no output (P2 1; 1 km/h).
+LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Lowest speed of the output (P2 1; 1 km/h).
 
 
 class TachometerLimits(Settings):
     """Wheel and window of a tachometer."""
 
-    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: As entered on board.
+    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: As configured on board.
     pulses_per_turn: int = Field(default=60, ge=1)  #: After multiplication of edges.
-    #: Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth take
-    #: that of a whole turn.
+    #: Time over which speeds are taken. P2 3.2 gives 0.1 s as the usual smoothing of a tachometer; with uneven teeth
+    #: use the time of a whole turn.
     window_s: float = Field(default=0.1, gt=0)
-    silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which there is no output.
+    silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which the output is NaN.
     #: Standard deviation of a pulse's instant, and the step of its clock.
     jitter_s: float = Field(default=5e-6, ge=0)
     resolution_s: float = Field(default=1e-6, ge=0)
 
     @property
     def pulse_m(self) -> float:
-        """Way of one pulse [m]."""
+        """Distance per pulse [m]."""
         return float(np.pi) * self.wheel_diameter_m / self.pulses_per_turn
 
 
 @dataclass(frozen=True, kw_only=True)
 class PulseSpeeds:
-    """Speeds at N instants asked for."""
+    """Speeds at N requested instants."""
 
-    #: Instant at which each speed holds, earlier than the one asked for; NaT where there is none; shape (N,).
+    #: Instant at which each speed is valid, earlier than requested; naT where missing; shape (N,).
     time: Datetimes
-    speed_mps: Floats  #: With the sign of the direction; NaN where the pulses say nothing; shape (N,).
-    sigma_mps: Floats  #: By jitter and clock; the wheel's scale comes beside it; shape (N,).
+    speed_mps: Floats  #: Signed by the direction; NaN where the pulses give no speed; shape (N,).
+    sigma_mps: Floats  #: Standard deviation by jitter and clock; the wheel's scale error is separate; shape (N,).
 
 
 def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> PulseSpeeds:
@@ -90,7 +90,7 @@ def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
 
 
 def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
-    """Return the difference of two speeds over that of the instants they hold at [m/s2]; NaN where one is missing."""
+    """Return the difference of two speeds over that of their instants [m/s2]; NaN where one is missing."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((late.speed_mps - early.speed_mps) / seconds(late.time - early.time))
 
@@ -98,8 +98,8 @@ def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
 def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
     """Return the signed distance run up to instants, from pulses up to each, shape (N,) [m].
 
-    Between pulses the distance goes on at the last speed, by less than one pulse. 0 before the first pulse. Where the
-    sensor has no direction every pulse counts forward.
+    Between pulses the distance continues at the last speed, by less than one pulse. It is 0 before the first pulse.
+    Where the sensor has no direction every pulse counts forward.
     """
     limits = limits or TachometerLimits()
     if not len(pulses):
@@ -117,8 +117,8 @@ def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerL
 def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     """Return pulses before which one was lost, and pulses that are one of a doubled pair, shapes (P,).
 
-    An interval of twice both neighbours holds a lost pulse (also one that `pulse` numbers show); two successive
-    intervals of together one neighbour are a doubled one.
+    An interval twice as long as both neighbours hides a lost pulse (also shown by `pulse` numbers); two successive
+    intervals that together equal one neighbour are a doubled pulse.
     """
     count = len(pulses)
     lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
@@ -127,7 +127,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     interval = seconds(np.diff(pulses.time))
     before, after = interval[:-2], interval[2:]
     even = np.abs(before - after) < 0.3 * np.minimum(before, after)
-    with np.errstate(divide="ignore", invalid="ignore"):  # pulses of one time tag
+    with np.errstate(divide="ignore", invalid="ignore"):  # pulses with the same time tag
         lost[2:-1] = even & (np.abs(interval[1:-1] / (0.5 * (before + after)) - 2.0) < 0.3)
     lost[1:] |= np.diff(pulses.pulse) > 1
     pair = interval[1:-2] + interval[2:-1]
@@ -138,7 +138,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 
 
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
-    """Return the number of lost and doubled pulses seen up to instants, two pulses late, shape (N,)."""
+    """Return the number of lost and doubled pulses detected up to instants, two pulses late, shape (N,)."""
     lost, doubled = tooth_faults(pulses)
     total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
     return np.asarray(total[np.maximum(np.searchsorted(pulses.time, time, side="right") - 2, 0)], dtype=np.int64)
@@ -150,10 +150,10 @@ class SpeedCheck:
 
     ratio: float  #: Logged over right, without the unit.
     unit: str  #: "m/s", or the unit that the log is really in.
-    lag_s: float  #: By how much its time tags are late.
+    lag_s: float  #: Delay of its time tags.
 
 
-#: Largest lag that is looked for [s].
+#: Largest lag that is searched for [s].
 _LARGEST_LAG_S: Final = 3.0
 
 
@@ -198,7 +198,7 @@ _FASTEST_MPS: Final = 150.0  #: Highest plausible speed [m/s].
 
 @dataclass(frozen=True, kw_only=True)
 class Wheel:
-    """A tachometer with the distance of one pulse."""
+    """A tachometer with its distance per pulse."""
 
     pulses: Pulses
     pulse_m: float
@@ -230,8 +230,8 @@ def _cumulate(run: Floats, step: Floats) -> Floats:
     known = np.isfinite(step)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
     open_ = np.isnan(run)
-    # An instant between two unknown steps belongs to no stretch; one at the edge of a stretch stays with it, and
-    # the first instant after a hole is given up so that no difference spans it.
+    # An instant between two unknown steps belongs to no stretch; an instant at the edge of a stretch belongs to it. The
+    # first instant after a gap is dropped so that no difference spans the gap.
     open_[1:] |= ~known
     return np.where(open_, np.nan, total)
 

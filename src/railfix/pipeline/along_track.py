@@ -32,7 +32,7 @@ from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, 
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
+#: Reasons with which a code is still used: the filter weighs multipath and faults itself, over more than one epoch.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK
@@ -43,16 +43,17 @@ _WEIGHED_BY_FILTER: Final = (
 )
 #: Reasons against the code alone: the filter keeps the satellite's phase and Doppler.
 _CODE_ALONE: Final = Reason.GROSS_ERROR
-#: Slower than this, with two sigmas, the train stands [m/s]: 1 km/h, where tachometers give out too.
+#: Slower than this, with two sigmas, the train counts as standing [m/s]: 1 km/h, below which tachometers give no output
+#: either.
 STANDSTILL_MPS: Final = 1.0 / 3.6
-#: Places beyond an end of the line by so many sigmas, or so far [m], are on its end.
+#: Positions beyond an end of the line by at most this many sigmas, or this distance [m], are moved to its end.
 _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
-#: Gate of two-way ranges against the predicted one, in standard deviations; least width toward long ones: echoes are
+#: Gate of two-way ranges against the predicted one, in standard deviations; least width toward long ranges: echoes are
 #: late, and separate from 0.3 m on (P2, table 3) [m].
 _GATE_SIGMAS: Final = 3.0
 _LATE_M: Final = 0.6
-#: With sensors, epochs of so much GPS time go through the filter together [ns].
+#: With sensors, the filter processes blocks of this much GPS time [ns].
 _BLOCK_NS: Final = 5_000_000_000
 #: A direction is given where the speed is beyond this many of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
@@ -69,11 +70,11 @@ def along_track(
     samples: SensorSamples | None = None,
     references: LineReferences | None = None,
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the filtered positions of one antenna after all screens and exclusions, and the state to pass on.
+    """Return the filtered positions of one antenna after all screens and exclusions, and the state for the next chunk.
 
     The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
-    Samples are those of the sensors on board since the chunk before; they meet features of the line, ground units and
-    balises of `references`.
+    Samples are those of the sensors on board since the previous chunk; `references` has the line's features, ground
+    units and balises.
     """
     epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
     epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
@@ -119,7 +120,7 @@ def along_track(
 
 
 def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
-    """Return places whose finite levels are at least what a pull may have got to unseen."""
+    """Return positions whose finite levels are at least the error that an undetected pull may have reached."""
     levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
     return replace(
         tracked, **{n: np.where(np.isfinite(level), np.fmax(level, bound_m), level) for n, level in levels.items()}
@@ -141,7 +142,8 @@ def _against_wheel(
 def apply_spacing_verdict(
     result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions with the verdict on distance and speed from those of the other antenna, and the state.
+    """Check distance and speed against those of the other antenna; return the positions with the verdict, and the
+    state.
 
     A verdict of shape (T,), None without any, lasts for `held_s` after it.
     """
@@ -163,7 +165,9 @@ def with_passings(
     samples: SensorSamples | None,
     limits: BaliseLimits,
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions with the balises that were passed, and the state; after the last verdict on the places."""
+    """Return the positions with the balises that were passed, and the state; called after the last verdict on the
+    positions.
+    """
     if listed is None:
         return result, state
     readings = samples.balises if samples else BaliseReadings()
@@ -172,7 +176,7 @@ def with_passings(
 
 
 def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
-    """Return places with a status of doubt at some epochs; nothing bounds their error there."""
+    """Return positions with a status of doubt at some epochs; their error is not bounded there."""
     if not doubtful.any():
         return tracked
     reported = np.where(doubtful, np.int8(status), tracked.status)
@@ -192,12 +196,12 @@ def _run_filter(
     references: LineReferences | None,
     alone: tuple[Floats, Floats],
 ) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
-    """Return the places of the filter, motion by the sensors, what the smoother starts from, and the state to pass on.
+    """Return the filter's positions, motion by the sensors, the smoother's input, and the state for the next chunk.
 
     `alone`: arc lengths by single epochs and their standard deviations, shape (T,) each [m].
 
-    With sensors the epochs are taken in stretches of `_BLOCK_NS` of GPS time, however the log is cut: the place by
-    the wheel, for the gradient there, begins each from the place of the filter.
+    With sensors the epochs are processed in blocks of `_BLOCK_NS` of GPS time, independent of the chunks: the position
+    by the wheel, which gives the gradient, begins each block at the position of the filter.
     """
 
     def sine_at(arc_m: Floats) -> Floats:
@@ -260,9 +264,11 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return ranges that fit the place of the filter: echoes come late, a unit surveyed wrongly fits nowhere (P2 3.3).
+    """Return ranges that match the position of the filter: echoes come late, a wrongly surveyed unit matches nowhere
+    (P2 3.3).
 
-    The place goes on at the filter's speed since the stretch began, so that the gate opens with the square of time.
+    The position is predicted with the filter's speed since the block began, so that the gate widens with the square of
+    time.
     """
     fixed = state.anchor
     if fixed is None:
@@ -285,7 +291,7 @@ def _block(time: np.datetime64) -> int:
 
 
 def _restart_state(state: FilterState, fixed: FilterFix) -> FilterState:
-    """Return the state at the beginning of a stretch: what the sensors carry begins from the place of the filter."""
+    """Return the state at the beginning of a block: dead reckoning begins at the position of the filter."""
     sensors = state.sensors
     if sensors.motion.tick:
         motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
@@ -304,8 +310,8 @@ def _find_fix(tracked: Tracked) -> FilterFix:
 def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:
     """Return arc lengths on the trajectory, shape (T,) [m].
 
-    Beyond an end by no more than errors allow (four sigmas, or those of codes at a start) a place is that end; NaN
-    further out.
+    A position beyond an end by no more than errors allow (four sigmas, or those of codes at a start) is moved to that
+    end; NaN further out.
     """
     arc, end = tracked.arc_m, trajectory.arc_m[-1]
     near = np.clip(arc, 0.0, end)
@@ -322,11 +328,11 @@ def gnss_epochs(
 ) -> tuple[GnssEpochs, CycleSlipState | None]:
     """Return the measurements of the filter, and the state of the slip detection.
 
-    A code is the corrected pseudorange, NaN where there is a reason against it that the filter does not weigh itself;
-    its standard deviation is that of the range times `noise_scale`, shape (T,).
+    A code is the corrected pseudorange, NaN where it has a rejection reason that the filter does not weigh itself; its
+    standard deviation is that of the range times `noise_scale`, shape (T,).
 
     The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in
-    the Dopplers; the change of the carrier phase has both taken off.
+    the Dopplers; the change of the carrier phase has both subtracted.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state
@@ -343,7 +349,7 @@ def gnss_epochs(
         np.where(np.isnan(air), 0.0, air),
     )
     epochs = GnssEpochs(
-        time=obs.time, satellite=ranges.satellite, clock=ranges.channels.clock,
+        time=obs.time, satellite=ranges.satellite, signal=ranges.signal, clock=ranges.channels.clock,
         sat_ecef_m=ranges.satellites.position_ecef_m, sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
         code_m=np.where(healthy, ranges.corrected_code_m, np.nan), code_sigma_m=ranges.sigma_m * noise_scale[:, None],
         phase_m=np.where(moving & phases, phase, np.nan), phase_joined=~slips.slip[:, columns],

@@ -1,8 +1,8 @@
-"""Results of antennas with every intermediate value, and what two antennas of one vehicle show each other.
+"""Results of antennas with every intermediate value, and comparison of the two antennas of one vehicle.
 
-Each antenna is positioned on its own trajectory, with its own offset from the vehicle. With the logs exchanged, or the
-vehicle turned round, both positions fit their ranges, but the front antenna comes out as far behind the rear one as
-it should be ahead.
+Each antenna is positioned on its own trajectory, with its own offset on the vehicle. With exchanged logs, or the
+vehicle turned round, both positions fit their ranges, but the front antenna appears as far behind the rear one as it
+should be ahead.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from railfix.track.trajectory import Trajectory
 
 @lru_cache
 def with_coordinates(failed_checks: str) -> Masks:
-    """Return which statuses come with coordinates, by the number of the status; of `Config.failed_checks`."""
+    """Return the statuses that have coordinates, by number of the status; by `Config.failed_checks`."""
     dropped = CHECK_FAILED if failed_checks == "drop" else ()
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))
 
@@ -61,7 +61,9 @@ def reason_of_all_channels(corrected: CorrectedRanges, combined: Combined | None
 def antenna_results(
     chunk: Chunk, antennas: AntennaRows, solution: Solution, chainage_m: Floats, config: Config
 ) -> AntennaResult:
-    """Return the result of one antenna, or of the rows of several; `chainage_m` of all positions, shape (T,)."""
+    """Return the result of one antenna, or of the rows of several antennas; `chainage_m` of all positions,
+    shape (T,).
+    """
     corrected = chunk.corrected
     obs, point, constrained = corrected.observations, solution.point, solution.fix.constrained
     has = with_coordinates(config.failed_checks)[solution.status]
@@ -122,7 +124,7 @@ def _nearest(line: Trajectory, ecef_m: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 class PositionVerdict(NamedTuple):
-    """Verdict of a screen on the positions of one antenna: doubtful ones get the status."""
+    """Verdict of a screen on the positions of one antenna: suspected positions get the status."""
 
     name: str
     screened: Screened
@@ -148,7 +150,7 @@ def position_verdicts(
 def filter_verdicts(
     screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, filtered: Mapping[str, FilteredMotion]
 ) -> dict[str, Screened]:
-    """Return the verdicts of the screens of positions on the places by the filter, by antenna."""
+    """Return the verdicts of the position screens on the filter's positions, by antenna."""
     checks: dict[str, Screened] = {}
     for screen, limits in screens:
         if pair is None:
@@ -162,7 +164,7 @@ def filter_verdicts(
 
 
 def filter_inputs(result: AntennaResult, off_map: Masks, limits: MapOffsetLimits) -> SingleEpochs:
-    """Return what the filter uses of the results of single epochs; `off_map` as in `SingleEpochs`."""
+    """Return the results of single epochs that the filter uses; `off_map` as in `SingleEpochs`."""
     return SingleEpochs(
         noise_scale=result.noise_scale,
         arc_m=result.arc_m,
@@ -192,7 +194,7 @@ def apply_wheel_sign(
     return after
 
 
-#: Pairs of positions within so much of the line share their reflections, and count as one sample [m].
+#: Pairs of positions within this distance along the line share their reflections, and count as one sample [m].
 _STRETCH_M: Final = 50.0
 #: Stretches before there is a verdict: a train at rest has too few.
 _LEAST_STRETCHES: Final = 4
@@ -219,15 +221,15 @@ class AntennaOrder:
         apart = float(np.median(front.chainage_at(arcs[0]) - rear.chainage_at(arcs[1])))
         self._facing = front.front_sign
         self.distance_m = self._facing * rising
-        self._reference_m = apart - rising  # chainages may be those of a point of the vehicle
+        self._reference_m = apart - rising  # chainages may refer to a point of the vehicle
         self._tolerance_s = tolerance_s
-        #: By stretch of line: pairs, sum of their distances [m], sum of their variances [m^2].
+        #: Per stretch of line: pairs, sum of their distances [m], sum of their variances [m^2].
         self._stretches: dict[int, tuple[float, float, float]] = {}
 
     def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
-        """Add the positions of more epochs; whether the train is on a stretch not seen before.
+        """Add the positions of more epochs; return whether the train is on a new stretch.
 
-        Of each antenna time tags, chainage [m] and its sigma [m], shape (F,) and (R,); NaN where there is no position.
+        For each antenna time tags, chainage [m] and its sigma [m], shape (F,) and (R,); NaN without a position.
         """
         at_front, at_rear = pair_epochs(front[0], rear[0], tolerance_s=self._tolerance_s)
         (place, other), (sigma, other_sigma) = (
@@ -251,8 +253,8 @@ class AntennaOrder:
     def measure(self) -> tuple[float, float]:
         """Return the mean distance of the front antenna ahead of the rear one, and its sigma [m]; NaN before a verdict.
 
-        A stretch has the mean of its distances with the variance of a single pair, as what disturbs the positions there
-        does not average out; where the stretches scatter more than that, the sigma grows.
+        The mean distance of a stretch has the variance of a single pair, as its disturbances do not average out; where
+        the stretches scatter more than that, the sigma grows.
         """
         if len(self._stretches) < _LEAST_STRETCHES:
             return float("nan"), float("nan")

@@ -1,8 +1,8 @@
-"""Balises and virtual balises: places of the filter by those that were read, and the passing of each.
+"""Balises and virtual balises: positions of the filter at the readings, and the passing of each.
 
-The train was over a place at arc length m some time while ``|m - s| <= L``, s the place of the filter and L its level
-along the line. The interval ends where the place is certainly behind. A passing takes the train from one side to the
-other, also where it backs.
+The train was over a balise at arc length m at some time while ``|m - s| <= L``, s the position of the filter and L its
+level along the line. The interval ends where the balise is certainly behind. A passing takes the train from one side to
+the other, also when it reverses.
 """
 
 from __future__ import annotations
@@ -21,15 +21,18 @@ from railfix.motion.samples import BaliseReadings, ListedBalises
 from railfix.track.trajectory import Trajectory, short_distance_m
 from railfix.tracking import BaliseEpochs, Tracked
 
-#: An identity read again within this time is the same passing [s]: a second balise of a group, or a train that stands.
+#: An identity read again within this time belongs to the same passing [s]: a second balise of a group, or a standing
+#: train.
 AGAIN_S: Final = 60.0
 
 
 class BaliseLimits(Settings):
     """Reader of balises on the vehicle."""
 
-    ahead_m: float = 0.0  #: Place of the reader ahead of the vehicle's middle, without a vehicle file of the antenna.
-    #: Least standard deviation of a reading along the line: SUBSET-036 has 1 m for the vital use of a balise's place.
+    #: Position of the reader ahead of the vehicle's middle, for an antenna without a vehicle file.
+    ahead_m: float = 0.0
+    #: Least standard deviation of a reading along the line: SUBSET-036 has 1 m for the vital use of a balise's
+    #: position.
     sigma_m: float = Field(default=1.0, gt=0)
 
 
@@ -80,38 +83,39 @@ def balise_epochs(
     return found, state
 
 
-#: Verdicts on a place or a reading.
+#: Verdicts on a passing or a reading.
 VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
-#: Confidence of an odometer by SUBSET-041 5.2.1.1: so much, and a share of the distance since the last balise read.
+#: Confidence of an odometer by SUBSET-041 5.2.1.1: a constant, and a fraction of the distance since the last balise
+#: read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
-#: Epochs further apart have nothing between them [s]; a reading may be so far outside of the interval of its passing.
+#: Epochs farther apart are not connected [s]; largest distance of a reading from the interval of its passing.
 _APART_S: Final = 2.0
-#: A balise further than this from the place of the filter is wrong.
+#: A balise farther than this from the position of the filter is wrong.
 _CONTRADICTION_SIGMAS: Final = 5.0
 _NEVER: Final = np.datetime64("NaT", "ns")
-#: Of the filter, at each epoch.
+#: Values of the filter, at each epoch.
 _VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Passing:
-    """A place that was passed, or a balise that was read where the filter is not."""
+    """A passing of a listed point, or a reading of a balise where the filter is not."""
 
     balise: str
-    #: Number of one of `VERDICTS`: a place without a balise; a balise that was read, or was not though it was passed; a
+    #: Index in `VERDICTS`: a point without a balise; a balise that was read, or was not read though it was passed; a
     #: reading that contradicts the filter, or of a balise that is not listed.
     verdict: int
     chainage_m: float  #: As listed; NaN where it is not.
-    #: Of the passing, by the filter, with its interval; of a contradicting reading the instant of the reading, NaT.
+    #: Time of the passing by the filter, with its interval; for a contradicting reading the time of the reading, NaT.
     time: np.datetime64
     earliest: np.datetime64 = _NEVER
     latest: np.datetime64 = _NEVER
     read: np.datetime64 = _NEVER  #: Time of the reading; NaT without one.
-    read_error_m: float = float("nan")  #: Listed place less that of the filter at the reading.
-    here: str = ""  #: For a reading that contradicts: the balise that is listed nearest to the place of the filter.
-    #: At the passing, or reading: speed, standard deviation, level and over- and under-reading amount of the place, and
-    #: what an odometer that meets SUBSET-041 is allowed since the balise read before.
+    read_error_m: float = float("nan")  #: Listed chainage less that of the filter at the reading.
+    here: str = ""  #: For a reading that contradicts: the listed balise nearest to the position of the filter.
+    #: At the passing or reading: speed, standard deviation, level and over- and under-reading amount of the position,
+    #: and the error allowed to an odometer that meets SUBSET-041 since the previous balise.
     speed_mps: float = float("nan")
     sigma_m: float = float("nan")
     level_m: float = float("nan")
@@ -121,20 +125,20 @@ class Passing:
 
 @dataclass(frozen=True, kw_only=True)
 class PassingState:
-    """What one chunk leaves to the next; M places."""
+    """State after a chunk; M places."""
 
     time: Datetimes  #: Shape (1,) or (0,).
-    values: Floats  #: Of the last epoch with a place, as `_VALUES`; shape (1, 5) or (0, 5).
-    #: On which side of each place the train was last for certain: -1 before it, 1 beyond, 0 not known; shape (M,).
+    values: Floats  #: Values of the last epoch with a position, as `_VALUES`; shape (1, 5) or (0, 5).
+    #: Last certain side of the train at each point: -1 before it, 1 beyond, 0 unknown; shape (M,).
     side: Integers
-    #: When that ended, and when the place of the filter was last over it; shape (M,).
+    #: Time when that ended, and when the filter's position was last over it; shape (M,).
     since: Datetimes
     over: Datetimes
     over_values: Floats  #: `_VALUES` then, and the odometer's confidence; shape (M, 6).
     read: Datetimes  #: Last reading, shape (M,).
     #: Not yet compared, as the epoch after them is to come.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Readings that were right, the last one `_APART_S` before the chunk's end first, with the filter's place [m].
+    #: Correct readings, beginning with the last one `_APART_S` before the chunk's end, with the filter's position [m].
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -158,7 +162,7 @@ def find_passings(
 ) -> tuple[tuple[Passing, ...], PassingState]:
     """Return the passings that ended in a chunk and the readings in it that are wrong, and the state to pass on.
 
-    `listed` has balises and virtual ones, `readings` are those since the chunk before, `tracked` has levels.
+    `listed` has balises and virtual ones, `readings` are those since the previous chunk, `tracked` has levels.
     """
     state = state or PassingState.empty(len(listed))
     own = trajectory.arc_at_chainage(listed.chainage_m)
@@ -219,7 +223,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Return the confidence of an odometer at a place since the balise before it that was read [m]; NaN without one."""
+    """Return the confidence of an odometer at a point since the previous balise that was read [m]; NaN without one."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 

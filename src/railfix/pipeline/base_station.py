@@ -29,12 +29,14 @@ from railfix.track.trajectory import Trajectory
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
 _NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
-#: Positions of a station that differ by no more are the same [m].
+#: Positions of a station that differ by no more than this are equal [m].
 _SAME_PLACE_M: Final = 0.01
 
 
 class Stations(NamedTuple):
-    """Surveyed places: units of two-way ranges, a base station ("stream": its position is in its headers), balises."""
+    """Surveyed positions: units of two-way ranges, a base station ("stream": its position is in its
+    headers), balises.
+    """
 
     units: GroundUnits | None = None
     base_ecef_m: Floats | Literal["stream"] | None = None
@@ -43,18 +45,18 @@ class Stations(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BaseState:
-    """Errors of a base station so far, None before the first, and state of its carrier-phase stages."""
+    """Errors of a base station so far, None at the start, and state of its carrier-phase stages."""
 
     errors: BaseErrors | None = None
     carrier: CarrierState = field(default_factory=CarrierState)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the station lacks, one sentence."""
+        """Missing data of the station, one sentence."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
-        """Return what is known, with the errors of the station and what it lacks."""
+        """Return the received data with the errors of the station and a note on its missing data."""
         notes = tuple(note for note in received.notes if note != _NO_EPOCH)
         return replace(received, base=self.errors, notes=(*notes, *self.notes))
 
@@ -64,7 +66,7 @@ class BaseStation:
 
     Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase where
     available, which reduces the station's own noise. The station's own multipath remains. With "stream" the position is
-    that of the headers of its observations; a station that moves by more than a centimetre (the next virtual one)
+    that in the headers of its observations; a station that moves by more than a centimetre (the next virtual one)
     restarts.
     """
 
@@ -82,7 +84,7 @@ class BaseStation:
     def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
-        """Return the state after more observations of the station, without what no epoch from `began` on needs."""
+        """Return the state after more observations of the station, without data that no epoch from `began` on needs."""
         state = state or BaseState()
         if obs is not None and len(obs):
             place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m

@@ -80,7 +80,7 @@ def smooth_ranges(
     config: Config,
     states: Sequence[CarrierState],
 ) -> tuple[CorrectedRanges, list[CarrierState]]:
-    """Return the ranges with their codes smoothed by their phases; the weights stay those of raw codes.
+    """Return the ranges with smoothed codes; the weights remain those of raw codes.
 
     Multipath and the error floor are not averaged out as white noise is.
     """
@@ -163,7 +163,7 @@ def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks,
 def _lasting(
     corrected: CorrectedRanges, ranges: Ranges, phases: Phases, limits: PhaseLimits, state: CarrierState
 ) -> tuple[Ranges, Phases]:
-    """Return ranges and phases whose multipath lasts `PhaseLimits.correlation_s`: weights fall to their share of it.
+    """Return ranges and phases for multipath that lasts `PhaseLimits.correlation_s`: weights are reduced accordingly.
 
     The first epoch of an arc counts in full, so that the weights of an arc add up to its independent epochs.
     """
@@ -176,7 +176,9 @@ def _lasting(
 
 
 def _integer_channels(corrected: CorrectedRanges) -> IntegerChannels:
-    """Return wavelengths, and which channels share a clock and a signal; GLONASS has a frequency each: no integers."""
+    """Return wavelengths, and the channels that share a clock and a signal; GLONASS has a frequency each:
+    no integers.
+    """
     names = zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True)
     labels = ["" if name[0] == "R" else CLOCK_GROUP[name[0]] + signal for name, signal in names]
     _, group = np.unique(labels, return_inverse=True)

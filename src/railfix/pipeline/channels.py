@@ -17,7 +17,7 @@ from railfix.ranges.second_codes import SecondCodes
 
 
 def missing_notes(received: Received, config: Config, second: SecondCodes | None) -> tuple[str, ...]:
-    """Return notes where no navigation record is known, and where two frequencies are asked for and one is used."""
+    """Return notes where navigation records are missing, and where one frequency is used though two are requested."""
     known, notes = received.navigation, []
     if known.precise is None and not len(known.kepler) and not len(known.glonass):
         notes.append("no navigation record is known; give navigation to EpochProcessor or to process")
@@ -28,7 +28,7 @@ def missing_notes(received: Received, config: Config, second: SecondCodes | None
     return tuple(notes)
 
 
-#: Sets of channels remembered.
+#: Number of cached sets of channels.
 _REMEMBERED: Final = 64
 
 
@@ -47,7 +47,7 @@ class ChannelBook:
         self._known: dict[tuple[object, ...], Channels] = {}
 
     def of(self, obs: Observations, navigation: Navigation) -> Channels:
-        """Return the channels of some observations; GLONASS frequencies are those of the log, then of the records."""
+        """Return the channels of some observations; GLONASS frequencies are those of the log, or of the records."""
         glonass = {**glonass_channels(navigation), **obs.header.glonass_channel}
         key = (
             obs.satellite.tobytes(),

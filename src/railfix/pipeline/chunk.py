@@ -18,15 +18,15 @@ from railfix.screens import PairedEpochs, Screened
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """Epochs of all antennas, those of one after those of the other, and what the stages so far have found."""
+    """Epochs of all antennas, concatenated, and the results of the stages so far."""
 
     corrected: CorrectedRanges  #: Corrected ranges with the verdicts so far.
-    rows: Mapping[str, slice]  #: Epochs of each antenna among those of all.
+    rows: Mapping[str, slice]  #: Rows of each antenna among those of all.
     screens: Mapping[str, Screened]  #: Metric and verdict of each screen of the observations.
     combined: Combined | None  #: How codes of two frequencies were combined.
-    slips: Slips | None  #: Of all channels of the observations, where the carrier phase is used.
+    slips: Slips | None  #: Wavelength of all channels of the observations, where the carrier phase is used.
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
-    sensors: SensorSamples | None  #: Samples of the sensors on board since the chunk before.
+    sensors: SensorSamples | None  #: Samples of the sensors on board since the previous chunk.
     notes: tuple[str, ...]
     results: Mapping[str, AntennaResult] = field(default_factory=dict)  #: Single epochs by antenna, once positioned.
     #: The train is away from the line, epochs of all antennas; empty before they are positioned.

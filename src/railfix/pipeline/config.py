@@ -1,7 +1,6 @@
 """Settings of a run: one frozen model, from Python or from TOML; misspelt keys are rejected.
 
-Each package defines its own limits; this module puts them side by side under the names that the
-configuration file uses::
+Each package defines its own limits; this module collects them under the names that the configuration file uses::
 
     preset = "default"
     systems = ["G", "J", "E", "C"]
@@ -56,7 +55,7 @@ FILTER_SOURCES: Final[tuple[FilterSource, ...]] = (
     "code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range",
 )  # fmt: skip
 
-#: Names of the screens, in the order in which they judge.
+#: Names of the screens, in the order in which they are run.
 SCREEN_NAMES: Final = tuple(screen.name for screen in SCREENS)
 
 #: Settings by the name of their preset. "strict": accuracy before availability. "p1": exactly table 6
@@ -96,13 +95,13 @@ else:
         "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
     )
 
-#: Time off the map after which the filter gives up its place, or on it restarts. On the recordings, with a right
-#: map, no two positions in a row are off it.
+#: Time off the map after which the filter drops its position, or on it after which it restarts. On the recordings, with
+#: a right map, no two positions in a row are off it.
 OFF_MAP_S: Final = 10.0
 
 
 class Config(ScreenSettings):
-    """Settings of the positioning, each with its default and where that comes from.
+    """Settings of the positioning, each with its default and the default's source.
 
     Attributes
     ----------
@@ -112,8 +111,8 @@ class Config(ScreenSettings):
 
     #: Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz and 10
     #: dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m with one clock for both receivers (P1 2.3(3)),
-    #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not specify
-    #: (weights, noise, inter-system biases, ambiguous sections) is as in "default".
+    #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. Settings that P1 does not
+    #: specify (weights, noise, inter-system biases, ambiguous sections) are as in "default".
     preset: Literal["default", "strict", "p1"] = "default"
     #: Constellations used. GLONASS is left out by default: its channels have code biases of metres between them.
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
@@ -146,7 +145,7 @@ class Config(ScreenSettings):
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the delay.
     #: Limit on the age of a record, tighter than its validity.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
-    #: In place of the track's own map error (P1: 0.30 m, 0.60 m).
+    #: Replacement of the track's own map error (P1: 0.30 m, 0.60 m).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
@@ -156,26 +155,26 @@ class Config(ScreenSettings):
     map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
     interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
     noise: CodeNoise = CodeNoise()  #: Limits of the weights and the screens.
-    #: Logs of SBAS messages, or "stream" for those of the receivers: their corrections take the place of the models,
-    #: and satellites without a valid one are rejected. Empty: no SBAS.
+    #: Logs of SBAS messages, or "stream" for those of the receivers: their corrections replace the models, and
+    #: satellites without a valid one are rejected. Empty: no SBAS.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
-    #: Messages that count: those of L1 correct GPS L1 C/A, those of L5 (dual-frequency) the ionosphere-free codes of
-    #: GPS L1 C/A and L5, Galileo E1 and E5a. Satellites without both codes are rejected.
+    #: Messages to use: those of L1 correct GPS L1 C/A, those of L5 (dual-frequency) the ionosphere-free codes of GPS L1
+    #: C/A and L5, Galileo E1 and E5a. Satellites without both codes are rejected.
     sbas_band: Literal["L1", "L5"] = "L1"
-    #: GEO whose messages are used; "best" is the one with the most usable fast corrections (L5: most corrections).
+    #: GEO whose messages are used; "best" is the GEO with the most usable fast corrections (L5: most corrections).
     sbas_prn: int | Literal["best"] = "best"
     sbas_limits: SbasLimits = SbasLimits()  #: Time-outs, use of message type 0, treatment of missing degradation data.
     base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
     #: Errors by direction and C/N0 (``railfix error-model``): in the protection level the sigma of no range falls below
-    #: their overbounds. Weights, screens and RAIM stay those of `noise`. Without it the level is based on `noise` times
+    #: their overbounds. Weights, screens and RAIM still use `noise`. Without it the level is based on `noise` times
     #: the scale estimated so far, which bounds no tails.
     error_model: Path | None = None
     #: Satellite and atmospheric errors, added to a model of local errors where SBAS does not give them.
     nominal: NominalErrors = NominalErrors()
     protection: Literal["on", "off"] = "on"  #: Protection level along the line with its parts.
-    #: Integrity risk per hour, its shares, and the fault probabilities that the level assumes.
+    #: Integrity risk per hour, its allocation, and the fault probabilities that the level assumes.
     risk: RiskBudget = RiskBudget()
-    #: Integrity support message (TOML, ``docs/protection-level.md``): its satellites have ARAIM levels besides, along
+    #: Integrity support message (TOML, ``docs/protection-level.md``): its satellites get additional ARAIM levels, along
     #: the track and in 3-D. Not with SBAS.
     integrity_support: Path | None = None
     araim: AraimBudget = AraimBudget()  #: Allocation of the risk of these.
@@ -187,9 +186,9 @@ class Config(ScreenSettings):
     #: Whether positions also get P4's level: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
     #: Use of the carrier phase: none; codes smoothed by it; or code and phase together with float ambiguities, from
-    #: this and earlier epochs, and with integer ones beside a base station ("fixed"). On recordings smoothing helps
-    #: most on a phone, float ambiguities under open sky; in towns, where arcs last seconds, neither removes large
-    #: errors.
+    #: this and earlier epochs, or with integer ambiguities, which need a base station ("fixed"). On recordings
+    #: smoothing helps most on a phone, float ambiguities under open sky; in towns, where arcs last seconds, neither
+    #: removes large errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
@@ -199,7 +198,7 @@ class Config(ScreenSettings):
     continuity: ContinuityLimits = ContinuityLimits()
     phase: PhaseLimits = PhaseLimits()
     #: Filter along the track: codes, Dopplers, changes of the carrier phase and sensors, from this and earlier epochs.
-    #: `railfix run` and `railfix demo` ask for it.
+    #: `railfix run` and `railfix demo` request it.
     filter: Literal["track", "off"] = "track"
     #: Measurements that the filter uses: `code`, `phase` and `doppler` of the satellites, and `wheel`, `radar`,
     #: `force`, `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the sensors on board.
@@ -241,7 +240,7 @@ class Config(ScreenSettings):
     @classmethod
     def _codes_and_each_once(cls, value: tuple[FilterSource, ...]) -> tuple[FilterSource, ...]:
         if "code" not in value or len(set(value)) != len(value):
-            raise ValueError("name each measurement once, code among them: places are sought by codes")
+            raise ValueError("name each measurement once, code among them: the filter starts from codes")
         return tuple(name for name in FILTER_SOURCES if name in value)
 
     @model_validator(mode="after")
@@ -271,7 +270,7 @@ class Config(ScreenSettings):
 
     @cached_property
     def local_risk(self) -> RiskBudget:
-        """Risk budget of local faults alone, where SBAS covers those of the satellites."""
+        """Risk budget of local faults alone, where SBAS covers satellite faults."""
         none = dict.fromkeys(self.risk.satellite_prior, 0.0)
         return self.risk.replaced(satellite_prior=none, constellation_prior={})
 
@@ -281,7 +280,7 @@ class Config(ScreenSettings):
 
 
 def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings over those of a preset: groups key by key, limits given as an object unchanged."""
+    """Return settings over those of a preset: groups are merged by key, limits given as an object are unchanged."""
     both = {**preset, **values}
     for name, group in preset.items():
         given = values.get(name)

@@ -1,4 +1,4 @@
-"""Places by the features of a line that the body has passed."""
+"""Positions by the features of a line that the body has passed."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from railfix.track.curves import curved_line
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Slower than this the rates say nothing of the line [m/s].
+#: Below this speed the rates are not used [m/s].
 SLOWEST_MPS: Final = 1.0
-#: Rates over a length are the mean of so many metres: the body's swings are shorter.
+#: Rates over a length are the mean over this many metres: the body's oscillations are shorter.
 _LEAST_POINTS: Final = 30
 
 
@@ -54,7 +54,7 @@ class LineFeatures:
         )  # fmt: skip
 
     def body_at(self, antenna_m: Floats) -> Floats:
-        """Place of the body's middle where an antenna is at an arc length of its trajectory [m]."""
+        """Position of the body's middle where an antenna is at an arc length of its trajectory [m]."""
         return np.interp(antenna_m, self.antenna_m, self.body_m)
 
 
@@ -69,19 +69,19 @@ def ahead_m(trajectory: Trajectory) -> float:
 class RateSeries:
     """Rates of the body at K ticks."""
 
-    #: Times at which they hold, and when they were known; shape (K,).
+    #: Times for which they are valid, and when they became known; shape (K,).
     time: Datetimes
     known: Datetimes
     distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).
-    arc_m: Floats  #: Place of the antenna by the wheel; NaN where it is not known; shape (K,).
-    #: Change of heading (+ to the right) and of pitch (+ nose up) since the tick before, shape (K,).
+    arc_m: Floats  #: Position of the antenna by the wheel; NaN where it is not known; shape (K,).
+    #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
     turned_rad: Floats
     climbed_rad: Floats
     speed_mps: Floats  #: In rising arc length, shape (K,).
     rolls: Masks  #: The wheel rolls, shape (K,).
 
     def arc_at(self, time: Datetimes) -> Floats:
-        """Return places at times after the first tick, on from the tick before each [m]."""
+        """Return positions at times after the first tick, from the preceding tick [m]."""
         last = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
         since = seconds(time - self.time[last])
         return np.asarray(self.arc_m[last] + np.nan_to_num(self.speed_mps[last]) * since)
@@ -98,9 +98,9 @@ class FeatureState:
     #: At each, shape (M,).
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))
     pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
-    #: Place of the last accepted feature, its standard deviation, and the distance there [m].
+    #: Position of the last accepted feature, its standard deviation, and the distance there [m].
     last: tuple[float, float, float] | None = None
-    done_m: float = float("nan")  #: Place up to which features have been compared; NaN before the first.
+    done_m: float = float("nan")  #: Position up to which features have been compared; NaN before the first.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +113,7 @@ class FeatureFix:
 
     @property
     def correction_m(self) -> float:
-        """Place less that by the wheel [m]; NaN unless accepted."""
+        """Position less that by the wheel [m]; NaN unless accepted."""
         return self.located.arc_m - self.feature.arc_m
 
 
@@ -122,15 +122,15 @@ class _Stretch(NamedTuple):
 
     first: int
     sense: float  #: 1 toward rising arc length, else -1.
-    distance_m: Floats  #: At all ticks of the chunk, the one before the first of them at index 0.
-    body_m: Floats  #: Place of the body's middle at each tick of the stretch.
-    behind_m: Floats  #: And the place that a feature has to be passed by to be compared.
+    distance_m: Floats  #: At all ticks of the chunk, the preceding tick at index 0.
+    body_m: Floats  #: Position of the body's middle at each tick of the stretch.
+    behind_m: Floats  #: And the position that a feature must be behind to be compared.
     metre: Integers
     heading_rad: Floats
     pitch_rad: Floats
 
     def shift_m(self, tick: int) -> float:
-        """Return what leads from distances to places of the body's middle at a tick."""
+        """Return the offset from distances to positions of the body's middle at a tick."""
         return float(self.body_m[tick - self.first] - self.distance_m[tick + 1])
 
 
@@ -142,10 +142,13 @@ def _fix_feature(
     facing: float,
     last: tuple[float, float, float] | None,
 ) -> FeatureFix | None:
-    """Compare the profile that was passed with a feature; `noise` is of the place by the wheel, and of the profile."""
+    """Compare the profile that was passed with a feature; `noise` is that of the position by the wheel, and of the
+    profile.
+    """
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
-    # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
+    # In rising arc length: for a vehicle that reverses or faces the other way the signs of pitch change, heading does
+    # not.
     passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
     place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
     profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])
@@ -172,8 +175,8 @@ def feature_fixes(
 
     A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only distances without a slip and faster
     than 1 m/s count: heading and pitch are integrals, and a break restarts them. `facing`: 1 where the front points to
-    rising arc length, else -1; `sigma_m`: of the place by the wheel; `noise`: standard deviations of gradient and
-    curvature in one metre.
+    rising arc length, else -1; `sigma_m`: standard deviation of the position by the wheel; `noise`: standard deviations
+    of gradient and curvature in one metre.
     """
     distances = np.concatenate([[0.0], rates.distance_m]) + state.distance_m
     heading, pitch = (
@@ -185,14 +188,14 @@ def feature_fixes(
     metre, headings, pitches = state.metre, state.heading_rad, state.pitch_rad
     kept, last, done = int(2.5 * HALF_LENGTH_M), state.last, state.done_m
     breaks = np.flatnonzero(~usable)
-    # stretches of usable ticks, each closed by one that is not
+    # stretches of usable ticks, each ended by an unusable one
     edges = np.concatenate([[-1], breaks, [len(usable)]])
     for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         if begin >= 0:
             metre, headings, pitches = metre[:0], headings[:0], pitches[:0]
         if end - begin < 2:
             continue
-        rows = slice(begin + 1, end + 1)  # ticks begin + 1 .. end - 1, with the one before them at index begin + 1
+        rows = slice(begin + 1, end + 1)  # ticks begin + 1 .. end - 1, with the preceding tick at index begin + 1
         distance = distances[rows]
         whole = _whole_metres(distance)
         if len(metre) and len(whole) and whole[0] != metre[-1] + np.sign(distance[-1] - distance[0]):
@@ -219,7 +222,7 @@ def feature_fixes(
             fixes.append(fix)
             if fix.located.verdict == "accepted":
                 last = (fix.located.arc_m, fix.located.sigma_m, feature.arc_m - stretch.shift_m(fix.tick))
-        # a place corrected backward passes nothing twice
+        # a position corrected backward passes no feature twice
         done = passed if not sense * (passed - done) < 0.0 or abs(passed - done) > HALF_LENGTH_M else done
     metre, headings, pitches = metre[-kept:], headings[-kept:], pitches[-kept:]
     angles = (float(np.nan_to_num(heading[-1])), float(np.nan_to_num(pitch[-1])))

@@ -1,4 +1,4 @@
-"""Results of the filter along the track, what it takes from single epochs, and the state that it passes on."""
+"""Results of the filter along the track, its input from single epochs, and its state."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from railfix.core.epoch_rows import OnDemand
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState
+from railfix.kernels.tracking import index as ix
 from railfix.pipeline.balises import Passing, PassingState
 from railfix.pipeline.outage_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
@@ -22,21 +23,20 @@ from railfix.screens import FilteredMotion
 from railfix.tracking import Line, Tracked, TrackState
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
-from railfix.tracking.state import StateIndex
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Place by the filter at its last epoch: what the place by the wheel restarts from every few seconds."""
+    """Position by the filter at its last epoch, from which dead reckoning by the wheel restarts every few seconds."""
 
     time: np.datetime64
-    #: NaN where the filter has not decided on a place.
+    #: NaN where the filter has not decided on a position.
     arc_m: float
     sigma_m: float
     speed_mps: float
 
     def arc_at(self, time: np.datetime64) -> float:
-        """Place at a time nearby [m]."""
+        """Position at a nearby time [m]."""
         return self.arc_m + self.speed_mps * float(seconds(time - self.time))
 
 
@@ -45,7 +45,7 @@ class SingleEpochs:
     """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
     noise_scale: Floats  #: Noise of the receiver's codes against their sigmas.
-    #: Position: after an outage codes count again when it agrees with the place that the sensors carried.
+    #: Position: after an outage codes are used again when it agrees with the dead-reckoned position.
     arc_m: Floats
     sigma_m: Floats
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
@@ -59,21 +59,21 @@ class FilterState(NotebookTable):
     """State of the filter along the track of one antenna after a chunk."""
 
     line: Line | None = None  #: The trajectory as the filter sees it, made once.
-    slips: CycleSlipState | None = None  #: Of the carrier phases.
+    slips: CycleSlipState | None = None  #: State of the carrier phases.
     track: TrackState | None = None
-    level: LevelState = field(default_factory=LevelState)  #: Of the filter that gives the levels.
+    level: LevelState = field(default_factory=LevelState)  #: State of the filter that gives the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
-    #: Place of the filter at the last epoch, and at the last one before the present stretch.
+    #: Position of the filter at the last epoch, and at the last epoch before the present block.
     fixed: FilterFix | None = None
     anchor: FilterFix | None = None
 
     gate: ReturnState = field(default_factory=ReturnState)
-    #: Of the comparison of distances by the wheel with those of single epochs, and of the filter.
+    #: State of the comparison of distances by the wheel with those of single epochs, and of the filter.
     wheel: WheelState = field(default_factory=WheelState)
     pulled: WheelState = field(default_factory=WheelState)
-    #: Last epoch at which places or speeds of the two antennas disagreed.
+    #: Last epoch at which positions or speeds of the two antennas disagreed.
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    passings: PassingState | None = None  #: Of balises and virtual ones.
+    passings: PassingState | None = None  #: State of balises and virtual ones.
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
@@ -81,12 +81,12 @@ class FilterState(NotebookTable):
         return f"<FilterState: {plural(self.track.hypotheses, 'place')}, the most probable at {self._place()} m>"
 
     def _place(self) -> str:
-        """Return the most probable place with its standard deviation."""
+        """Return the most probable position with its standard deviation."""
         track = self.track
         if track is None:
             return ""
-        best = int(np.argmax(track.log_probability))
-        place, variance = track.mean[best, StateIndex.ARC], track.covariance[best, StateIndex.ARC, StateIndex.ARC]
+        best = int(np.argmax(track.hypothesis["log_probability"]))
+        place, variance = track.mean[best, ix.ARC], track.covariance[best, ix.ARC, ix.ARC]
         return f"{place:,.1f} ± {np.sqrt(variance):.1f}"
 
 
@@ -98,7 +98,7 @@ COORDINATES: Final = ("latitude_deg", "longitude_deg", "height_m")
 class AlongTrack(NotebookTable, OnDemand):
     """Positions of one antenna by the filter along the track, T epochs."""
 
-    #: Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
+    #: Positions along the antenna's trajectory, and their measurements; channels as `AntennaResult.columns`.
     tracked: Tracked
     #: Shape (T,).
     chainage_m: Floats
@@ -108,14 +108,15 @@ class AlongTrack(NotebookTable, OnDemand):
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
-    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed does not tell; shape (T,).
+    #: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small to decide; shape (T,).
+    direction: Codes
     standstill: Masks  #: Shape (T,).
     sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    #: Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at; shape
+    #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape
     #: (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.
-    replay: tuple[Replay, ...] = ()  #: What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
+    replay: tuple[Replay, ...] = ()  #: Input of the filter, to smooth it (`railfix.pipeline.smoothing`).
     passings: tuple[Passing, ...] = ()  #: Balises and virtual ones that were passed, and readings that are wrong.
 
     @property
@@ -125,7 +126,7 @@ class AlongTrack(NotebookTable, OnDemand):
 
     @property
     def motion(self) -> FilteredMotion:
-        """Places and speeds, for the comparison with those of another antenna."""
+        """Positions and speeds, for the comparison with those of another antenna."""
         found = self.tracked
         return FilteredMotion(self.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
 
@@ -136,7 +137,9 @@ class AlongTrack(NotebookTable, OnDemand):
         return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return how many epochs have a place with a bound: ``1,890 of 2,000 epochs tracking or coasting``."""
+        """Return the number of epochs that have a position with a bound: ``1,890 of 2,000 epochs tracking or
+        coasting``.
+        """
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:

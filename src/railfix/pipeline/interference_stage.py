@@ -35,21 +35,21 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.range_arrays import InterSystemBiases
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Reasons given because ranges contradict others: those of a spoofer do.
+#: Reasons that ranges get because they contradict others, as those of a spoofer do.
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )
-#: Reasons of satellites that are wrong by themselves, where they are few.
+#: Reasons of satellites that are wrong separately, where they are few.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
-#: Satellites that are wrong by themselves at most, by residuals, and of one clock by gross errors: a spoofer's signals
-#: that give a position of their own are more.
+#: Largest number of satellites that are wrong by residuals, and of one clock by gross errors; a spoofer that gives a
+#: position of its own affects more.
 _MOST_WRONG: Final = 2
 _MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Statuses of positions that spoofing outranks, and those that jamming does.
 _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
-    Status.MAP_OFFSET,
+    Status.MAP_OFFSET, Status.MAP_END,
 ])  # fmt: skip
 #: Statuses of positions that failed a check by their ranges.
 _FAILED: Final = np.isin(np.arange(len(Status)), [
@@ -63,7 +63,7 @@ _STATUS_BY_CAUSE: Final = (
     (Suspicion.TIME_TAGS, _UNDER_SPOOFING, Status.INCONSISTENT),
     (Suspicion.LEFT_MAP, _UNDER_SPOOFING, Status.OFF_MAP),
 )
-#: Interference is looked for once so long [ns].
+#: Interval between the checks for interference [ns].
 _SECOND_NS: Final = 1_000_000_000
 #: Where seconds begin: tags may be 5 ms before the whole one [ns].
 _FIRST_NS: Final = int(GPS_EPOCH.astype(np.int64)) - 5_000_000
@@ -76,7 +76,7 @@ class InterferenceState:
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
-    second: int = -1  #: GPS second of the last epoch that was looked at.
+    second: int = -1  #: GPS second of the last epoch that was checked.
     #: Break and the receiver's alarms since then.
     broken: bool = False
     alarm: int = 0
@@ -98,7 +98,7 @@ class Interference:
 
 
 class PositionEpochs(NamedTuple):
-    """Results of single epochs that the signs are looked for in, T epochs."""
+    """Results of single epochs that the signs are searched for in, T epochs."""
 
     #: 3-D positions without the map, of all ranges; and of those that agree, NaN where ranges contradict each other;
     #: shape (T, 3).
@@ -112,7 +112,7 @@ class PositionEpochs(NamedTuple):
 def _motion_inputs(
     corrected: CorrectedRanges, single: PositionEpochs, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
-    """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the epoch before."""
+    """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the previous epoch."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
     near = np.where(np.isnan(consistent), single.point_ecef_m[rows], consistent)
@@ -141,7 +141,9 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites that are wrong by themselves, not by a spoofer who moves all of a clock; shape (T, K)."""
+    """Return the satellites that are wrong individually, not by a spoofer who moves all satellites of a clock; shape
+    (T, K).
+    """
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -159,9 +161,9 @@ def _find_interference(
     state: InterferenceState,
     limits: InterferenceLimits,
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of some epochs of one antenna, and the state to pass on.
+    """Return the interference of some epochs of one antenna, and the state for the next chunk.
 
-    `alarm`: alarms of the receiver since the epoch before, of each; `failed`: their position failed a check.
+    `alarm`: alarms of the receiver since the previous epoch, of each; `failed`: their position failed a check.
     """
     other_signal = (corrected.reason[rows] & _NOT_ITS_SIGNAL) != 0
     cn0 = np.where(other_signal | np.isnan(corrected.code_m[rows]), np.nan, corrected.cn0_dbhz[rows])
@@ -178,7 +180,7 @@ def _find_interference(
 
 
 def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
-    """Return which signs the epochs show by themselves, shape (T, causes)."""
+    """Return which signs the epochs show separately, shape (T, causes)."""
     sigmas = limits.jump_sigmas
     by_cause = {
         Sign.RECEIVER_JAMMING: (alarm & 1) != 0,
@@ -218,9 +220,9 @@ def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
 
 
 class _Due(NamedTuple):
-    """Epochs of one antenna at which interference is looked for: the first of each second."""
+    """Epochs of one antenna at which interference is checked: the first of each second."""
 
-    rows: Indices  #: Among those of all antennas, shape (n,).
+    rows: Indices  #: Rows among those of all antennas, shape (n,).
     group: Indices  #: How many there have been up to each epoch of the antenna, shape (T,).
     #: Alarms of the receiver and breaks up to each of them, and those that count at the next one; shape (n + 1,).
     alarm: Bytes
@@ -229,7 +231,7 @@ class _Due(NamedTuple):
 
 
 def _due(corrected: CorrectedRanges, gps_second: Integers, rows: slice, state: InterferenceState) -> _Due:
-    """Return the epochs of one antenna at which interference is looked for."""
+    """Return the epochs of one antenna at which interference is checked."""
     second = gps_second[rows]
     due = np.empty(len(second), dtype=np.bool_)
     due[:1], due[1:] = second[:1] != state.second, second[1:] != second[:-1]
@@ -237,7 +239,7 @@ def _due(corrected: CorrectedRanges, gps_second: Integers, rows: slice, state: I
     count = int(group[-1]) + 1 if len(group) else 1
     alarm, broken = np.zeros(count, dtype=np.uint8), np.zeros(count, dtype=np.bool_)
     alarm[0], broken[0] = state.alarm, state.broken
-    # what came after a due epoch belongs to the next one
+    # epochs after a checked epoch belong to the next one
     np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm[rows])
     np.logical_or.at(broken, group - due, corrected.break_before[rows])
     last = int(second[-1]) if len(second) else state.second
@@ -247,7 +249,7 @@ def _due(corrected: CorrectedRanges, gps_second: Integers, rows: slice, state: I
 def _on_all_epochs(
     due: _Due, found: Interference | None, state: InterferenceState
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of all epochs of one antenna, which have what was found at the first of the second."""
+    """Return the interference of all epochs of one antenna; each has the result of the first epoch of its second."""
     known = [each for each in (state.latest, found) if each is not None]
     if len(due.group) == 1:
         every = latest = known[-1]
@@ -263,9 +265,9 @@ def _on_all_epochs(
 
 
 def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
-    """Return the statuses of positions (T,) with those of interference, where they outrank.
+    """Return the statuses of positions (T,) with those of interference, where they are more serious.
 
-    `suspected`: `Suspicion` of the epochs of each antenna, one after the other; empty where that is off.
+    `suspected`: `Suspicion` of the epochs of each antenna, concatenated; empty where the check is off.
     """
     if not suspected:
         return status
@@ -284,7 +286,7 @@ def judge_interference(
 ) -> tuple[Sequence[Interference | None], list[InterferenceState]]:
     """Return interference and new state of each antenna; None where `InterferenceLimits.use` is off.
 
-    It is looked for at the first epoch of each second; the others have what was found there. A break or an alarm
+    It is checked at the first epoch of each second; the others have that result. A break or an alarm
     between counts at the next one.
     """
     if limits.use == "off":

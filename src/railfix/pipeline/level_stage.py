@@ -121,7 +121,7 @@ def level_facts(config: Config) -> dict[str, Any]:
 
 
 def get_risk_budget(config: Config) -> RiskBudget:
-    """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones are left."""
+    """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones remain."""
     return config.risk if choose_kind(config) == "separation" else config.local_risk
 
 
@@ -171,8 +171,8 @@ def protection_levels(
 ) -> ProtectionResult:
     """Return the protection levels of the positions of a chunk, from their model on the line.
 
-    What of the map's offset lies beyond its own sigma is a bias of the level; what it would not find is covered by the
-    hypothesis of a wrong map. Quiet residuals shrink no level: the receiver's noise scale, shape (T,), is taken as 1 at
+    The part of the map's offset beyond its own sigma is a bias of the level; an undetected offset is covered by the
+    hypothesis of a wrong map. Quiet residuals shrink no level: the receiver's noise scale, shape (T,), counts as 1 at
     least, and with an error model the sigma of no range falls below the model's. `sides`: `low_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
@@ -206,22 +206,23 @@ def apply_verdicts(
 ) -> ProtectionResult:
     """Return the levels with the verdicts on the positions applied.
 
-    A level holds at the place where the ranges were linearised. Where another place explains them as well, it is
-    unavailable. Where a check has failed, or ranges and map contradict each other: alarm. Epochs that lose their
-    coordinates (`has`) lose the level; where it reaches a stretch of `Config.no_level_m` it is infinite.
+    A level is valid at the position where the ranges were linearised. Where another position fits them equally well, or
+    they put it beyond an end of the map, the level is unavailable. Where a check has failed, or ranges and map
+    contradict each other: alarm. Epochs that lose their coordinates (`has`) lose the level; where it reaches a stretch
+    of `Config.no_level_m` it is infinite.
     """
     level, verdict = protection.level, protection.status
     if config.no_level_m or not has.all():
         level = _where_it_holds(level, has, chainage_m, config)
         verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     verdict = np.where(_ALARMING[status], int(LevelStatus.ALARM), verdict)
-    doubtful = status == int(Status.AMBIGUOUS)
+    doubtful = np.isin(status, (Status.AMBIGUOUS, Status.MAP_END))
     verdict = np.where(doubtful & (verdict == int(LevelStatus.AVAILABLE)), int(LevelStatus.UNAVAILABLE), verdict)
     return copy_with(protection, level=level, status=verdict.astype(np.int8))
 
 
 def _where_it_holds(level: ProtectionLevel, has: Masks, chainage_m: Floats, config: Config) -> ProtectionLevel:
-    """Return the levels without those of epochs without coordinates, and infinite ones in stretches without any."""
+    """Return the levels, removed at epochs without coordinates, and infinite in stretches without a level."""
     values = {
         name: np.where(has, value, np.nan) if value.dtype == np.float64 else value
         for name, value in vars(level).items()
@@ -249,7 +250,7 @@ def compute_araim(
     """Return ARAIM levels of positions on the line, shape (T,); None without an integrity support message.
 
     Integrity: URA of the message, atmosphere of `Config.nominal` and the noise of the ranges by its scale; accuracy and
-    thresholds: URE in place of URA. The ranges have all reasons.
+    thresholds: URE instead of URA. The ranges have all reasons.
     """
     if support is None:
         return None

@@ -34,7 +34,8 @@ _EARTH_RADIUS_M: Final = 6.371e6
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Heights for which the tropospheric model has values [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
-#: Root mean square of raw residuals, the atmosphere's delays among them, from which on gross errors are looked for [m].
+#: Root mean square of raw residuals, the atmosphere's delays among them, from which on gross errors are searched for
+#: [m].
 _QUIET_M: Final = 10.0
 
 
@@ -78,7 +79,7 @@ class Located:
     """3-D positions of one antenna, T epochs."""
 
     time: Datetimes  #: Shape (T,).
-    ecef_m: Floats  #: NaN where there is no position, shape (T, 3).
+    ecef_m: Floats  #: NaN without a position, shape (T, 3).
     #: Standard deviations north, east and up: from the sigmas of the ranges, atmosphere and orbits included, and larger
     #: where the residuals are; shape (T, 3).
     sigma_m: Floats
@@ -88,7 +89,7 @@ class Located:
 
 @dataclass(frozen=True, kw_only=True)
 class RangesWithoutMap:
-    """Corrected ranges of one antenna seen from an approximate place, T epochs by K channels."""
+    """Corrected ranges of one antenna at an approximate position, T epochs by K channels."""
 
     channels: Channels
     ranges: Ranges  #: Weight 0 where a range cannot be used.
@@ -101,7 +102,9 @@ class RangesWithoutMap:
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
-    """Return corrected ranges of one antenna without a track: the approximate place is that of the codes alone."""
+    """Return corrected ranges of one antenna without a track: the approximate position is computed from the codes
+    alone.
+    """
     channels = book.of(obs, received.navigation)
     satellite, columns = channels.satellite, channels.columns
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
@@ -239,7 +242,7 @@ def _below(ranges: Ranges) -> Floats:
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True) * _EARTH_RADIUS_M)
 
 
-#: Steps longer than so many intervals have no changes: Dopplers at both ends tell too little.
+#: Steps longer than this many intervals have no changes: Beyond this, Dopplers at both ends are not accurate enough.
 _LONGEST_STEP: Final = 2.5
 #: Standard deviation of a change by Dopplers from the curvature of the motion [m/s^2].
 _CURVED_MPS2: Final = 0.05
@@ -276,8 +279,8 @@ def _survey_part(
 ) -> tuple[SurveyRun, RunSignals, CycleSlipState | None]:
     """Return the run of some observations, thinned to the interval of the survey, and the state of the slips.
 
-    A range changes by the carrier phase where it goes on without a slip at every epoch between, else by the mean of
-    the Dopplers at both ends.
+    The change of a range is that of the carrier phase where it continues without a slip at every epoch between,
+    otherwise the mean of the Dopplers at both ends.
     """
     seen = ranges_without_map(obs, received, config, book)
     located = locate_ranges(obs.time, seen, config)

@@ -1,8 +1,8 @@
 """Signs and units of Dopplers and carrier phases, by the range rates of the satellites.
 
 A satellite's own motion changes its range by up to 800 m/s, much more than a train's or a receiver clock's. The factor
-by which a constellation's Dopplers, or changes of its phases, follow it is 1; it is -1 with the wrong sign, and the
-wavelength where metres stand for cycles.
+between a constellation's Dopplers, or changes of its phases, and its range rates is 1; it is -1 with the wrong sign,
+and the wavelength if metres are given for cycles.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Least range rate of a satellite, against the median one of its constellation, that a factor is taken from [m/s].
+#: Least range rate of a satellite, relative to the median of its constellation, for a factor [m/s].
 _LEAST_RATE_MPS: Final = 100.0
 #: Satellites that give a factor, and how far their factors are from the median one: all, or all but one of at least
-#: `_MANY`. Of four satellites one with a cycle slip moves the median rate, and with it the factors of the others.
+#: `_MANY`. With four satellites, one cycle slip moves the median rate, and with it the factors of the others.
 _LEAST_SATELLITES: Final = 3
 _MANY: Final = 6
 _SPREAD: Final = 0.3
-#: Factors up to so far from 1 are right: a train's own speed is in them.
+#: Factors within this distance from 1 are correct: they include the train's own speed.
 _RIGHT: Final = 0.5
 #: Phases of epochs farther apart are not compared [s].
 _LONGEST_S: Final = 35.0
@@ -39,11 +39,11 @@ _NAMES: Final = {"G": "GPS", "J": "QZSS", "E": "Galileo", "C": "BeiDou", "R": "G
 class ObservableState:
     """State of the checks of one antenna after a chunk."""
 
-    #: Last factors of Dopplers and of phases, NaN for none so far, shape (2, L), by letter of the constellation, ""
+    #: Last factors of Dopplers and of phases, NaN before the first, shape (2, L), by letter of the constellation, ""
     #: for all together, shape (L,).
     factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
     letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
-    #: Phases of the last epoch and range rates of the satellites, shape (K,).
+    #: Phases of the last epoch that gave factors and range rates of the satellites, shape (K,).
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U6"))
     phase_m: Floats = field(default_factory=lambda: np.zeros(0))
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
@@ -59,30 +59,34 @@ class CheckedObservables(NamedTuple):
 
 
 def check_observables(corrected: CorrectedRanges, state: ObservableState) -> CheckedObservables:
-    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, a sentence on each.
+    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, with one sentence for
+    each.
 
-    A factor counts until the next one of its constellation; before the first one, that of all constellations does.
+    A factor is valid until the next one of its constellation; before the first one, that of all constellations is used.
     """
-    sight = corrected.satellites.position_ecef_m - corrected.near_ecef_m[:, None, :]
+    second = corrected.time.astype("datetime64[s]")
+    chosen = np.diff(second, prepend=np.array([state.time], dtype=second.dtype)) != np.timedelta64(0, "s")
+    sight = corrected.satellites.position_ecef_m[chosen] - corrected.near_ecef_m[chosen, None, :]
     sight = sight / np.linalg.norm(sight, axis=2, keepdims=True)
-    rate = (sight * corrected.satellites.velocity_ecef_mps).sum(axis=2)
+    rate = (sight * corrected.satellites.velocity_ecef_mps[chosen]).sum(axis=2)
     wavelength = SPEED_OF_LIGHT / corrected.frequency_hz
     phase = wavelength * corrected.observations.phase_cycles[:, corrected.columns]
-    changes, after = _phase_rates(corrected.time, corrected.channels.names, phase, rate, state)
+    names, time = corrected.channels.names, corrected.time[chosen]
+    changes, after = _phase_rates(time, names, phase[chosen], rate, state)
     letters = corrected.satellite.astype("<U1")
     bad: dict[int, Masks] = {}
     notes: list[str] = []
     before = dict(zip(state.letter.tolist(), state.factor.T.tolist(), strict=True))
     factors = {letter: before.get(letter, [np.nan, np.nan]) for letter in {**before, **dict.fromkeys(["", *letters])}}
-    for kind, (observed, expected) in enumerate(((-wavelength * corrected.doppler_hz, rate), changes)):
-        wrong, found = np.zeros(observed.shape, dtype=np.bool_), {}
+    doppler = -wavelength * corrected.doppler_hz
+    for kind, (all_of_kind, observed, expected) in enumerate(((doppler, doppler[chosen], rate), (phase, *changes))):
+        wrong, found = np.zeros(all_of_kind.shape, dtype=np.bool_), {}
         for letter in ["", *np.unique(letters).tolist()]:
             own = (letters == letter) | (letter == "")
-            found[letter] = _held(rate_factor(observed[:, own], expected[:, own]), factors[letter][kind])
-            factors[letter][kind] = float(found[letter][-1]) if len(rate) else factors[letter][kind]
+            found[letter] = _held(rate_factor(observed[:, own], expected[:, own]), factors[letter][kind], chosen)
+            factors[letter][kind] = float(found[letter][-1]) if len(chosen) else factors[letter][kind]
             factor = np.where(np.isnan(found[letter]), found[""], found[letter])
-            seen = np.isfinite(observed[:, own] - expected[:, own]).any(axis=1)
-            off = (np.abs(factor - 1.0) > _RIGHT) & seen
+            off = (np.abs(factor - 1.0) > _RIGHT) & np.isfinite(all_of_kind[:, own]).any(axis=1)
             if letter and off.any():
                 wrong[:, own] = off[:, None]
                 notes.append(_sentence(kind, letter, float(np.median(factor[off])), float(np.median(wavelength[own]))))
@@ -95,9 +99,9 @@ def check_observables(corrected: CorrectedRanges, state: ObservableState) -> Che
 
 
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
-    """Return the factor by which observed rates follow those of the satellites, shape (T,); NaN where it is unclear.
+    """Return the factor between observed rates and those of the satellites, shape (T,); NaN where it is unclear.
 
-    The median over satellites of one constellation, shape (T, K), each against their median.
+    The median over satellites of one constellation, shape (T, K), each relative to their median.
     """
     known = np.isfinite(observed_mps) & np.isfinite(expected_mps)
     few = known.sum(axis=1) <= _LEAST_SATELLITES
@@ -113,11 +117,11 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
     return np.where(unclear, np.nan, factor)
 
 
-def _held(factor: Floats, before: float) -> Floats:
-    """Return the factors with each gap filled by the one before it."""
+def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
+    """Return the factor of each epoch, shape (T,): the last known one of the `chosen` epochs; at first `before`."""
     values = np.concatenate([[before], factor])
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
-    return np.asarray(values[last][1:])
+    return np.asarray(values[last][np.cumsum(chosen)])
 
 
 def _phase_rates(
@@ -152,7 +156,7 @@ def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]
 
 
 def _sentence(kind: int, letter: str, factor: float, wavelength_m: float) -> str:
-    """Return what is wrong with the Dopplers or phases of a constellation."""
+    """Return the fault of the Dopplers or phases of a constellation."""
     if abs(factor + 1.0) <= _RIGHT:
         wrong = "have the wrong sign"
     elif abs(abs(factor) - wavelength_m) < 0.1:

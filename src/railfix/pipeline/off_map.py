@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
 
 _NEVER: Final = np.datetime64("NaT", "ns")
+#: Time for which the offset of a train off the map is stored [s].
+_REMEMBERED_S: Final = 30.0
+#: A train is back where the mean offset of its positions is a smaller share of what it was away; or metres.
+_BACK_SHARE: Final = 0.5
+_BACK_M: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,30 +27,48 @@ class OffMapState:
     known: bool = False  #: A position has been tested; the first one of a log decides alone.
     #: First of the last positions in a row that contradict `off`; NaT where the last one agrees with it.
     since: np.datetime64 = _NEVER
+    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of the offsets since then.
+    #: Decayed sum and number of the offsets while it is away, and the time of the last one.
+    away: Floats = field(default_factory=lambda: np.zeros(2))
+    away_at: np.datetime64 = _NEVER
 
 
 def off_map_epochs(
-    time: Datetimes, on_map: Masks, off_map: Masks, state: OffMapState, *, least_s: float
+    time: Datetimes, on_map: Masks, off_map: Masks, offset_m: Floats, state: OffMapState, *, least_s: float
 ) -> tuple[Masks, OffMapState]:
     """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
 
-    It leaves the map once all positions of the last `least_s` are off it, and returns once all of that time are on it:
-    a single position can be off the map by reflected signals, or on it by chance. The first position of a log decides
-    alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict, shape (T,).
+    The train leaves the map once all positions of the last `least_s` are off it: a single position can be off it by
+    reflected signals. It returns once all of that time are on it, and their mean offset is within a metre or half of
+    what it was before: beside the line, on a track that the map lacks, positions are on it by chance. The first
+    position of a log decides alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict;
+    `offset_m`: 3-D positions right of the line, NaN for none; shapes (T,).
     """
-    off, known, since = state.off, state.known, state.since
+    off, known, since, back = state.off, state.known, state.since, state.back
+    away, away_at = state.away, state.away_at
     result = np.full(len(time), off)
     judged = (on_map | off_map).nonzero()[0]
     states = off_map[judged]
     edges = [0, *((states[1:] != states[:-1]).nonzero()[0] + 1).tolist(), len(judged)]
     for first, end in pairwise(edges) if len(judged) else ():
         run, says = judged[first:end], bool(states[first])
+        sums = np.cumsum([np.nan_to_num(offset_m[run]), np.isfinite(offset_m[run])], axis=1)
+        if says:
+            age = seconds(time[run[-1]] - time[run])
+            decay = 0.0 if np.isnat(away_at) else np.exp(-seconds(time[run[-1]] - away_at) / _REMEMBERED_S)
+            away = away * decay + np.diff(sums, prepend=0.0) @ np.exp(-age / _REMEMBERED_S)
+            away_at = time[run[-1]]
         if known and says == off:
-            since = _NEVER
+            since, back = _NEVER, np.zeros(2)
             continue
         since = time[run[0]] if np.isnat(since) else since
-        enough = run[seconds(time[run] - since) >= least_s] if known else run
-        if len(enough):
-            result[enough[0] :] = says
-            off, known, since = says, True, _NEVER
-    return result, OffMapState(off=off, known=known, since=since)
+        sums, back = sums + back[:, None], sums[:, -1] + back
+        enough = seconds(time[run] - since) >= least_s if known else np.ones(len(run), dtype=np.bool_)
+        if off and away[1] > 0.0:
+            limit = max(_BACK_M, _BACK_SHARE * abs(away[0] / away[1]))
+            enough &= (sums[1] > 0.0) & (np.abs(sums[0]) <= limit * sums[1])
+        if enough.any():
+            result[run[np.argmax(enough)] :] = says
+            off, known, since, back = says, True, _NEVER, np.zeros(2)
+            away = away if says else np.zeros(2)
+    return result, OffMapState(off=off, known=known, since=since, back=back, away=away, away_at=away_at)

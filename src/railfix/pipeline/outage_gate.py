@@ -1,4 +1,4 @@
-"""Codes after an outage: they count again once single epochs agree with the place that the sensors carried."""
+"""Codes after an outage are used again once single epochs agree with the dead-reckoned position."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from railfix.core.timescale import seconds
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.tracking import Line
 
-#: Without codes for so long the place is that of the sensors [s].
+#: Without codes for this time the position is that of the sensors [s].
 _OUTAGE_S: Final = 2.0
 #: Positions that must agree before codes count again.
 _AGREEING: Final = 3
-#: Standard deviation of a distance by the sensors since the beginning of a stretch, as a share.
+#: Standard deviation of a distance by the sensors since the beginning of a block, as a fraction.
 _DISTANCE_SHARE: Final = 0.01
 #: Least standard deviation of a single epoch at the end of a tunnel [m]: multipath of the portal.
 _LEAST_SIGMA_M: Final = 2.0
@@ -25,13 +25,13 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class ReturnState:
-    """What one chunk leaves to the next."""
+    """State after a chunk."""
 
     time: np.datetime64 = _NEVER  #: Last epoch whose codes counted; NaT before the first.
-    #: Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a distance.
+    #: Dead-reckoned position at the last epoch and its standard deviation; NaN where no sensor gives a distance.
     place_m: float = float("nan")
     sigma_m: float = float("nan")
-    distance_m: float = 0.0  #: Since the filter's own place.
+    distance_m: float = 0.0  #: Since the filter's own position.
     returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without.
     agreeing: int = 0  #: Positions in a row that agreed since.
 
@@ -46,14 +46,15 @@ def gated_codes(
     line: Line,
     limits: SensorLimits,
 ) -> tuple[Masks, ReturnState]:
-    """Return the epochs whose codes do not count yet, shape (T,), and the state to pass on.
+    """Return the epochs whose codes are not yet used, shape (T,), and the state to pass on.
 
-    After an outage the position of each epoch by itself is compared with the place coasted on the sensors: codes count
+    After an outage single-epoch positions are compared with the position dead-reckoned by the sensors: codes are used
     again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
     and after `SensorLimits.return_s` in any case. Where no sensor gives a distance nothing is refused.
 
-    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the epoch before; `place_m`, `sigma_m`
-    of each epoch by itself; NaN where there is none. `state` has the place of the filter at the epoch before the first.
+    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the previous epoch; `place_m`,
+    `sigma_m` of each epoch by itself; NaN where missing. `state` has the position of the filter at the epoch before the
+    first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     distances = state.distance_m + np.cumsum(distance_m)

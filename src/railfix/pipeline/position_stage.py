@@ -34,7 +34,14 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.carrier import PhasePositions, Slips
 from railfix.positioning.inter_system import TieLimits, tie_constellations
 from railfix.positioning.line_fix import LineFix, fix_on_line
-from railfix.positioning.map_offset import LinePositions, MapOffset, OffsetErrors, beyond_threshold, map_offset
+from railfix.positioning.map_offset import (
+    LinePositions,
+    MapOffset,
+    OffsetErrors,
+    beyond_threshold,
+    map_offset,
+    offset_from_line,
+)
 from railfix.positioning.normal_equations import SinglePoint, misfit, point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
 from railfix.positioning.receiver_noise import (
@@ -61,9 +68,9 @@ def satellites_rejected(member: Integers, reason: Bits) -> Integers:
 
 @dataclass(frozen=True, kw_only=True)
 class Solution:
-    """Positions of one antenna, T epochs, before coordinates are dropped where the status says so."""
+    """Positions of one antenna, T epochs, before coordinates are dropped because of their status."""
 
-    point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
+    point: SinglePoint  #: Conventional position: every constellation with a separate clock.
     #: 3-D positions of the ranges that agree, without excluded ones; NaN where they contradict each other; (T, 3).
     consistent_ecef_m: Floats
     point_status: Codes  #: `railfix.integrity.PointStatus`, shape (T,).
@@ -82,7 +89,7 @@ class Solution:
     protection: ProtectionResult | None
     map_offset: MapOffset
     off_map: Masks  #: The train is away from the line: `railfix.pipeline.off_map`; shape (T,).
-    #: Of `railfix.pipeline.level_stage`, which comes after; None without an integrity support message.
+    #: Result of `railfix.pipeline.level_stage`, which follows; None without an integrity support message.
     araim: AraimResult | None = None
 
 
@@ -113,12 +120,16 @@ def position_stage(
     unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
     off_map = checked.off_map & ~unresolved
 
-    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
-        return off_map_epochs(time[rows], on_map[rows], off_map[rows], state.off_map, least_s=OFF_MAP_S)
-
-    away, off_map_states = antennas.each_with_state(own_absence, states)
     excluded = checked.lasting | checked.raim.excluded
     agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
+    right_m = offset_from_line(free.ecef_m, constrained.arc_m, antennas)[:, 0]
+
+    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
+        return off_map_epochs(
+            time[rows], on_map[rows], off_map[rows], right_m[rows], state.off_map, least_s=OFF_MAP_S
+        )  # fmt: skip
+
+    away, off_map_states = antennas.each_with_state(own_absence, states)
     offset, map_states = map_offset(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
@@ -198,8 +209,8 @@ def check_ranges(
 ) -> tuple[CheckedRanges, NoiseStates]:
     """Return positions without satellites that are wrong for long, then without single faults, and noise scales.
 
-    The robust scale, which RAIM tests with, is learnt from ranges that agree with each other; the stated one from those
-    that RAIM left.
+    The robust scale, which RAIM tests with, is estimated from ranges that agree with each other; the stated one from
+    those that RAIM accepted.
     """
     time, near = corrected.time, corrected.near_ecef_m
     on, noises = "raim" in config.screens, [state.noise for state in states]
@@ -259,15 +270,15 @@ def check_ranges(
 
 #: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.
 _LARGEST_VARIANCE: Final = 1e4
-#: Variance of an epoch's ranges in space over that of the receiver from which on they contradict each other.
+#: Ratio of the variance of an epoch's ranges in 3-D to that of the receiver from which on they contradict each other.
 _CONTRADICT: Final = 25.0
 
 
 def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
-    """Return ranges and 3-D positions that judge the map: without the `excluded` satellites where all ranges together
-    contradict each other, NaN where they still do or nothing tells which one is wrong.
+    """Return ranges and 3-D positions for the test of the map: without the `excluded` satellites where all ranges
+    together contradict each other, NaN where they still do or the wrong one cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
@@ -292,7 +303,7 @@ class PublishedPositions(NamedTuple):
     arc_m: Floats
     along_m: Floats  #: Standard deviation along the line.
     own_m: Floats  #: Single-epoch sigma.
-    judged_m: Floats  #: What `Config.largest_sigma_m` is compared with.
+    judged_m: Floats  #: Sigma that is compared with `Config.largest_sigma_m`.
     phase: PhasePositions | None
 
 
@@ -338,10 +349,10 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
-    """Return the mean square distance to the best other place of ambiguous epochs, shape (T,).
+    """Return the mean square distance to the best other position of ambiguous epochs, shape (T,).
 
-    The other place fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
-    (normal likelihoods, neither place likelier beforehand).
+    The other position fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
+    (normal likelihoods, equal priors).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
@@ -386,9 +397,9 @@ def _status(
     failed: tuple[Masks, Masks, Masks],
     config: Config,
 ) -> Codes:
-    """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first.
+    """Return the status of each epoch, shape (T,): the first condition that is true, the most serious first.
 
-    `failed`: ranges that contradict the map, or each other, and other places that are open; shape (T,) each.
+    `failed`: ranges that contradict the map, or each other, and other possible positions; shape (T,) each.
     """
     off_map, inconsistent, open_elsewhere = failed
     redundancy, constrained, section = ranges.redundancy, solution.fix.constrained, solution.fix.section
@@ -405,6 +416,7 @@ def _status(
             (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,
             Status.AMBIGUOUS,
         ),
+        (constrained.overshoot_m > 0.0, Status.MAP_END),
     ]
     status = np.full(len(ranges), Status.OK, dtype=np.int8)
     for condition, value in reversed(conditions):

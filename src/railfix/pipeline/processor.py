@@ -1,7 +1,7 @@
 """Positioning of chunks of epochs: the calls in reading order.
 
-`EpochProcessor` holds what does not change during a run (settings, trajectories, error model). `process` takes a chunk
-of observations with the navigation records, SBAS messages and sensor samples received since the chunk before, and the
+`EpochProcessor` has the constant data of a run (settings, trajectories, error model). `process` takes a chunk
+of observations with the navigation records, SBAS messages and sensor samples received since the previous chunk, and the
 state after that chunk; it returns every intermediate result and the new state. A live epoch is a chunk of length one;
 any cutting gives the same results.
 """
@@ -99,12 +99,12 @@ class EpochProcessor:
         Screens that are on, with their limits.
     setup : ScreenSetup
     notes : tuple of str
-        Differences between what was asked for and what is used, one sentence each.
+        Differences between what was requested and what is used, one sentence each.
 
     Raises
     ------
     SettingsError
-        SBAS and precise ephemerides together, no SBAS message of the GEO asked for, or an argument of another type.
+        SBAS and precise ephemerides together, no SBAS message of the GEO requested, or an argument of another type.
     """
 
     def __init__(
@@ -170,16 +170,16 @@ class EpochProcessor:
         return ThreadPoolExecutor(len(self.trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the threads, which another process has of its own."""
+        """Return everything but the threads, which another process creates itself."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the data known from the start, and on screens that cannot judge."""
+        """Notes on the data known from the start, and on screens that cannot be run."""
         return (*self.received.notes, *self._lacking)
 
     def _inactive_notes(self) -> tuple[str, ...]:
-        """Return one sentence for each part of the settings that cannot work as asked."""
+        """Return one sentence for each part of the settings that cannot be satisfied."""
         notes = [note for screen, limits in self.screens for note in screen.notes(limits, self.setup)]
         check_base(self.config, self._base)
         conditions = None if self._error_model is None else self._error_model.conditions
@@ -196,7 +196,9 @@ class EpochProcessor:
         return tuple(notes)
 
     def antenna_order(self) -> AntennaOrder | None:
-        """Return a test, without positions as yet, of the order of two antennas; None without two of one vehicle."""
+        """Return a test, without positions as yet, of the order of two antennas; None without two antennas of one
+        vehicle.
+        """
         if len(self.trajectories) < 2 or not self.setup.spacing_known:
             return None
         tolerance = self.config.antenna_pair.tag_tolerance_s
@@ -212,7 +214,7 @@ class EpochProcessor:
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
     ) -> tuple[Result, State]:
-        """Return the positions of one chunk, and the state to pass on with the next one.
+        """Return the positions of one chunk, and the state for the next one.
 
         Parameters
         ----------
@@ -221,15 +223,15 @@ class EpochProcessor:
         state : State, optional
             State after the chunk before this one; None at the start of a log.
         navigation : Navigation, optional
-            Records received since the chunk before. Results equal those with all records given at the start,
+            Records received since the previous chunk. Results equal those with all records given at the start,
             where each record is given before the first epoch that uses it.
         messages : SbasMessages, optional
-            SBAS messages received since the chunk before.
+            SBAS messages received since the previous chunk.
         sensors : SensorSamples, optional
-            Samples of the sensors on board since the chunk before, for the filter along the track. An antenna without
+            Samples of the sensors on board since the previous chunk, for the filter along the track. An antenna without
             observations in this chunk has them with its next one.
         base : Observations, optional
-            Of the base station since the chunk before, up to the last epoch of this one.
+            Of the base station since the previous chunk, up to the last epoch of this one.
 
         Raises
         ------
@@ -256,7 +258,7 @@ class EpochProcessor:
         """Return the ranges of one chunk after the screens: the first part of `process`; parameters are the same.
 
         Each part uses and replaces its own members of the state, so that the parts of successive chunks can be computed
-        at the same time, each with the state that it left itself.
+        at the same time, each with its own state.
         """
         if not (isinstance(observations, Mapping) and observations):
             raise ValueError("observations are one log for each antenna, at least one: {'front': log}")
@@ -336,7 +338,7 @@ class EpochProcessor:
         Parameters
         ----------
         state : State
-            Of it only what the filter left after the chunk before is used, and replaced.
+            Of it only what the filter left after the previous chunk is used, and replaced.
         """
         fusion, filter_states, sensors = {}, dict(state.fusion), chunk.sensors
         if sensors:
@@ -379,7 +381,7 @@ class EpochProcessor:
         }  # fmt: skip
 
     def _filter_antennas(self, chunk: Chunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
-        """Return the places of the filter along the track by antenna, and its states; two antennas in two threads."""
+        """Return the filter's positions by antenna, and its states; two antennas in two threads."""
 
         def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
             rows, sensors = chunk.rows[name], chunk.sensors
@@ -407,7 +409,7 @@ class EpochProcessor:
         return LineReferences(features=self._features.get(name), units=self.units, balises=self.balises)
 
     def _pair(self, time: Datetimes, near_arc_m: Floats, rows: Mapping[str, slice]) -> PairedEpochs | None:
-        """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""
+        """Return the common epochs of two antennas of one vehicle; None without such antennas."""
         if len(rows) < 2 or not self.setup.spacing_known:
             return None
         front, rear = rows["front"], rows["rear"]
@@ -418,7 +420,7 @@ class EpochProcessor:
 
 
 def _check_rising(name: str, observations: Observations, before: AntennaState | None) -> None:
-    """Raise ValueError where an epoch is not after the one before it, of the chunk `before` or its own."""
+    """Raise ValueError where an epoch is not after the preceding one, of the chunk `before` or its own."""
     time = observations.time
     if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]

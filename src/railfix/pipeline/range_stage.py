@@ -24,7 +24,9 @@ from railfix.screens import Verdict, suspicion_sigma_m
 
 
 class Models(NamedTuple):
-    """Measured models: weights of the ranges in place of `Config.noise`, the screen "cn0", ARAIM levels."""
+    """Measured models: weights of the ranges that replace `Config.noise`, the curve of the screen "cn0", the support
+    message of ARAIM levels.
+    """
 
     error_model: ErrorModel | None = None
     cn0_curve: Cn0Curve | None = None
@@ -73,7 +75,7 @@ def reject(corrected: CorrectedRanges, mask: Masks, reason: Reason) -> Corrected
 
 
 def apply_verdict(corrected: CorrectedRanges, verdict: Verdict) -> CorrectedRanges:
-    """Return the ranges with the verdict of a screen: what fails is rejected, or weighted down."""
+    """Apply the verdict of a screen to ranges: suspected ones are rejected, or weighted down."""
     failed = verdict.screened.reject
     if verdict.error_m is None:
         return reject(corrected, failed, verdict.reason)
@@ -101,7 +103,7 @@ def _apply_error_model(
 
 
 def collect_conditions(config: Config) -> Conditions:
-    """Collect settings that the errors of ranges depend on: the conditions of an error model made from such a run."""
+    """Collect settings that the errors of ranges depend on: the conditions of an error model fitted on such a run."""
     return Conditions(
         systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
         screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,

@@ -1,4 +1,4 @@
-"""Navigation records and SBAS messages received so far, and the corrections made from them."""
+"""Navigation records and SBAS messages received so far, and their corrections."""
 
 from __future__ import annotations
 
@@ -53,27 +53,27 @@ def _no_records(kind: type[Records]) -> Records:
 
 
 def no_navigation() -> Navigation:
-    """Return navigation data without records: what is known before the first message."""
+    """Return navigation data without records, as known before the first message."""
     return Navigation(kepler=_no_records(KeplerRecords), glonass=_no_records(GlonassRecords))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Received:
-    """Everything received beside the observations, up to the current epoch."""
+    """Data received besides the observations, up to the current epoch."""
 
     navigation: Navigation = field(default_factory=no_navigation)
     messages: SbasState | None = None  #: SBAS messages of the GEO in use; None: SBAS is not used.
     sbas: SbasCorrections | DfmcService | None = None  #: Corrections by these messages.
-    #: Ionospheric coefficients in use; None leaves the ionosphere uncorrected, or to SBAS; shape (8,).
+    #: Ionospheric coefficients in use; None: the ionosphere is uncorrected, or corrected by SBAS; shape (8,).
     klobuchar: Floats | None = None
-    #: Standard deviation of the vertical delay by coefficients that were not received; else 0.
+    #: Standard deviation of the vertical delay by coefficients that were not received; otherwise 0.
     ionosphere_sigma_m: float = 0.0
-    notes: tuple[str, ...] = ()  #: Data that were asked for, and the data used in their place, one sentence each.
+    notes: tuple[str, ...] = ()  #: Requested data, and the data used instead, one sentence each.
     base: BaseErrors | None = None  #: Range errors that a base station has measured.
 
 
 def correction_source(received: Received, config: Config) -> CorrectionSource:
-    """Return the source of corrections of what has been received."""
+    """Return the source of corrections from the received data."""
     models = BroadcastSource(
         navigation=received.navigation, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
         troposphere=config.troposphere, nominal=config.nominal,
@@ -93,10 +93,10 @@ def correction_source(received: Received, config: Config) -> CorrectionSource:
 def known_from_start(
     config: Config, *, navigation: Navigation | None = None, messages: SbasMessages | None = None
 ) -> Received:
-    """Return what is known before the first epoch: all of it where files are read, nothing where a train runs.
+    """Return the data known before the first epoch: all of it where files are read, nothing on a running train.
 
-    Of recorded messages the GEO is chosen if the settings ask for the best. SettingsError: SBAS and precise ephemerides
-    together, or no message of the GEO asked for.
+    In recorded messages the GEO is chosen if the settings request the best. SettingsError: SBAS and precise ephemerides
+    together, or no message of the requested GEO.
     """
     received = Received(navigation=navigation or no_navigation())
     if messages is None and config.sbas == "stream":
@@ -125,9 +125,9 @@ def receive(
     navigation: Navigation | None = None,
     messages: SbasMessages | None = None,
 ) -> Received:
-    """Return what is known after new navigation records and SBAS messages have arrived; `before` where nothing has.
+    """Return the received data after new navigation records and SBAS messages; `before` where nothing has.
 
-    `time` is that of the next epoch, NaT where there is none: SBAS messages that neither it nor a later one can use are
+    `time` is that of the next epoch, NaT without one: SBAS messages that neither it nor a later one can use are
     dropped, and so are records received again, and those that have expired, but for the newest of a satellite. Newer
     coefficients and precise ephemerides replace the older ones. Without any message so far, every satellite is rejected
     until the corrections are complete. SettingsError: SBAS and precise ephemerides together, or messages while the
@@ -150,7 +150,7 @@ def receive(
 
 
 def _empty_state(config: Config) -> SbasState:
-    """Return SBAS without a message so far."""
+    """Return SBAS corrections without a message so far."""
     if config.sbas_prn == "best":
         raise SettingsError(
             "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN (sbas_prn = 137)"
@@ -159,7 +159,7 @@ def _empty_state(config: Config) -> SbasState:
 
 
 def _with_notes(received: Received, config: Config) -> Received:
-    """Return the data with the ionospheric coefficients in use and notes on what replaces what was asked for."""
+    """Return the data with the ionospheric coefficients in use and notes on replacements of requested data."""
     if received.sbas is not None and received.navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
     received = _with_ionosphere(received, config)
@@ -203,7 +203,7 @@ def merge_navigation(old: Navigation, new: Navigation) -> Navigation:
 
 
 def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
-    """Return the rows of two tables, those of the second without the ones that the first has."""
+    """Return the rows of two tables, without rows of the second that the first has."""
     known = set(zip(*(getattr(old, name).tolist() for name in key), strict=True))
     rows = zip(*(getattr(new, name).tolist() for name in key), strict=True)
     fresh = np.array([row not in known for row in rows], dtype=bool)
@@ -211,7 +211,7 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 
 
 def _with_ionosphere(received: Received, config: Config) -> Received:
-    """Return the data with the Klobuchar coefficients in use, and notes where they are not those asked for."""
+    """Return the data with the Klobuchar coefficients in use, and notes where they are not the requested ones."""
     if isinstance(received.sbas, DfmcService):  # the model helps the screens, and cancels in the combination
         modelled = _with_ionosphere(replace(received, sbas=None), config)
         note = (

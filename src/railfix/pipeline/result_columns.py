@@ -47,11 +47,11 @@ class Column(Generic[Source]):
     name: str  #: Ends with the unit where there is one: ``along_sigma_m``.
     meaning: str
     #: Path of the values in the source of a table (``raim.statistic``), by default the name; or a function of it, or
-    #: None where the source has none. They are an array with epochs on axis 0, or one value for all rows; words are
-    #: given by their number.
+    #: None where the source has none. Their values are an array with epochs on axis 0, or one value for all rows; words
+    #: are given by their number.
     values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
-    words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words that the numbers stand for.
+    words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words by number.
 
     @property
     def unit(self) -> str:
@@ -102,7 +102,7 @@ def by_name(columns: Iterable[Column[Source]]) -> dict[str, Column[Source]]:
 
 
 def of_one_meaning(meaning: str, **values: str | Callable[[Any], NDArray[Any] | None]) -> Iterator[Column[Any]]:
-    """Return columns of floats with one meaning, and each with values of its own."""
+    """Return columns of floats with one meaning and separate values."""
     return (Column(name, meaning, source) for name, source in values.items())
 
 
@@ -112,7 +112,7 @@ def float_column(values: Floats) -> pl.Series:
 
 
 def make_table(columns: Mapping[str, Column[Source]], source: Source, rows: int, **given: str) -> pl.DataFrame:
-    """Return a table of columns with one row an epoch; `given` has the value of columns that the source has not."""
+    """Return a table of columns with one row per epoch; `given` has the value of columns that the source has not."""
     return pl.DataFrame(
         {name: column.series(given.get(name, column.of(source)), rows) for name, column in columns.items()}
     )
@@ -151,7 +151,7 @@ class Observed:
         return innovations(self.tracked, self.result.columns, self.result.reason.shape)
 
 
-#: Columns that the tables of positions and of the filter share: of the epoch, the line, the place.
+#: Columns that the tables of positions and of the filter share: epoch, line and position.
 EPOCH: Final[tuple[Column[Any], ...]] = (
     Column("time_gpst", "time tag of the receiver, GPS time", "time", dtype=pl.Datetime("ns")),
     Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
@@ -174,12 +174,12 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         *EPOCH,
         Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
         *ON_LINE,
-        Column("along_sigma_m", "standard deviation along the line, other places of an ambiguous epoch included"),
+        Column("along_sigma_m", "standard deviation along the line, other positions of an ambiguous epoch included"),
         Column("own_sigma_m", "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit"),
         *IN_SPACE,
         Column("n_used", "satellites used", dtype=pl.Int16()),
         Column("n_rejected", "satellites with a pseudorange that were not used", dtype=pl.Int16()),
-        Column("noise_scale", "noise of this receiver over that of the weights, estimated so far"),
+        Column("noise_scale", "ratio of this receiver's noise to that of the weights, as estimated so far"),
         Column(
             "raim_outcome",
             "result of RAIM: `passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
@@ -213,16 +213,16 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "protection_level_m",
             "along the line: the error exceeds it with the stated risk; infinite where `protection_cause` says "
-            "why, empty where a fault is left",
+            "why, empty where a fault remains",
             "protection.level.level_m",
         ),
         Column(
             "protection_fault_free_m",
-            "level for noise alone, with its share of the risk; may exceed `protection_level_m`",
+            "level for noise alone, with its part of the risk; may exceed `protection_level_m`",
             "protection.level.fault_free_m",
         ),
         *of_one_meaning(
-            "the same for faults of one satellite, of two; 0 where less likely than its share",
+            "level for faults of one satellite, of two; 0 where less likely than its part of the risk",
             protection_one_fault_m="protection.level.one_fault_m",
             protection_two_faults_m="protection.level.two_fault_m",
         ),
@@ -251,8 +251,9 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_cause",
-            "what sets the level: `fault_free`, `one_fault`, `two_faults`, `three_faults` or more; or why "
-            "there is none: `unchecked`, `unchecked_constellation`, `unchecked_side`, `unchecked_map`, "
+            "largest contribution to the level: `fault_free`, `one_fault`, `two_faults`, `three_faults` or more; or "
+            "the reason for a missing level: `unchecked`, `unchecked_constellation`, `unchecked_side`, "
+            "`unchecked_map`, "
             "`unchecked_together` (faults that nothing checks), `budget`, `unbounded`, "
             "`no_position`",
             "protection.level.cause",
@@ -260,7 +261,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_status",
-            "`available` within the alarm limit; `unavailable`, also in doubt about the place; `alarm`: the "
+            "`available` within the alarm limit; `unavailable`, also if the position is in doubt; `alarm`: the "
             "ranges contradict the level, or a check has failed",
             "protection.status",
             words=tuple(s.name.lower() for s in LevelStatus),
@@ -272,7 +273,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "araim_horizontal_m",
-            "the same of a 3-D position from these ranges, without the map: horizontal",
+            "level of a 3-D position from these ranges, without the map: horizontal",
             "araim.horizontal_m",
         ),
         Column(
@@ -305,8 +306,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference",
-            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status has another; or what "
-            "explains the signs: `time_tags`, `left_map`, `contradicted`",
+            "`none`, `jamming_suspected` or `spoofing_suspected`, also where the status differs; or another cause of "
+            "the signs: `time_tags`, `left_map`, `contradicted`",
             "interference.suspicion",
             words=tuple(s.name.lower() for s in Suspicion),
         ),
@@ -338,7 +339,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         Column("reason", "bits of `railfix.core.reasons.Reason`, 0 = used", "result.reason", dtype=pl.Int32()),
         Column(
             "residual_m",
-            "corrected pseudorange minus what the position on the line and the clock explain",
+            "corrected pseudorange minus the range and clock at the position on the line",
             "result.residual_m",
         ),
         Column("elevation_deg", "of the satellite, azimuth from north over east", "result.elevation_deg"),
@@ -364,7 +365,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "metric_two_frequencies_m",
-            "two frequencies: second code less first beyond what is predicted: multipath and noise",
+            "two frequencies: second code less first, less the prediction: multipath and noise",
             lambda o: _second(o, lambda r, _: r.difference_m),
         ),
         Column(
@@ -380,11 +381,12 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "innovation_code_m",
-            "filter along the track: code less what earlier epochs predict, where codes count (once a second)",
+            "filter along the track: code less its prediction from earlier epochs, where codes are used (once a "
+            "second)",
             lambda o: o.innovations["innovation_code_m"],
         ),
         *of_one_meaning(
-            "the same of the carrier phase's change, of the Doppler",
+            "innovation of the carrier phase's change, and of the Doppler",
             innovation_phase_m=lambda o: o.innovations["innovation_phase_m"],
             innovation_doppler_mps=lambda o: o.innovations["innovation_doppler_mps"],
         ),

@@ -30,7 +30,7 @@ from railfix.screens import Screened
 class AntennaResult(NotebookTable, OnDemand):
     """Results of one antenna, T epochs by M channels.
 
-    The channels are those of the observations given, of all antennas where few epochs of several are given together.
+    The channels are those of the given observations, of all antennas where few epochs of several are given together.
     """
 
     time: Datetimes  #: Shape (T,).
@@ -44,15 +44,15 @@ class AntennaResult(NotebookTable, OnDemand):
     kilometrage_m: Floats
     arc_m: Floats
     #: Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
-    #: itself; satellites and atmosphere; the map error; and the distance to an open other place, by its probability;
-    #: shape (T,).
+    #: itself; satellites and atmosphere; the map error; and the distance to another possible position, by its
+    #: probability; shape (T,).
     along_sigma_m: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
     #: receiver's noise and the noise of these residuals, widened by Student's t where few ranges are redundant. Also
     #: given where the position is dropped; shape (T,).
     own_sigma_m: Floats
-    #: Standard deviation of this receiver's ranges against the one the weights assume: root mean square of what RAIM
-    #: left in the epochs before, with forgetting; shape (T,).
+    #: Ratio of this receiver's standard deviation to that of the weights: root mean square of the ranges that RAIM
+    #: accepted in earlier epochs, with forgetting; shape (T,).
     noise_scale: Floats
     ecef_m: Floats  #: Antenna; shape (T, 3).
     #: Shape (T,).
@@ -79,17 +79,17 @@ class AntennaResult(NotebookTable, OnDemand):
     #: NaN where unknown; residuals of the position on the line; shape (T, M).
     corrected_code_m: Floats
     residual_m: Floats
-    satellites: SatelliteStates  #: Of the channels in `columns`.
+    satellites: SatelliteStates  #: Frequencies of the channels in `columns`.
     columns: Indices  #: Channels that settings allow, in the order of the intermediate results below; shape (K,).
     second: SecondCodes | None  #: Second codes of satellites, where two frequencies are used; shape (T, K).
     combined: Combined | None  #: How they were combined with the first.
     #: Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which judges positions,
     #: has shape (T,).
     screens: Mapping[str, Screened]
-    single_point: SinglePoint  #: The conventional position: every constellation with a clock of its own.
+    single_point: SinglePoint  #: The conventional position: every constellation with a separate clock.
     section: Section
     constrained: Constrained  #: Position on the line.
-    #: Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
+    #: Positions from code and phase, where ``Config.carrier`` is "float"; the coordinates are theirs.
     phase: PhasePositions | None
     raim: RaimResult  #: Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
     protection: ProtectionResult | None  #: Protection levels along the line; None where they are off.
@@ -122,12 +122,12 @@ class Result(NotebookTable):
     """Results of one chunk."""
 
     antennas: Mapping[str, AntennaResult]
-    notes: tuple[str, ...]  #: Differences between what was requested and what was used, one sentence each.
+    notes: tuple[str, ...]  #: Differences between the requested and the used data, one sentence each.
     #: Positions of the filter along the track, by antenna; empty where it is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
 
     def __getitem__(self, antenna: str) -> AntennaResult:
-        """Return the single-epoch results of an antenna; KeyError where there is none of that name."""
+        """Return the single-epoch results of an antenna; KeyError where no antenna has that name."""
         return self.antennas[antenna]
 
     def __repr__(self) -> str:

@@ -39,10 +39,10 @@ def screen_antennas(
     ionosphere_sigma_m: float,
     states: Sequence[AntennaState],
 ) -> tuple[Screening, list[AntennaState]]:
-    """Return the ranges after the screens that judge one antenna alone (`screens`, with their limits), and new states.
+    """Return the ranges after the screens of one antenna alone (`screens`, with their limits), and new states.
 
-    Dopplers and phases of the wrong sign or unit are left out first. Codes of two frequencies are combined then, and
-    smoothed by the carrier phase where the settings ask for it.
+    Dopplers and phases of the wrong sign or unit are left out first. Codes of two frequencies are combined here, and
+    smoothed by the carrier phase where the settings request it.
     """
     checked = [
         check_observables(take_epochs(corrected, rows), state.observables)

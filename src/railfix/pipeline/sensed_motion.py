@@ -39,16 +39,18 @@ from railfix.track.trajectory import Trajectory
 _TICK_NS: Final = 20_000_000
 #: Accelerations of the wheel and means of the inertial unit are over this [ns].
 _MEAN_NS: Final = 200_000_000
-#: A lost or doubled pulse is in the acceleration for so long [ns].
+#: A lost or doubled pulse disturbs the acceleration for this time [ns].
 _FAULT_NS: Final = _MEAN_NS + 150_000_000
 #: Samples before the last epoch that the next chunk needs [ns].
 REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
 #: States whose distance is that of the inertial unit.
 CARRIED: Final = (
-    MotionState.STANDING, MotionState.LOW_SPEED, MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE,
+    MotionState.STANDING,
+    MotionState.LOW_SPEED,
+    MotionState.INERTIAL_SPIN,
+    MotionState.INERTIAL_SLIDE,
     MotionState.ROLLING,
-)  # fmt: skip
-#: The state of an interval is the one that says most.
+)  # The state of an interval is its most informative one.
 _RANK: Final = np.array(
     [
         {
@@ -70,10 +72,10 @@ class SensedMotion:
     doubt_mps: Floats  #: Speed that a slip not detected yet may have had, shape (T,).
     #: Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro; shape (T,).
     swing_mps2: Floats
-    #: Of the line under the body, toward rising arc length (P2 2.3): climb over distance by wheel and accelerometer (an
-    #: offset of 0.01 m/s2 is 0.001), curvature by the yaw rate, + to the right, lean of the body over the contact
-    #: points of the wheels, + with the left rail higher; and chainage of the body's middle then. NaN where the wheel
-    #: does not roll faster than `SLOWEST_MPS`; cant without a vehicle; shape (T,).
+    #: Properties of the line under the body, toward rising arc length (P2 2.3): climb over distance by wheel and
+    #: accelerometer (an offset of 0.01 m/s2 is 0.001), curvature by the yaw rate, + to the right, lean of the body over
+    #: the contact points of the wheels, + with the left rail higher; and chainage of the body's middle then. NaN where
+    #: the wheel does not roll faster than `SLOWEST_MPS`; cant without a vehicle; shape (T,).
     gradient: Floats
     curvature_1pm: Floats
     cant_m: Floats
@@ -82,12 +84,12 @@ class SensedMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class SensedState:
-    """What one chunk leaves to the next."""
+    """State after a chunk."""
 
     tick: int = 0  #: Number of the last sample since the beginning of GPS time; 0 before the first.
-    #: Place of the antenna then, by the wheel since the last one of the filter; NaN where it is not known.
+    #: Position of the antenna then, by the wheel since the filter's last position; NaN where it is not known.
     arc_m: float = float("nan")
-    sigma_m: float = float("nan")  #: Standard deviation of that place of the filter.
+    sigma_m: float = float("nan")  #: Standard deviation of that position of the filter.
     slip: SlipState | None = None
 
     @property
@@ -120,8 +122,8 @@ def sensed_motion(
     """Return the motion between instants, the rates of the body (None without a sample), and the state to pass on.
 
     Pulses with a direction and inertial samples are from `REACH` before the first of the T + 1 `edges` on. `sine_at`
-    gives the sine of the gradient in rising arc length at arc lengths; the trajectory of the antenna shows which way
-    the front points, and where the body is.
+    gives the sine of the gradient in rising arc length at arc lengths; the trajectory of the antenna determines the
+    direction of the front, and the position of the body.
     """
     facing = trajectory.front_sign
     ends = edges.astype("datetime64[ns]").astype(np.int64)
@@ -144,7 +146,8 @@ def sensed_motion(
     distances = distance_m(pulses, np.concatenate([[start], when]), limits=tachometer)
     arc = state.arc_m + facing * (distances[1:] - distances[0])
     line_sine = facing * sine_at(arc)
-    # the speed by pulses is that of the middle of their time: 0.065 s ago, 0.2 m after a slip of 3 s begun at 1 m/s2
+    # the speed by pulses is that of the middle of their time: a delay of 0.065 s, which is 0.2 m after a slip of 3 s
+    # begun at 1 m/s2
     ago = seconds(when - speed.time)
     found, slip = find_slips(
         MotionSamples(
@@ -193,7 +196,7 @@ def _slope_and_bend(sine: Floats, turned_radps: Floats, speed_mps: Floats) -> tu
 def _wheel_acceleration(
     pulses: TachometerPulses, ticks: Integers, speed: PulseSpeeds, limits: TachometerLimits
 ) -> Floats:
-    """Return the acceleration by the wheel at the ticks; NaN by a lost tooth, which is no slip."""
+    """Return the acceleration by the wheel at the ticks; NaN from a lost tooth, which is no slip."""
     when, earlier, before = ((ticks * _TICK_NS - ago).astype("datetime64[ns]") for ago in (0, _MEAN_NS, _FAULT_NS))
     acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=limits), speed)
     return np.where(faults_until(pulses, when) > faults_until(pulses, before), np.nan, acceleration)
@@ -211,7 +214,7 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 def _by_interval(
     state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Return samples brought together by interval: `at` is the first sample after each instant, 0 after the first.
+    """Return samples grouped by interval: `at` is the first sample after each instant, 0 after the first.
 
     `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """

@@ -33,17 +33,17 @@ from railfix.tracking import RangeEpochs, SensorEpochs
 
 #: Longest time between epochs over which a distance or a mean force is taken [s].
 _LONGEST_S: Final = 5.0
-#: Share of the samples of an interval that must be there for its mean.
+#: Fraction of the samples of an interval that its mean requires.
 _COMPLETE: Final = 0.9
 #: Standard deviation of the speed that the inertial unit carries through a slip, a stop or a start [m/s].
 _CARRY_SIGMA_MPS: Final = 0.1
 #: Standard deviations in one metre of distance: swings of the body of 1 mrad, and of its heading [1/m].
 _GRADIENT_NOISE: Final = 1e-3
 _CURVATURE_NOISE_1PM: Final = 1e-4
-#: Length over which the errors of the map change (as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`) [m]: a map
-#: of 0.3 m places no feature better than some metres, one of 0.05 m to half a metre.
+#: Length over which the errors of the map change (as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`) [m]: with
+#: a map of 0.3 m features are located to no better than some metres, with one of 0.05 m to half a metre.
 _MAP_LENGTH_M: Final = 50.0
-#: Least standard deviation of the place of a feature: the map's, and that of the body on its bogies [m].
+#: Least standard deviation of the position of a feature: the map's, and that of the body on its bogies [m].
 _FEATURE_SIGMA_M: Final = 0.5
 
 Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
@@ -51,15 +51,15 @@ Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, Sta
 
 @dataclass(frozen=True, kw_only=True)
 class LineReferences:
-    """What sensors are compared with."""
+    """References that sensors are compared with."""
 
     features: LineFeatures | None = None
     units: GroundUnits | None = None
     balises: ListedBalises | None = None
 
 
-#: Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
-#: answering delay beside it.
+#: Standard deviation of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), with echoes and drifts
+#: of the unit's answering delay.
 _RANGE_SIGMA_M: Final = 0.5
 _RADAR_SIGMA_MPS: Final = 0.1
 
@@ -68,24 +68,25 @@ class SensorLimits(Settings):
     """Noise of the sensors as the filter sees them."""
 
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
-    #: Of the detection of slip and slide by tachometer and inertial unit together.
+    #: Detection of slip and slide by tachometer and inertial unit together.
     slip: SlipLimits = Field(default_factory=SlipLimits)
-    #: Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna), to
-    #: the right of the antenna's path and above the antenna.
+    #: Position of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna),
+    #: to the right of the antenna's path and above the antenna.
     range_ahead_m: float = 0.0
     range_right_m: float = 0.0
     range_above_m: float = 0.0
 
     balise: BaliseLimits = Field(default_factory=BaliseLimits)
-    #: After an outage codes count again when three positions in a row are within so many sigmas, or so late.
+    #: After an outage codes are used again when three positions in a row are within this many sigmas, or after this
+    #: time.
     return_sigmas: float = Field(default=4.0, gt=0)
     return_s: float = Field(default=60.0, ge=0)
-    #: Of a distance between two epochs beside the pulse: creep of a braked or driven wheel.
+    #: Standard deviation of a distance between two epochs in addition to the pulse: creep of a braked or driven wheel.
     wheel_sigma_m: float = Field(default=0.01, gt=0)
-    #: Of one speed, and the usual time between two.
+    #: Standard deviation of one speed, and the usual interval of two.
     radar_step_s: float = Field(default=0.1, gt=0)
-    #: Of a mean force between two epochs: pitching of the body beside the sensor's noise (1 mrad is 0.01 m/s2), and the
-    #: map's gradient.
+    #: Standard deviation of a mean force between two epochs: pitching of the body in addition to the sensor's noise (1
+    #: mrad is 0.01 m/s2), and the map's gradient.
     force_sigma_mps2: float = Field(default=0.05, gt=0)
 
 
@@ -131,10 +132,10 @@ def sensor_epochs(
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
     """Return distances and forces between the epochs, the motion that wheel and inertia agree on, and the new state.
 
-    Samples are those since the chunk before, epochs those of the antenna, shape (T,); the trajectory shows which way
-    the front points, `sine_at` the sine of the gradient at arc lengths (the line is unknown without). `sources` names
-    which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted, `references` has features of the
-    line, ground units and listed balises.
+    Samples are those since the previous chunk, epochs those of the antenna, shape (T,); the trajectory determines the
+    direction of the front, `sine_at` the sine of the gradient at arc lengths (without it the line is unknown).
+    `sources` names the requested ones of `wheel`, `radar`, `force`, `feature`, `balise` and `range`, `references` has
+    features of the line, ground units and listed balises.
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
@@ -150,7 +151,7 @@ def sensor_epochs(
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     values: dict[str, Any] = {}
-    # what comes after the last epoch is not known yet, however the log is cut
+    # samples after the last epoch belong to the next chunk, independent of how the log is cut
     heard = int(np.searchsorted(pulses.time, edges[-1], side="right"))
     wheel = heard > 0 and "wheel" in sources
     force = len(inertial) > 0 and bool(inertial.time[0] <= edges[-1]) and "force" in sources
@@ -239,7 +240,7 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
     """Return the noise of gradient and curvature in one metre, the errors of the map in it.
 
     A map off by sigma across the track over a length L has curvatures off by ``sqrt(3) sigma / L^2`` for about L: as
-    white noise in one metre times ``sqrt(L)``. Its gradients are off by ``sigma / L`` likewise.
+    white noise in one metre times ``sqrt(L)``. Its gradients have the error ``sigma / L``.
     """
     gradient = trajectory.sigma_height_m / np.sqrt(_MAP_LENGTH_M)
     curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / _MAP_LENGTH_M**1.5
@@ -247,7 +248,7 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
 
 
 def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes) -> dict[str, Floats]:
-    """Return the places of the antenna by the accepted features, at the first epoch after each."""
+    """Return the positions of the antenna by the accepted features, at the first epoch after each."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
     for fix in fixes:
@@ -260,7 +261,9 @@ def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes) -> dict
 
 
 def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
-    """Return the place of the vehicle's ranging unit from the antenna: along, right and up of its path, shape (3,)."""
+    """Return the position of the vehicle's ranging unit from the antenna: along, right and up of its path,
+    shape (3,).
+    """
     facing = trajectory.front_sign
     along = facing * limits.range_ahead_m - ahead_m(trajectory)
     return np.array([along, facing * limits.range_right_m, limits.range_above_m])
@@ -295,7 +298,7 @@ def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: Sen
 
 
 def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Floats, Floats]:
-    """Return the mean of the samples in each interval after its first edge, and the share of them that is finite."""
+    """Return the mean of the samples in each interval after its first edge, and their finite fraction."""
     known = np.isfinite(values)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
     count = np.concatenate([[0], np.cumsum(known)])
@@ -306,7 +309,7 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Return the intervals of which a sensor has not been heard to the end: the last one, or none."""
+    """Return the intervals that a sensor's samples do not cover to the end: the last one, or none."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 

@@ -1,4 +1,4 @@
-"""Smoothed positions of a run: the filter run again over what it was given, then backward."""
+"""Smoothed positions of a run: the filter run again over its stored input, then backward."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EPOCHS: Final = 300
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """What the filter was given for some epochs."""
+    """Input of the filter for some epochs."""
 
     epochs: GnssEpochs
     sensors: SensorEpochs
@@ -36,7 +36,7 @@ class Replay:
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothedTrack:
-    """Places of T epochs by everything measured before and after them."""
+    """Positions of T epochs from all measurements before and after them."""
 
     time: Datetimes  #: Shape (T,).
     #: Shape (T,).
@@ -46,14 +46,14 @@ class SmoothedTrack:
 
 
 def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
-    """Return the places of all epochs from what the filter was given, the last first."""
+    """Return the positions of all epochs from the input of the filter, the last first."""
     parts: list[SmoothedTrack] = []
     later: BackwardInformation | None = None
     for replay in backward:
         for epochs, before in reversed(_pieces(replay, line, limits)):
             trace: list[Step] = []
             track(epochs, line, before, limits=limits, sensors=replay.sensors, trace=trace)
-            found, later = smooth_steps(trace, before or TrackState.empty(), later, limits)
+            found, later = smooth_steps(trace, before or TrackState(), later, limits)
             arc = found.arc_m + line.round_m(found.arc_m)
             parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
     nothing = np.empty(0)

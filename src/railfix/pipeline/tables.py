@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
-    """Return one row an epoch of one antenna, also where there is no position: `POSITION_COLUMNS`."""
+    """Return one row per epoch of one antenna, also without a position: `POSITION_COLUMNS`."""
     return make_table(POSITION_COLUMNS, result, len(result.time), antenna=name)
 
 
@@ -55,13 +55,13 @@ def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def positions_table(result: Result) -> pl.DataFrame:
-    """Return one row an epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
+    """Return one row per epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
 
 def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack | None = None) -> pl.DataFrame:
-    """Return one row an epoch and channel that was observed, of one antenna: `OBSERVATION_COLUMNS`."""
+    """Return one row per epoch and observed channel of one antenna: `OBSERVATION_COLUMNS`."""
     source = Observed(result, tracked)
     epoch, channel = np.nonzero((result.reason & Reason.NOT_OBSERVED) == 0)
     reasons, inverse = np.unique(result.reason[epoch, channel], return_inverse=True)
@@ -81,13 +81,13 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 
 def observations_table(result: Result) -> pl.DataFrame:
-    """Return `OBSERVATION_COLUMNS`: a row an epoch, antenna and channel that was observed, in the order of these."""
+    """Return `OBSERVATION_COLUMNS`: a row per epoch, antenna and channel that was observed, in the order of these."""
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
 
 def round_floats(table: pl.DataFrame) -> pl.DataFrame:
-    """Return a table with its floats rounded to what CSV files get: 0.1 mm, 1e-9 deg."""
+    """Return a table with its floats rounded as in CSV files: 0.1 mm, 1e-9 deg."""
     floats = [name for name, kind in table.schema.items() if kind == pl.Float64]
     return table.with_columns(pl.col(name).round(decimals(name)) for name in floats)
 
@@ -170,7 +170,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         *ON_LINE,
         Column(
             "along_sigma_m",
-            "standard deviation of the place, with the straight distance to other branches in it",
+            "standard deviation of the position, including the straight distance to other branches",
             "tracked.sigma_m",
         ),
         Column("speed_mps", "along the line, + toward rising chainage", "tracked.speed_mps"),
@@ -178,30 +178,35 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("acceleration_mps2", "along the line", "tracked.acceleration_mps2"),
         Column(
             "direction",
-            "`rising` or `falling` chainage, `unknown` where the speed does not tell",
+            "`rising` or `falling` chainage, `unknown` where the speed is too small to decide",
             lambda r: r.direction + 1,
             words=("falling", "unknown", "rising"),
         ),
         Column("standstill", "slower than 1 km/h with two sigmas", dtype=pl.Boolean()),
         Column(
             "branch_probability",
-            "probability of the place given against other places of the line",
+            "probability of the given position against other positions on the line",
             "tracked.probability",
         ),
-        Column("hypotheses", "places that are possible", "tracked.hypotheses", dtype=pl.Int16()),
+        Column("hypotheses", "number of possible positions", "tracked.hypotheses", dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "exceeded by the error along the line with the stated risk; infinite where another place is likelier "
-            "or measurements contradict the place",
+            "exceeded by the error along the line with the stated risk; infinite where another position is likelier "
+            "or measurements contradict the position",
             "tracked.level_m",
         ),
         Column(
             "protection_level_ground_m",
-            "the same of the straight distance on the ground, also on another lap or beside the map",
+            "level of the straight distance on the ground, also on another lap or off the map",
             "tracked.ground_level_m",
         ),
         Column("protection_noise_m", "its part by noise without a fault", "tracked.level_noise_m"),
         Column("protection_separation_m", "largest distance of a sub-filter of the level", "tracked.separation_m"),
+        Column(
+            "protection_unchecked",
+            "probability of faults that the level does not bound: one of the only constellation in view",
+            "tracked.unchecked_prior",
+        ),
         Column(
             "over_reading_m",
             "how far the train may be behind: the level, at least 2 % of the distance since codes were used "
@@ -232,7 +237,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "tracked.code_weight",
         ),
         Column("motion_weight", "mean weight of Dopplers and phases", "tracked.motion_weight"),
-        Column("wheel_scale", "share that its distance is too short by, as estimated", "tracked.wheel_scale"),
+        Column("wheel_scale", "estimated scale error of its distance, + where too short", "tracked.wheel_scale"),
         Column("radar_scale", "share that its distance is too short by, as estimated", "tracked.radar_scale"),
         Column("force_offset_mps2", "offset of the accelerometer, as estimated", "tracked.force_offset_mps2"),
         Column(
@@ -263,7 +268,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "metric_antenna_spacing_m",
-            "distance of the two antennas' places less that of the antennas; empty for one antenna",
+            "distance of the two positions less that of the antennas; empty for one antenna",
             "spacing_error_m",
         ),
         Column(
@@ -281,7 +286,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
                 (Kind.WHEEL, "m", "distance since the epoch before"),
                 (Kind.RADAR, "m", "distance since the epoch before"),
                 (Kind.FORCE, "mps2", "mean specific force forward"),
-                (Kind.PLACE, "m", "place by a feature of the line"),
+                (Kind.PLACE, "m", "position by a feature of the line"),
                 (Kind.BALISE, "m", "place of a balise"),
                 (Kind.RANGE, "m", "range to a ground unit"),
             )
@@ -292,7 +297,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
 
 @dataclass(frozen=True)
 class SmoothedAntenna:
-    """Smoothed places of one antenna, with its trajectory."""
+    """Smoothed positions of one antenna, with its trajectory."""
 
     track: SmoothedTrack
     trajectory: Trajectory
@@ -307,7 +312,7 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
             lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
         ),
         Column("smoothed_sigma_m", "its standard deviation", "track.sigma_m"),
-        Column("smoothed_speed_mps", "speed along the line, in the same way", "track.speed_mps"),
+        Column("smoothed_speed_mps", "speed along the line from all measurements before and after", "track.speed_mps"),
     )
 )
 
@@ -353,7 +358,7 @@ def _getter(name: str) -> Any:
 #: Columns of the table of passings.
 PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
     (
-        Column("time_gpst", "when the place was passed, by the filter; or a reading that is wrong", _getter("time"),
+        Column("time_gpst", "time of the passing by the filter; or of a contradicting reading", _getter("time"),
                dtype=_TIME),
         Column("earliest_gpst", "begin of the interval of the passing, by the level: before, the train was not there",
                _getter("earliest"), dtype=_TIME),
@@ -368,11 +373,11 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
         ),
         Column("chainage_m", "as listed", _getter("chainage_m")),
         Column("read_gpst", "time of the reading", _getter("read"), dtype=_TIME),
-        Column("read_error_m", "of a reading that contradicts: listed place less that of the filter",
+        Column("read_error_m", "of a reading that contradicts: listed chainage less that of the filter",
                _getter("read_error_m")),
         Column("speed_mps", "at the passing, + toward rising chainage", _getter("speed_mps")),
-        Column("protection_level_m", "of the place at the passing", _getter("level_m")),
-        Column("doubt_over_m", "how far the train may be behind the place: `L_DOUBTOVER` less `Q_LOCACC`",
+        Column("protection_level_m", "protection level of the position at the passing", _getter("level_m")),
+        Column("doubt_over_m", "how far the train may be behind the position: `L_DOUBTOVER` less `Q_LOCACC`",
                _getter("amount_m")),
         Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _getter("amount_m")),
         Column("odometer_m", "for comparison: 5 m and 5 % of the distance since the last balise read (SUBSET-041)",

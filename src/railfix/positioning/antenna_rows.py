@@ -1,7 +1,7 @@
-"""Epochs of several antennas as the rows of one set of arrays.
+"""Epochs of several antennas as rows of common arrays.
 
-Stages that know neither the line nor earlier epochs take all rows in one call; those that do are called for the rows of
-each antenna, and what they return is joined.
+Stages that depend neither on the line nor on earlier epochs process all rows in one call; the other stages are called
+for the rows of each antenna, and their results are joined.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ State = TypeVar("State")
 class AntennaRows:
     """Which rows are of which antenna."""
 
-    indices: tuple[SearchIndex, ...]  #: Of the trajectory of each antenna; their maps have the same sigmas.
-    parts: tuple[slice, ...]  #: Rows of each antenna, one after the other; `EVERY` of a single one.
+    indices: tuple[SearchIndex, ...]  #: Trajectory of each antenna; their maps have the same sigmas.
+    parts: tuple[slice, ...]  #: Rows of each antenna, concatenated; `EVERY` of a single one.
 
     @classmethod
     def on(cls, line: Trajectory | SearchIndex | AntennaRows) -> AntennaRows:
-        """Return the rows of one antenna on a line; those of several as they are."""
+        """Return the rows of one antenna on a line; rows of several antennas unchanged."""
         if isinstance(line, AntennaRows):
             return line
         return cls((line if isinstance(line, SearchIndex) else SearchIndex(line),), (EVERY,))
@@ -51,11 +51,11 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Return what a function gives for each antenna: of its search index, rows, and one item of each list."""
+        """Call a function for each antenna with its search index, rows, and one item of each list; join the results."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
-        """Return the same, joined."""
+        """Return the rows of several antennas, joined."""
         return join_epochs(self.apart(function, *of_antennas))
 
     def each_with_state(
@@ -93,7 +93,7 @@ class AntennaRows:
         return self.each(lambda index, rows: index.trajectory.get_axes(section[rows]))
 
 
-#: What a stage takes as the line: the trajectory of one antenna, its search structures, or epochs of several.
+#: Line of a stage: the trajectory of one antenna, its search structures, or epochs of several antennas.
 Line = Trajectory | SearchIndex | AntennaRows
 
 

@@ -14,11 +14,11 @@ from railfix.positioning.normal_equations import SinglePointLimits, point_positi
 from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.section_search import SectionLimits, find_section
 
-#: Standard deviation given to raw ranges for the approximate place of the antenna [m].
+#: Standard deviation of raw ranges for the approximate position of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
 #: A last step of this length leaves 25 m of a range, which turns no satellite by more than 2e-6 rad [m].
 _TOLERANCE_M: Final = 1000.0
-#: A raw 3-D position further from the line than this is not that of a train on it, however bad the ranges [m].
+#: A raw 3-D position farther from the line than this is not on the line, however bad the ranges [m].
 MAX_FROM_LINE_M: Final = 1e5
 
 
@@ -28,7 +28,7 @@ class ApproximatePosition(NamedTuple):
     ecef_m: Floats  #: Shape (T, 3).
     arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).
     gross: Masks  #: Codes that are grossly wrong, shape (T, K).
-    unsure: Masks  #: Epochs in which a code is grossly wrong, and nothing tells which one; shape (T,).
+    unsure: Masks  #: Epochs with a grossly wrong code that cannot be identified; shape (T,).
 
 
 def approximate_position(
@@ -36,9 +36,9 @@ def approximate_position(
 ) -> ApproximatePosition:
     """Return approximate positions by the raw codes that are not grossly wrong (P1 2.2(2): delays are predicted there).
 
-    The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
-    the middle of the line at every epoch so that no epoch depends on another; the 3-D position
-    itself where it is far from the line; the best-fitting point of the line where there is no 3-D position.
+    The point of the line nearest to a 3-D position from raw ranges of equal weight, iterated from the middle of the
+    line at every epoch so that epochs are independent; the 3-D position itself where it is far from the line; the
+    best-fitting point of the line where there is no 3-D position.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ speed v along the unit tangent e of its path measures
     ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
 
 with the drifts of both clocks in m/s and the change of the tropospheric delay. Unknown are v and d_r, whatever the
-number of constellations. The ionosphere's change (millimetres a second) is left in.
+number of constellations. The ionosphere's change (millimetres per second) is neglected.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_avail
 
 _STEP_S: Final = 1.0  #: Step over which clocks and elevations are differenced [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-_PASSES: Final = 3  #: Fits with the scale of the one before; the first takes the limits' own noise.
-_TELLING: Final = 2.0  #: Mean squares of residuals within this many standard deviations of 1 are what noise makes.
+_PASSES: Final = 3  #: Fits with the scale of the previous fit; the first uses the limits' own noise.
+_TELLING: Final = 2.0  #: Mean squares of residuals within this many standard deviations of 1 are within the noise.
 _FLOOR_MPS: Final = 0.02
 
 
@@ -46,7 +46,7 @@ class DopplerSpeedLimits(Settings):
     #: A Doppler is left out when its residual is over this many of its own standard deviations (the w-test of W.
     #: Baarda, 1968); the largest goes first.
     outlier: float = Field(default=3.5, gt=0)
-    most_rejected: int = Field(default=8, ge=0)  #: Dopplers left out at an epoch at most.
+    most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers left out per epoch.
     min_satellites: int = Field(default=4, ge=3)  #: Satellites that must be left; 2 are solved for.
 
 
@@ -82,16 +82,16 @@ class DopplerSpeed:
     used: Masks
     rejected: Masks
     n_used: Integers  #: Shape (T,).
-    scale: float  #: Standard deviation of the receiver's Dopplers against that of the limits, over the whole log.
+    scale: float  #: Standard deviation of the receiver's Dopplers relative to the limits, over the whole log.
 
 
 def dopplers_of_log(
     obs: Observations, navigation: Navigation, *, systems: Sequence[str], signals: Mapping[str, Sequence[str]]
 ) -> Dopplers:
-    """Return the Dopplers of a log with the satellites that they come from; one signal a satellite and epoch.
+    """Return the Dopplers of a log with their satellites; one signal per satellite and epoch.
 
-    Left out are unhealthy satellites, unknown carriers, and channels without a code, which tells the instant of
-    transmission.
+    Unhealthy satellites, unknown carriers, and channels without a code, from which the time of transmission is
+    computed, are left out.
     """
     columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=signals)
     satellite, signal = obs.satellite[columns], obs.signal[columns]
@@ -101,7 +101,7 @@ def dopplers_of_log(
     known = np.isfinite(doppler) & np.isfinite(wavelength) & (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
     code = np.where(first_available(satellite, known), code, np.nan)
     now = satellite_states(obs.time, satellite, signal, code, navigation)
-    # The same records at another instant: a second earlier along the same orbit and clock.
+    # The same records one second earlier along the same orbit and clock.
     before = satellite_states(obs.time, satellite, signal, code + SPEED_OF_LIGHT * _STEP_S, navigation)
     usable = np.isfinite(now.clock_m) & np.isfinite(before.clock_m) & ~now.unhealthy
     return Dopplers(
@@ -121,9 +121,9 @@ def doppler_speed(
 ) -> DopplerSpeed:
     """Estimate speed along the track and clock drift by weighted least squares, all epochs at once.
 
-    Outliers go one by one, the largest first, as long as enough satellites are left; the median of the log's residuals
-    is the scale. `ecef_m`, shape (T, 3): 10 m off change a range rate by 2 mm/s; NaN: no speed. `tangent`: unit
-    vectors.
+    Outliers are removed one by one, the largest first, while enough satellites are left; the median of the log's
+    residuals is the scale. `ecef_m`, shape (T, 3): 10 m off change a range rate by 2 mm/s; NaN: no speed. `tangent`:
+    unit vectors.
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)

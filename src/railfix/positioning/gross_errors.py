@@ -1,9 +1,9 @@
 """Detect grossly wrong codes before anything is fitted to all of them.
 
-A least-squares position absorbs a share of every error: one code 10 km off moves it by kilometres, to where no
-atmospheric model and no map is valid, and its residuals accuse other satellites. The position with the least sum of
-absolute residuals is not moved further by an error that grows: the sum is convex, and each range beyond the others
-pulls with the same force.
+A least-squares position absorbs part of every error: one code that is 10 km off moves it by kilometres, where no
+atmospheric model and no map is valid, and its residuals point to other satellites. The position with the least sum of
+absolute residuals does not move further when an error grows: the sum is convex, and each outlying range pulls with the
+same force.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from railfix.track.trajectory import Trajectory
 
 #: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].
 GROSS_M: Final = 100.0
-#: Largest median residual of the codes that are left: they agree with each other [m].
+#: Largest median residual of the remaining codes: they agree with each other [m].
 AGREEING_M: Final = 30.0
-#: Redundant ranges that are left after an exclusion in space, so that the rest is still checked.
+#: Redundant ranges that remain after an exclusion in space, so that the rest is still checked.
 _LEFT_IN_SPACE: Final = 3
-#: Where only one or two are left, the other exclusions must fit worse by this factor.
+#: Where only one or two ranges remain, the other exclusions must fit worse by this factor.
 _CLEARER: Final = 5.0
-#: Scales of the residuals from which on a corrected code disagrees with the others.
+#: Multiple of the scale of the residuals from which on a corrected code disagrees with the others.
 _DISAGREE: Final = 5.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 #: Iterations; the least residual that divides a weight, in sigmas, in the first ten of them and later.
@@ -90,7 +90,7 @@ def _freedom(ranges: Ranges, unknowns: int) -> Integers:
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     """Return the raw codes that are off by more than `GROSS_M`, shape (T, M), where the others agree on a position.
 
-    Three redundant ranges are left and agree. With fewer, one range is accused where leaving it out makes the others
+    Three redundant ranges remain and agree. With fewer ranges, one is rejected where leaving it out makes the others
     agree, and leaving out any other one does not.
     """
     place = least_absolute(ranges, start_ecef_m)
@@ -108,7 +108,9 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return the one range without which the others agree within `AGREEING_M`, shape (T, M); none where two explain."""
+    """Return the one range without which the others agree within `AGREEING_M`, shape (T, M); none where two explain the
+    residuals.
+    """
     epochs, channels = ranges.weight.shape
     epoch, channel = np.nonzero(ranges.weight > 0)
     each = ranges.take(epoch)
@@ -165,7 +167,7 @@ _COARSE_M: Final = 100.0
 _FINE_M: Final = 12.5
 #: Points times epochs times channels that are computed at once.
 _BLOCK: Final = 2_000_000
-#: Other accusations must cost so much more: a share of one gross error.
+#: Other exclusions must cost this much more: a fraction of one gross error.
 _CLEAR: Final = 0.7
 #: Redundant ranges that agree with a point of the line.
 _LEFT_ON_LINE: Final = 2
@@ -212,7 +214,9 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
 
 
 def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at N places of each epoch, (T, N, 3) [m], each clock at its median, (T, N, M); NaN: not used."""
+    """Return residuals at N positions of each epoch, (T, N, 3) [m], each clock at its median, (T, N, M);
+    NaN: not used.
+    """
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
     square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]
@@ -238,11 +242,11 @@ class GrossErrors(NamedTuple):
     """Gross errors of raw ranges, T epochs by M channels."""
 
     gross: Masks  #: Ranges that are grossly wrong, shape (T, M).
-    #: Arc of the best point of the line where nothing tells which range is grossly wrong; NaN elsewhere; shape (T,).
+    #: Arc of the best point of the line where the grossly wrong range cannot be identified; NaN elsewhere; shape (T,).
     unsure_arc_m: Floats
 
 
-#: Ellipsoidal heights of trains, and more [m]: a position beyond them says nothing.
+#: Ellipsoidal heights of trains with a margin [m]: a position outside is not used.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Root of the sum of squared raw residuals up to which an epoch is not examined; distance of its position from the
 #: line from which on it is [m].

@@ -18,10 +18,10 @@ from railfix.positioning.receiver_noise import ClockOffsetLimits, OffsetState, R
 
 
 class PointPositions(NamedTuple):
-    """3-D positions of T epochs, and the ranges with what is known of the clocks."""
+    """3-D positions of T epochs, and the ranges with the estimated clocks."""
 
-    untied: Ranges  #: With a clock for each constellation.
-    ranges: Ranges  #: With the inter-system biases known so far.
+    untied: Ranges  #: Position with a clock for each constellation.
+    ranges: Ranges  #: Position with the inter-system biases known so far.
     point: SinglePoint  #: The conventional position, from the untied ranges.
     tied: SinglePoint  #: From those with known biases.
     #: Ranges that agree with each other in space, and the positions from these.
@@ -52,7 +52,7 @@ def tie_constellations(
 ) -> tuple[PointPositions, list[OffsetState]]:
     """Return 3-D positions (P1 5), inter-system biases by the epochs before each, and the state after the last one.
 
-    Each further constellation costs one satellite for its clock; a bias that is known to a metre gives it back. Biases
+    Each further constellation costs one satellite for its clock, unless its bias is known to a metre. Biases
     are differences of the receiver clocks of positions from ranges that agree with each other, averaged over earlier
     epochs: results do not depend on how a log is cut.
 
@@ -66,7 +66,7 @@ def tie_constellations(
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
         Approximate positions.
     states : sequence of OffsetState
-        Of each receiver after the epochs before; returned anew.
+        State of each receiver after the earlier epochs; the new states are returned.
     reference : str, optional
         Letter of the clock that biases refer to; by default that of GPS, or the first one without GPS.
     parts : sequence of slice

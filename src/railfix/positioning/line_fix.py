@@ -1,4 +1,4 @@
-"""Section search and constrained fix of antennas from one set of ranges."""
+"""Section search and constrained fix of antennas from common ranges."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FixLimits(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class LineFix:
-    """Positions from one set of ranges, T epochs."""
+    """Positions of T epochs from common ranges."""
 
     point: SinglePoint  #: 3-D position without the map.
     section: Section  #: Best-fitting vertex of the trajectory.
@@ -51,7 +51,7 @@ def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimit
 
 
 def refit_epochs(ranges: Ranges, antennas: AntennaRows, fix: LineFix, epochs: Indices, limits: FixLimits) -> LineFix:
-    """Return positions with those of some rising epochs found again, from other ranges."""
+    """Return positions in which some epochs, in rising order, are replaced by those from other ranges."""
     for index, own in antennas.split(epochs):
         part = ranges.take(own)
         solved = fix_on_line(

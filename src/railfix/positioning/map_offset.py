@@ -1,7 +1,7 @@
 """Offset of the 3-D positions from the line over minutes: the test of a wrong map.
 
 Single epochs hide a constant offset in their noise; the mean over a window does not. Its sigma has three parts: noise,
-which the window averages; errors of satellites and atmosphere, which it does not; and the stated error of the map.
+which the window averages; satellite and atmospheric errors, which it does not average; and the stated error of the map.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class MapOffsetState:
 
     #: Of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Of the last epoch [windows].
+    age: float = 0.0  #: Window of the last epoch [windows].
     #: Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples: of the
     #: epochs that are on the map, then of those off it; shape (18,).
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
@@ -76,7 +76,8 @@ class MapOffset:
     #: Right of the line in the direction of rising chainage, and above it; shape (T,).
     across_m: Floats
     up_m: Floats
-    #: Of a right map, across and up: noise, satellites, atmosphere and the stated error of the map; shape (T, 2, 2).
+    #: Covariance across and up for a correct map: noise, satellites, atmosphere and the stated error of the map; shape
+    #: (T, 2, 2).
     covariance_m2: Floats
     statistic: Floats  #: Square of the offset in sigmas, both components together; shape (T,).
     #: Smallest offsets across and up that the test finds, each alone; smaller ones are not excluded; shape (T, 2).
@@ -112,15 +113,15 @@ class OffsetErrors(NamedTuple):
     """Errors of the ranges of T epochs."""
 
     nominal_m: Floats  #: Standard deviations of satellites and atmosphere, shape (T, M).
-    variance: Floats  #: Of the ranges against their weights, shape (T,).
+    variance: Floats  #: Scale of the ranges against their weights, shape (T,).
 
 
 class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
-    arc_m: Floats  #: NaN where there is none, shape (T,).
-    #: The train is away from the line. These epochs have a window of their own: what a train was beside while it was
-    #: away says nothing of the map once it is on it; shape (T,).
+    arc_m: Floats  #: NaN where missing, shape (T,).
+    #: The train is away from the line. These epochs have a separate window: positions off the line contain no
+    #: information on the map when the train has returned to it; shape (T,).
     off_map: Masks
 
 
@@ -170,6 +171,17 @@ def map_offset(
     return result, after
 
 
+def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
+    """Return how far 3-D positions (T, 3) lie right of positions on the line and above them, shape (T, 2); NaN
+    without.
+    """
+    known = np.isfinite(arc_m)
+    arc = np.where(known, arc_m, 0.0)
+    axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]
+    offset = np.einsum("tij,tj->ti", axes, ecef_m - antennas.at_arc(arc))
+    return np.asarray(np.where(known[:, None], offset, np.nan))
+
+
 def terms_of_epochs(
     ranges: RangeArrays,
     ecef_m: Floats,
@@ -179,9 +191,10 @@ def terms_of_epochs(
     nominal_m: Floats,
     variance: Floats,
 ) -> Floats:
-    """Return what each epoch adds to the sums of its window, shape (T, 9): `MapOffsetState.sums`, of one sample.
+    """Return the contribution of each epoch to the sums of its window, shape (T, 9): `MapOffsetState.sums` of one
+    sample.
 
-    3-D positions with covariance (T, 3, 3), places on the line (T, 3), unit vectors across and up there (T, 2, 3);
+    3-D positions with covariance (T, 3, 3), positions on the line (T, 3), unit vectors across and up there (T, 2, 3);
     `nominal_m` (in C order) and `variance` of `OffsetErrors`.
     """
     offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)

@@ -1,9 +1,9 @@
 """Normal equations of ranges with the receiver clocks eliminated; the constrained position and the 3-D single point.
 
 Subtracting the weighted mean of a constellation's satellites from its residuals and design rows is the same as solving
-for that clock (the Schur complement of the clock block). Where the offsets between the clocks are known to some sigma
-(`InterSystemBiases`), each mean, less its offset, is one more observation of a common clock, eliminated in the same
-way.
+for that clock (the Schur complement of the clock block). Where the offsets between the clocks are known with a sigma
+(`InterSystemBiases`), each mean less its offset is one more observation of a common clock, eliminated in the same
+manner.
 
 P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
 height errors are two more unknowns with their covariance as prior, the same as an added covariance ``H_m S_m H_m^T``.
@@ -30,19 +30,20 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class NormalEquations:
-    """Fit of ranges around a place, the clocks eliminated."""
+    """Fit of ranges at a position, with the clocks eliminated."""
 
-    matrix: Floats  #: Normal matrix of the place in ECEF, shape (T, 3, 3) [1/m^2].
+    matrix: Floats  #: Normal matrix of the position in ECEF, shape (T, 3, 3) [1/m^2].
     vector: Floats  #: Right-hand side: the step that lowers `wsse` most is ``matrix^-1 vector``; shape (T, 3) [1/m].
-    wsse: Floats  #: Weighted sum of squared residuals at the place itself, shape (T,).
-    clock_m: Floats  #: Receiver clock of each group at the place; NaN where the group has no satellite; shape (T, G).
+    wsse: Floats  #: Weighted sum of squared residuals at the position itself, shape (T,).
+    #: Receiver clock of each group at the position; NaN where the group has no satellite; shape (T, G).
+    clock_m: Floats
     residual_m: Floats  #: Code - range - clock; 0 where the weight is 0; shape (T, M).
-    clock_slope: Floats  #: Decrease of `clock_m` by a step from the place, per metre of each axis; shape (T, 3, G).
-    design: Floats  #: Decrease of `residual_m` by a step from the place, per metre of each axis; shape (T, 3, M).
+    clock_slope: Floats  #: Decrease of `clock_m` by a step from the position, per metre of each axis; shape (T, 3, G).
+    design: Floats  #: Decrease of `residual_m` by a step from the position, per metre of each axis; shape (T, 3, M).
 
 
 def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
-    """Return the normal equations of `ranges` linearised at one place an epoch, shape (T, 3) [m]."""
+    """Return the normal equations of `ranges` linearised at one position per epoch, shape (T, 3) [m]."""
     system, means, rows, seen = kernels.ranges.reduced_equations(ranges.arrays, kernel_array(place_ecef_m))
     return NormalEquations(
         matrix=system[:, :3, :3], vector=system[:, :3, 3], wsse=system[:, 3, 3],
@@ -52,10 +53,10 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
 
 
 def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
-    """Return the weighted sum of squared residuals at places (n, 3) [m], the clocks eliminated, shape (n,):
+    """Return the weighted sum of squared residuals at positions (n, 3) [m], the clocks eliminated, shape (n,):
     `normal_equations(...).wsse` without the derivatives.
 
-    `epochs`: epoch of each place; by default one place an epoch, in order.
+    `epochs`: epoch of each position; by default one position per epoch, in order.
     """
     of = np.arange(len(ranges)) if epochs is None else epochs
     return kernels.ranges.misfits(ranges.arrays, kernel_array(place_ecef_m), of)
@@ -74,7 +75,7 @@ class Constrained:
     """Positions along the line, T epochs."""
 
     arc_m: Floats  #: Along the trajectory; NaN where the iteration did not settle or was not started; shape (T,).
-    section: Indices  #: Section that the position lies on, -1 where there is none; shape (T,).
+    section: Indices  #: Section that contains the position, -1 without a position; shape (T,).
     sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
     exact_map_sigma_m: Floats  #: The part of it that the weights give, as if the map were exact; shape (T,).
     #: Sigma along the line for unit, equal weights and an exact map; infinite where undetermined; shape (T,).
@@ -93,8 +94,8 @@ def position_on_line(
     """Compute the distance along the line by constrained least squares (P1 2.2(3)): ``R = r_i + d e_i``.
 
     Newton steps in d with the receiver clocks eliminated, inside a section; a step that leaves it stops at its end and
-    goes on in the neighbouring one. Where both neighbours of a point send the step back, the point is the answer. At an
-    open end the position is clamped and `overshoot_m` is how far beyond it the ranges pull.
+    continues in the neighbouring one. Where both neighbours of a point send the step back, the point is the answer. At
+    an open end the position is clamped and `overshoot_m` is how far beyond it the ranges pull.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ def position_on_line(
 def _on_line(
     ranges: Ranges, trajectory: Trajectory, start: Indices, limits: ConstrainedLimits
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
-    """Return arc lengths (T,), and what `_from` returns with the epochs on the last axis."""
+    """Return arc lengths (T,), and the values of `_from` with the epochs on the last axis."""
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
         pulled = ((solved[4] > 0.0) & (section == end)).nonzero()[0]
@@ -187,7 +188,7 @@ class SinglePoint(RowArrays):
     ecef_m: Floats  #: NaN with too few satellites, singular geometry, or no convergence; shape (T, 3).
     clock_m: Floats  #: Shape (T, G).
     matrix: Floats  #: Normal matrix at the position, shape (T, 3, 3) [1/m^2].
-    covariance_m2: Floats  #: Of the position, from the weights; shape (T, 3, 3).
+    covariance_m2: Floats  #: Covariance of the position, from the weights; shape (T, 3, 3).
     wsse: Floats  #: Shape (T,).
     residual_m: Floats  #: Shape (T, M).
 

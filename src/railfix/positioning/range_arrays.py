@@ -1,6 +1,6 @@
 """Pseudoranges ready to be fitted, each with its weight: the arrays that the stages of positioning take.
 
-Arguments are checked here, at the edge; the stages and the compiled functions trust them.
+Arguments are checked here, at the interface; the stages and the compiled functions do not check them again.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Ranges:
     sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; any finite value where the weight is 0; shape (T, M, 3).
     code_m: Floats  #: Corrected pseudorange; any finite value where the weight is 0; shape (T, M).
     weight: Floats  #: 1/sigma^2, 0 for what is not used; shape (T, M) [1/m^2].
-    groups: tuple[slice, ...]  #: Channels that share one receiver clock stand side by side; one slice a clock.
+    groups: tuple[slice, ...]  #: Channels that share one receiver clock are adjacent; one slice per clock.
     ties: InterSystemBiases | None = None  #: Known offsets between these clocks; None: none.
 
     def __len__(self) -> int:
@@ -81,7 +81,7 @@ class Ranges:
 
     @cached_property
     def arrays(self) -> RangeArrays:
-        """The same as plain arrays."""
+        """Plain arrays of the ranges."""
         ties = np.empty((2, 0, len(self.groups))) if self.ties is None else (self.ties.offset_m, self.ties.sigma_m)
         arrays = (self.sat_ecef_m, self.code_m, self.weight, *ties)
         sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
@@ -126,15 +126,15 @@ def weighted_ranges(
     sat_ecef_m : array_like, shape (T, M, 3) [m]
         Satellites at the times of transmission, Earth-fixed.
     code_m, sigma_m : array_like, shape (T, M) [m]
-        Corrected pseudoranges and their standard deviations; NaN for what is not to be used.
+        Corrected pseudoranges and their standard deviations; NaN for unused codes.
     clock : sequence of str, length M
-        Constellation, or letter of the receiver clock, of each channel; those of one clock side by side.
+        Constellation, or letter of the receiver clock, of each channel; channels of one clock are adjacent.
 
     Raises
     ------
     ValueError
-        Shapes that do not match, arrays of other things than double precision numbers, a standard deviation that is
-        not positive, a satellite or a code at no satellite's distance, a letter of no constellation.
+        Shapes that do not match, arrays that are not of double precision, a standard deviation that is not positive,
+        a satellite or a code at an impossible distance, a letter of no constellation.
     """
     code = _check_floats("code_m", code_m, 2)
     sigma = _check_floats("sigma_m", sigma_m, 2)
@@ -169,7 +169,7 @@ def weighted_ranges(
 
 
 def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
-    """Return an array of double precision numbers with so many axes; ValueError for another one."""
+    """Return an array of double precision with a number of axes; ValueError for another one."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 8):
         raise ValueError(

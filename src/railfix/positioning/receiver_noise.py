@@ -1,9 +1,9 @@
 """Receiver noise scale, single-epoch sigma, robust clocks at a known position, and offsets between receiver clocks.
 
-Two scales are learnt from earlier epochs, as root mean squares with exponential forgetting: the robust one, from the
-ranges of each epoch that agree with each other, which RAIM tests with and does not influence; and the stated one, from
-the ranges that RAIM left, under every sigma and level. Epochs that RAIM did not resolve, and epochs off the map, teach
-neither of them.
+Two scales are estimated from earlier epochs, as root mean squares with exponential forgetting: the robust one, from the
+ranges of each epoch that agree with each other, for the RAIM test, which does not influence it; and the stated one,
+from the ranges that RAIM accepted, for every sigma and level. Epochs that RAIM did not resolve, and epochs off the map,
+teach neither of them.
 
 Robust fits are iteratively reweighted least squares with the IGG-III weights (Yang, Song and Xu, Journal of Geodesy 76,
 2002) and the median of the absolute residuals as scale: no noise level is assumed.
@@ -39,8 +39,7 @@ class LastingErrorLimits(Settings):
 
     #: Time constant of the mean of the residuals: a minute, as reflections on a train that moves last less.
     memory_s: float = Field(default=60.0, gt=0)
-    #: Standard deviations that a residual counts with at most: those of the weights, or of the receiver's noise where
-    #: that is larger.
+    #: Limit of a residual in standard deviations: of the weights, or of the receiver's noise where that is larger.
     clipped: float = Field(default=2.0, gt=0)
     #: Mean from which on a satellite is left out, over `clipped`. On recordings in cities without a fault the largest
     #: is 0.59, but for satellites seen by reflection alone; 20 m on one satellite reach it after 75 to 115 s.
@@ -57,7 +56,7 @@ class LastingErrorState:
     channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
     #: Sums behind the noise of the ranges, those in error included (`NoiseState`); shape (2,).
     noise: Floats = field(default_factory=lambda: np.zeros(2))
-    #: By turn: of the residuals of all ranges, then of those without the worst satellite, and so on; shape (S, P).
+    #: In turn: mean square of the residuals of all ranges, without the worst satellite, and so on; shape (S, P).
     sums: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
 
@@ -67,8 +66,8 @@ _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard no
 class RobustFitLimits(Settings):
     """Limits of the robust fit."""
 
-    keep: float = Field(default=1.5, gt=0)  #: Residuals up to so many scales keep their weight.
-    reject: float = Field(default=4.0, gt=0)  #: Residuals from so many scales on have no weight.
+    keep: float = Field(default=1.5, gt=0)  #: Residuals up to this many scales have full weight.
+    reject: float = Field(default=4.0, gt=0)  #: Residuals from this many scales on have no weight.
     #: Reweightings. On the demonstration with 20 m on one satellite the fifth one changes no verdict.
     iterations: int = Field(default=5, ge=1)
 
@@ -80,16 +79,18 @@ class RobustFit:
     kept: Masks  #: Used ranges whose residual is below `RobustFitLimits.reject` scales, shape (T, M).
     #: Weighted sum of squared residuals of the kept ranges over their freedom; NaN without any; shape (T,).
     variance: Floats
-    freedom: Integers  #: Kept ranges beyond clocks and unknowns of the place, shape (T,).
+    freedom: Integers  #: Redundancy of the kept ranges over clocks and position unknowns, shape (T,).
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
-    """Return the inverse covariance of the place across and above sections of a line, ECEF, shape (T, 3, 3) [1/m^2]."""
+    """Return the inverse covariance of the position across and above sections of a line, ECEF, shape (T, 3,
+    3) [1/m^2].
+    """
     return compute_information(trajectory.get_axes(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 
 def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
-    """Return the same by the axes of the line there, shape (T, 3, 3), and the sigmas of its map."""
+    """Return it in the axes of the line there, shape (T, 3, 3), and the sigmas of its map."""
     across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
         across[:, :, None] * across[:, None, :] / sigma_plan_m**2 + up[:, :, None] * up[:, None, :] / sigma_height_m**2
@@ -130,7 +131,7 @@ def robust_on_line(
     near_ecef_m: Floats | None = None,
     limits: RobustFitLimits | None = None,
 ) -> RobustFit:
-    """Fit the ranges around positions on the line; where there is none, around approximate ones, shape (T, 3)."""
+    """Fit the ranges at positions on the line, or where these are missing at approximate positions, shape (T, 3)."""
     antennas, arc = AntennaRows.on(line), position.arc_m
     if near_ecef_m is None:
         near_ecef_m = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(arc[rows]), axis=0))
@@ -140,23 +141,23 @@ def robust_on_line(
     return robust_fit(ranges, at, information=information, limits=limits)
 
 
-#: Beyond so many degrees of freedom Student's t is taken at this many.
+#: Student's t is evaluated at no more than this many degrees of freedom.
 _MOST_FREEDOM: Final = 128
 
 
 class NoiseScaleLimits(Settings):
-    """How the noise of a receiver is learnt."""
+    """Estimation of a receiver's noise scale."""
 
     #: Time constant of forgetting. Errors of codes stay alike for about 20 s (correlation 0.6 after 10 s on
     #: recordings): five such times are independent enough for a mean, and short enough that a street or a station left
     #: behind is forgotten before the next one.
     window_s: float = Field(default=100.0, gt=0)
-    #: Redundant ranges that a scale of 1 counts for: two or three epochs. Infinite holds the scale at 1.
+    #: Redundant ranges that a scale of 1 counts for: two or three epochs. Infinite keeps the scale at 1.
     prior: float = Field(default=20.0, gt=0)
     least_epochs: float = Field(default=20.0, ge=1)  #: Epochs that the window spans at least, gaps left out.
-    #: Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square says,
-    #: so the variance stated for an epoch is that of its window counted this many times, and that of its own residuals.
-    #: 4 is also the Student t of code errors on recordings.
+    #: Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
+    #: predicts, so the variance stated for an epoch combines that of its window, counted this many times, with that of
+    #: its own residuals. 4 is also the Student t of code errors on recordings.
     spread: float = Field(default=4.0, gt=0)
 
 
@@ -211,8 +212,8 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
 def epoch_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
     """Return the single-epoch sigma along the line, shape (T,) [m].
 
-    The standard deviation by the weights, times the larger of the receiver's scale and that of the epoch's own
-    residuals, widened as Student's t is where few ranges are redundant.
+    The standard deviation by the weights, times the larger of the receiver's scale and the scale of the epoch's own
+    residuals, widened as Student's t where the redundancy is small.
     """
     freedom = np.maximum(redundancy, 1)
     shown = np.sqrt(np.maximum(wsse, 0.0) / freedom)
@@ -285,7 +286,7 @@ class OffsetState:
     moment: Mapping[str, float] = field(default_factory=dict)  #: Information times offset [1/m].
     #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Of the last epoch [windows].
+    age: float = 0.0  #: Window of the last epoch [windows].
 
     def sums(self, letters: Sequence[str]) -> Floats:
         """Return the information of some clocks, then their moments, in one array."""
@@ -293,7 +294,7 @@ class OffsetState:
         return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
 
     def later(self, letters: Sequence[str], sums: Floats, last: Dated) -> OffsetState:
-        """Return the state with new sums of some clocks (`sums`), those of the others as they are."""
+        """Return the state with new sums of some clocks (`sums`); the others are unchanged."""
         count = len(letters)
         return OffsetState(
             information={**self.information, **dict(zip(letters, sums[:count], strict=True))},

@@ -48,7 +48,7 @@ class SearchIndex:
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
         """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
 
-        Along and across, without the height. The same for all positions on a section, and computed once for each; at
+        Along and across, without the height. The distance for all positions on a section, computed once per section; at
         most `CLEAR_M`.
         """
         line = self.trajectory

@@ -1,10 +1,10 @@
 """Section search: the point of the trajectory that fits the ranges best.
 
-P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares is that
-of the residuals after each constellation's clock is eliminated. `find_section` returns the point with the least such
-``q`` in a time that does not grow with the line. Where a 3-D position exists, ``q`` grows from it as a quadratic form,
-so stretches outside a ball are dropped. Where it does not, coarse to fine: the root of ``q`` changes at most by the
-root of the summed weights times the distance moved. Both are exact.
+P1 2.2(2) compares ranges with distances by between-satellite single differences, whose weighted sum of squares equals
+that of the residuals after each constellation's clock is eliminated. `find_section` returns the point with the least
+such ``q`` in a time that does not grow with the line. Where a 3-D position exists, ``q`` grows from it as a quadratic
+form, so stretches outside a ball are dropped. Where it does not, coarse to fine: the root of ``q`` changes at most by
+the root of the summed weights times the distance moved. Both are exact.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Other places are sought as far as noise has this probability: further than they are ambiguous, for a fault of one
-#: range can hide that much.
+#: Other positions are searched for as far as noise has this probability: farther than the limit of ambiguity, as a
+#: fault of one range can hide that much.
 _REACH_RISK: Final = 1e-16
 
 
 class SectionLimits(Settings):
     """Limits of ambiguous sections."""
 
-    #: Probability that noise makes the true place fit so much worse than the best one. Chi-square, one degree of
-    #: freedom. P1 3.2: wrong sections on sharp curves.
+    #: Probability that noise makes the true position fit worse than the best one by this much. Chi-square, one degree
+    #: of freedom. P1 3.2: wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
-    separation_m: float = Field(default=30.0, ge=0)  #: Least distance along the line between two distinct places.
+    separation_m: float = Field(default=30.0, ge=0)  #: Least distance along the line between two distinct positions.
     #: Ranges beyond the unknowns below which a section is doubtful: on real recordings of two constellations a quarter
     #: of the sections were wrong with one redundant range, 3 to 4 % with two.
     redundancy: int = Field(default=2, ge=0)
@@ -49,7 +49,7 @@ class SectionLimits(Settings):
 
     @cached_property
     def reach(self) -> float:
-        """Excess of q up to which other places are found."""
+        """Excess of q up to which other positions are searched for."""
         return float(scipy.special.chdtri(1, min(_REACH_RISK, self.ambiguity_risk)))
 
 
@@ -58,17 +58,17 @@ class Section:
     """The best point of the trajectory, T epochs."""
 
     vertex: Indices  #: Point with the least q; -1 where no range is redundant with the clocks; shape (T,).
-    q: Floats  #: Its weighted sum of squared residuals, shape (T,).
-    #: How much worse the best other place fits, in q at its own best point between the points of the trajectory, in
-    #: variances estimated from the fit of the best place (never below the variance of the weights); negative when it
-    #: fits better, infinite when there is none; shape (T,).
+    q: Floats  #: Weighted sum of squared residuals of the section, shape (T,).
+    #: Difference in q of the best other position, at its own best point between the points of the trajectory, in
+    #: variances estimated from the fit of the best position (never below the variance of the weights); negative when it
+    #: fits better, infinite without another position; shape (T,).
     excess: Floats
-    other_vertex: Indices  #: Where that other place is; -1 when there is none; shape (T,).
+    other_vertex: Indices  #: Section of the other position; -1 without one; shape (T,).
     evaluations: Integers  #: Points whose q was computed, shape (T,).
 
 
 class SectionCandidates(NamedTuple):
-    """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points."""
+    """Evaluated points, sorted by epoch and point, with q and its slope there; n epochs, p points."""
 
     #: The epochs, and how many points each has (at least one); shape (n,).
     at: Indices
@@ -94,7 +94,7 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
     point : SinglePoint
-        3-D positions from the same ranges (`point_position`), NaN where there are none: they save time, and change
+        3-D positions from the same ranges (`point_position`), NaN where none exist: they save time, and change
         nothing.
     limits : SectionLimits, optional
         Of ambiguous sections (P1 3.2).
@@ -143,7 +143,7 @@ def _ball(
     epochs: Indices,
     limits: SectionLimits,
 ) -> Floats:
-    """Radius around the 3-D position of some epochs that holds every point worth looking at; NaN where unknown."""
+    """Radius around the 3-D position of some epochs that contains every candidate point; NaN where unknown."""
     radius = np.full(len(epochs), np.nan)
     known = np.isfinite(point.ecef_m[epochs, 0])
     at = epochs[known]

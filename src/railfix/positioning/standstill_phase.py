@@ -1,7 +1,7 @@
-"""Carrier phases of a train at rest beside a base station: how probable they are for a place known but for its error.
+"""Carrier phases of a train at rest with a base station: their probability given a position of known error.
 
-Double differences have integer ambiguities that stay while the train stands; along a track, integers that fit the
-phases of all satellites exist near the true place alone (P1 2.5). Each satellite's phase has a constant error, which
+Double differences have integer ambiguities that stay while the train is at rest; along a track, integers that fit the
+phases of all satellites exist only near the true position (P1 2.5). Each satellite's phase has a constant error, which
 does not average out. LAMBDA: decorrelation and a search in a shrinking ellipsoid (Teunissen 1995,
 doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 """
@@ -17,7 +17,8 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-_WITHIN: Final = 40.0  #: Vectors whose square exceeds the least by more are not looked for: exp(-20) of its likelihood.
+#: Vectors whose square exceeds the least by more are not searched for: exp(-20) of its likelihood.
+_WITHIN: Final = 40.0
 _ROUNDING: Final = 1e-9  #: Exchange of two unknowns must shrink the conditional variance by more than rounding.
 
 
@@ -121,17 +122,17 @@ _NEGLIGIBLE: Final = -5.0
 
 @dataclass(frozen=True, kw_only=True)
 class MeanPhases:
-    """Mean double differences of the carrier phases of one antenna, n pairs of satellites."""
+    """Mean double differences of one antenna's carrier phases, n pairs of satellites."""
 
     difference_m: Floats  #: Observed less computed for the origin, but for multiples of the wavelength; shape (n,).
-    away: Floats  #: Change of it with the place, east, north, up; shape (n, 3).
+    away: Floats  #: Its change with the position, east, north, up; shape (n, 3).
     wavelength_m: Floats  #: Shape (n,).
     covariance_m2: Floats  #: Shape (n, n).
 
 
 @dataclass(frozen=True, kw_only=True)
 class CodePlace:
-    """Place of one antenna by its codes, shape (3,) east, north, up of the origin [m], and its covariance."""
+    """Position of one antenna by its codes, shape (3,) east, north, up of the origin [m], and its covariance."""
 
     place_m: Floats
     covariance_m2: Floats
@@ -145,7 +146,7 @@ def phase_log_likelihood(
     *,
     fault_prior: float,
 ) -> Floats:
-    """Log density of the phases of A antennas, given their codes, under U hypotheses of their places, shape (U,).
+    """Log density of the phases of A antennas, given their codes, for U hypotheses of their positions, shape (U,).
 
     `expected_m` (U, 3 A) and covariance `prior_m2` about it. The phases are within a wavelength, as the integers are
     unknown; with the probability `fault_prior` they follow no model (a slip, half a cycle) and are uniform there.
@@ -168,5 +169,5 @@ def phase_log_likelihood(
 
 
 def uniform_log_likelihood(phases: Sequence[MeanPhases], *, fault_prior: float) -> float:
-    """Return the logarithm of the density of phases that follow no model: a lower bound for every place."""
+    """Return the logarithm of the density of phases that follow no model: a lower bound at every position."""
     return float(np.log(fault_prior) - sum(np.log(phase.wavelength_m).sum() for phase in phases))

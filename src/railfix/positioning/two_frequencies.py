@@ -6,9 +6,9 @@ The difference of the two corrected codes of a satellite has no geometry. With `
 
 where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
 receiver. The error is a field, alike for neighbouring satellites: an offset and two gradients with the sigma of the
-model as the prior, and a rest of each satellite's own. They and B follow from the means of all satellites by best
-linear prediction. The two codes, less the ionosphere predicted so far, then measure one range: least squares in closed
-form, in which only what the means do not show yet sets the codes apart.
+model as the prior, and a rest of each satellite's own. The residual delays and B follow from the means of all
+satellites by best linear prediction. The two codes, less the ionosphere predicted so far, then measure one range: least
+squares in closed form, in which only the unpredicted part distinguishes the codes.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from railfix.ranges.second_codes import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.
 _FIRST_SAMPLES: Final = 2.0  #: Samples with the noise that the weights assume, which the noise scale begins with.
-_CLIP: Final = 2.5  #: Sigmas beyond which the mean difference of a satellite counts as so far off and no further.
+_CLIP: Final = 2.5  #: Number of sigmas at which the mean difference of a satellite is limited.
 _LEAST_SUSPICION_M: Final = 3.0  #: Smallest such difference.
 
 
 class TwoFrequencyLimits(Settings):
     """Limits of the combination of two frequencies."""
 
-    #: Time constant of the mean differences of the codes: what Klobuchar's model misses changes over many minutes.
+    #: Time constant of the mean differences of the codes: the error of the Klobuchar model changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
-    #: Epochs nearer to each other than this are one sample: multipath of a standing train lasts so long.
+    #: Epochs nearer to each other than this are one sample: the multipath of a standing train lasts this long.
     correlation_s: float = Field(default=60.0, gt=0)
     #: Standard deviation of a broadcast group delay, difference of two signals.
     delay_sigma_m: float = Field(default=0.2, gt=0)
@@ -76,12 +76,12 @@ class Combined:
     """One pseudorange a satellite from two codes: T epochs by K channels; NaN where the first code is alone."""
 
     code_m: Floats  #: Shape (T, K).
-    variance_m2: Floats  #: Added to that of the first code, shape (T, K).
-    share: Floats  #: Weight of the second code; that of the first is 1 less it; shape (T, K).
-    #: Delay on the first frequency beyond that of the model, shape (T, K).
+    variance_m2: Floats  #: Correction added to the first code, shape (T, K).
+    share: Floats  #: Weight of the second code; the first has 1 less this weight; shape (T, K).
+    #: Delay on the first frequency beyond the model, shape (T, K).
     ionosphere_m: Floats
     ionosphere_sigma_m: Floats
-    difference_m: Floats  #: Second code less first, what is predicted taken off; shape (T, K).
+    difference_m: Floats  #: Second code less first, less the prediction; shape (T, K).
     suspected: Masks  #: Shape (T, K).
 
 
@@ -97,10 +97,10 @@ def combine_codes(
 ) -> tuple[Combined, TwoFrequencyState]:
     """Combine the two codes of each satellite, with the ionosphere from the epochs before, however a log is cut.
 
-    `code_m`, shape (T, K), are corrected first codes, NaN where unusable; `noise_m` is what the weights assume;
-    `field_m`, shape (T, K, 4), are the standard deviations with sign of the modelled ionosphere on the first frequency
-    by its offset, two gradients and the satellite's own rest; `pairs` are the names of the pairs, length Q, and the
-    group of each whose receiver delay is common.
+    `code_m`, shape (T, K), are corrected first codes, NaN where unusable; `noise_m` is the noise assumed by the
+    weights; `field_m`, shape (T, K, 4), are the standard deviations with sign of the modelled ionosphere on the first
+    frequency by its offset, two gradients and the satellite's own rest; `pairs` are the names of the pairs, length Q,
+    and the group of each whose receiver delay is common.
     """
     names, groups = pairs
     own, number = state.with_pairs(names)
@@ -122,7 +122,7 @@ def combine_codes(
     known = both & (information > 0.0)
     mean[known] = before[np.nonzero(known)[0], size + at[known]] / information[known]
     scale, of_scale = _noise_scale(time, difference - mean, variance, known, own, ages)
-    # errors alike for a time C: the mean over a time T is that of 1 + T / C samples
+    # errors constant over a time C: the mean over a time T is that of 1 + T / C samples
     of_mean = scale[:, None] / (information + 1.0 / np.where(known, variance, 1.0))
     lever = second.ratio - 1.0
     delay = second.delay_sigma_m**2 + limits.delay_sigma_m**2
@@ -140,7 +140,7 @@ def combine_codes(
     prior = of_field + own_m2
     p1, p2 = code_m - ionosphere, second.code_m - bias - second.ratio * ionosphere - delay * rest
     noise = np.minimum(scale, 1.0)[:, None]
-    # what the means show is in both codes alike
+    # the difference known from the means is the same in both codes
     untold = of_mean / (error + of_bias + lever**2 * of_field)
     share, total = share_of_second(
         scale[:, None] * first, scale[:, None] * other + untold * (delay + of_bias), second.ratio, untold * prior
@@ -222,5 +222,5 @@ def _fit_field(
 
 
 def _sum(values: Floats) -> Floats:
-    """Return the sum over the channels one after the other: channels without a value between them change no bit."""
+    """Return the sum over the channels in sequence: channels without a value do not change the result by a bit."""
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)

@@ -1,10 +1,10 @@
-"""Which of several tracks a train stands on, from codes and carrier phases at rest (P1 2.5).
+"""Track on which a train at rest stands, from codes and carrier phases (P1 2.5).
 
-Hypotheses are a track and the way the train faces, and *none*: a parallel track that the map does not have. At rest
+Hypotheses are a track with the facing of the train, and *none*: a parallel track that is missing from the map. At rest
 each satellite's code has a constant bias, so the covariance of the mean does not fall with the number of epochs. The
-posterior of a hypothesis is its prior times the likelihood integrated over the place along the track. A decision is
-taken when all others together have less than the risk allowed, which is its probability of being wrong as far as the
-error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472).
+posterior of a hypothesis is its prior times the likelihood integrated over the position along the track. A track is
+decided on when all other hypotheses together have less than the allowed risk, which is the probability of a wrong
+decision if the error model holds (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472).
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Strings
 from railfix.core.settings import Settings, option
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
+from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UNMAPPED_PRIOR
 
 #: Steps of the integrals along and across the track [m].
 _ALONG_M: Final = 0.25
 _ACROSS_M: Final = 0.3
-#: Tracks lie no nearer to each other than this [m]: a track that the map does not have keeps it from those it has.
-_CLEARANCE_M: Final = 3.0
-#: A train nearer to a track than that is beside it where the map is displaced: less likely by this than a track that
-#: the map lacks, and no nearer than the second [m].
+#: A train nearer to a track than this is off it because the map is displaced: less likely by this factor than a missing
+#: track, and no nearer than the second value [m].
 _BETWEEN_SHARE: Final = 0.1
 _BETWEEN_M: Final = 1.2
-#: A place farther than this from the most likely track, in standard deviations, decides nothing.
+#: A position farther than this from the most likely track, in standard deviations, decides nothing.
 _LARGEST_MISFIT: Final = 4.0
 #: Part of a track about the train that is integrated over, either side [m].
 _REACH_M: Final = 40.0
 _LEAST_ELEVATION_DEG: Final = 10.0
-#: What the atmosphere leaves of the difference of phases at two places: share of their distance.
+#: Residual atmospheric error of the difference of phases at two positions, as a fraction of their distance.
 _PHASE_SHARE: Final = 1e-6
-#: Hypotheses with codes this much less likely (logarithm) than the best are not looked at with phases.
+#: Hypotheses with codes this much less likely (logarithm) than the best are not evaluated with phases.
 _UNLIKELY: Final = 25.0
-#: Standard deviations of the place along the track, and of the height, that phases are searched with [m].
+#: Standard deviations of the position along the track, and of the height, for the phase search [m].
 _ANY_PLACE_M: Final = 50.0
-#: Probability of a larger misfit of the mean codes below which the error model is not believed.
+#: Probability of a larger misfit of the mean codes below which the error model is rejected.
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
-#: Probability that the phases of a standstill follow no model, by a slip or half a cycle that was not seen.
+_FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of heights.
+#: Probability that the phases of a standstill follow no model, by an undetected slip or half a cycle.
 _PHASE_FAULT_PRIOR: Final = 1e-3
-_UNMAPPED_WIDTH_M: Final = 60.0  #: Width over which a track that the map does not have can lie.
+_UNMAPPED_WIDTH_M: Final = 60.0  #: Width over which a missing track can lie.
 
 
 class StandstillErrors(Settings):
@@ -60,12 +60,23 @@ class StandstillErrors(Settings):
     correlation_s: float = option("Time over which the varying part persists.", 60.0, metavar="S", gt=0)
     #: Constant part of a satellite's carrier phase at the zenith, likewise.
     phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
-    #: Error of each antenna's place on the train, along and across: spacing, sway, lean.
+    #: Error of each antenna's position on the train, along and across: spacing, sway, lean.
     antenna_sigma_m: float = Field(default=0.05, gt=0)
     #: Error across the track that all tracks of a yard have in common, lean of the antenna on canted track included.
     map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
 
-    unmapped_prior: float = option("Prior probability of a track not in the map.", 0.05, metavar="P", gt=0, lt=1)
+    #: With a standard deviation of 1.5 m where it is not given: from bogies to roofs.
+    antenna_up_m: float | None = option(
+        "Height of the antennas above the rails, for tracks above each other; else about 2.5 m.",
+        None,
+        name="--antenna-height",
+        metavar="M",
+        ge=0,
+    )
+
+    unmapped_prior: float = option(
+        "Prior probability of a track not in the map.", UNMAPPED_PRIOR, metavar="P", gt=0, lt=1
+    )
 
     def bias_m(self, elevation_deg: Floats) -> Floats:
         """Return the standard deviation of the constant code error [m]."""
@@ -78,7 +89,7 @@ class StandstillErrors(Settings):
     def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
         """Return the standard deviation of the mean of the varying code error over a time [m].
 
-        Of a first-order Gauss-Markov process: 2 tau/T (1 - tau/T (1 - exp(-T/tau))) of its variance.
+        Fraction of variance of a first-order Gauss-Markov process in its mean: 2 tau/T (1 - tau/T (1 - exp(-T/tau))).
         """
         ratio = self.correlation_s / max(seconds, 1e-9)
         share = 2.0 * ratio * (1.0 - ratio * (1.0 - np.exp(-1.0 / ratio)))
@@ -91,14 +102,14 @@ def _sine(elevation_deg: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillFix:
-    """Mean place of one antenna at rest."""
+    """Mean position of one antenna at rest."""
 
     east_north_m: Floats  #: From the origin of the yard's coordinates, shape (2,).
-    own_m2: Floats  #: Covariance of what this antenna alone has: code bias and noise; shape (2, 2).
-    common_m2: Floats  #: Of what both antennas have: satellites and atmosphere; shape (2, 2).
+    own_m2: Floats  #: Covariance of this antenna's own errors: code bias and noise; shape (2, 2).
+    common_m2: Floats  #: Covariance of errors common to both antennas: satellites and atmosphere; shape (2, 2).
     misfit: float  #: Weighted sum of squares of the residuals.
     freedom: int
-    place: CodePlace | None = None  #: With the height, for phases; None where there are none.
+    place: CodePlace | None = None  #: Position with height, for phases; None where there are no phases.
 
     @property
     def fits(self) -> bool:
@@ -117,7 +128,7 @@ def standstill_fix(
     errors: StandstillErrors,
     receivers: int = 1,
 ) -> StandstillFix | None:
-    """Fix the place of an antenna at rest from mean code residuals at an origin; None where satellites are too few.
+    """Fix the position of an antenna at rest from mean code residuals at an origin; None where satellites are too few.
 
     Shapes (K,): `system` letters of the clocks, `residual_m` observed minus computed, means over `seconds`, `common_m`
     sigmas of satellite and atmosphere errors; `receivers` is 2 where a base station's codes are subtracted.
@@ -156,17 +167,19 @@ class YardTrack:
 
     name: str
     points_m: Floats
+    up_m: float = np.nan  #: Height above the origin where the track is nearest to it; NaN without.
+    sigma_up_m: float = 0.0  #: Standard deviation of that.
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackPosterior:
     """Probabilities of tracks."""
 
-    names: tuple[str, ...]  #: Of the tracks, then `NONE`.
+    names: tuple[str, ...]  #: Names of the tracks, then `NONE`.
     probability: Floats  #: Shape (tracks + 1,).
     with_rising: Floats  #: Probability that the train stands on the track and faces its direction, shape (tracks,).
     fits: bool  #: Whether the codes agree with the error model.
-    #: Distance of the codes' place from each track, in its standard deviations; shape (tracks + 1,), NaN for `NONE`.
+    #: Distance of the code position from each track, in its standard deviations; shape (tracks + 1,), NaN for `NONE`.
     misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
@@ -186,10 +199,10 @@ def track_posterior(
     prior: Mapping[str, float] | None = None,
     phases: Sequence[MeanPhases] = (),
 ) -> TrackPosterior:
-    """Compute the probability of each track, and of none, that a train at rest stands on it.
+    """Compute the probability that a train at rest stands on each track, or on none.
 
-    `arms_m`: place of each antenna along the train, positive to its front; `prior`: weights of the mapped tracks by
-    name, those not named have none; `phases`: of each antenna beside a base station; empty without.
+    `arms_m`: position of each antenna along the train, positive to its front; `prior`: weights of the mapped tracks by
+    name, those not named have none; `phases`: phases of each antenna with a base station; empty without one.
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])
@@ -203,7 +216,7 @@ def track_posterior(
     width = len(shifts)
     likely = _shift_weights(shifts, tracks, nearest, fixes[0].east_north_m)
     shifts, likely = shifts[likely > 0.0], likely[likely > 0.0]
-    # hypotheses: each track, and shifts of the nearest one; each with both ways to face
+    # hypotheses: each track, and shifts of the nearest one; each with both facings
     lines = [*((track, np.zeros(1)) for track in tracks), (tracks[nearest], shifts)]
     found = [
         [_places(track.points_m, places, covariance, arms_m, facing, across) for facing in (1.0, -1.0)]
@@ -223,7 +236,7 @@ def track_posterior(
             for row in found
         ]
     )
-    logs += log_prior[:, None]
+    logs += log_prior[:, None] + _height_likelihood(tracks, fixes, errors)[:, None]
     total = scipy.special.logsumexp(logs)
     if not np.isfinite(total):
         shares = np.zeros((len(tracks) + 1, 2))
@@ -239,10 +252,29 @@ def track_posterior(
     )
 
 
+def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFix], errors: StandstillErrors) -> Floats:
+    """Return the log likelihood of the codes' height on each track and on none, shape (tracks + 1,).
+
+    Student's t: a height that fits no track decides less. A track without height, and none, are as high as fits best.
+    """
+    codes = [fix.place for fix in fixes if fix.place is not None]
+    up = np.array([track.up_m for track in tracks])
+    if not codes or np.isnan(up).all():
+        return np.zeros(len(tracks) + 1)
+    unknown = errors.antenna_up_m is None
+    above = float(np.mean([code.place_m[2] for code in codes])) - (
+        ANTENNA_UP_M if unknown else errors.antenna_up_m or 0.0
+    )
+    variance = max(float(code.covariance_m2[2, 2]) for code in codes) + (ANTENNA_SIGMA_M**2 if unknown else 0.0)
+    square = (above - up) ** 2 / (variance + np.array([track.sigma_up_m for track in tracks]) ** 2)
+    logs = -0.5 * (_FREEDOM + 1.0) * np.log1p(square / _FREEDOM)
+    return np.append(np.where(np.isnan(logs), np.nanmax(logs), logs), np.nanmax(logs))
+
+
 def _with_phases(
     found: list[list[_Places]], fixes: Sequence[StandstillFix], phases: Sequence[MeanPhases], errors: StandstillErrors
 ) -> list[list[_Places]]:
-    """Return the evidence with that of the phases."""
+    """Return the evidence including the phases."""
     codes = [fix.place for fix in fixes if fix.place is not None]
     heights = np.array([code.place_m[2] for code in codes])
     best = max(item.log_evidence.max(initial=-np.inf) for row in found for item in row)
@@ -254,7 +286,7 @@ def _with_phases(
             evidence = item.log_evidence + lowest
             likely = item.log_evidence > best - _UNLIKELY
             if k == 1 and len(codes) == 1:
-                # one antenna does not tell the facing
+                # one antenna does not show the facing
                 evidence = updated[0].log_evidence
             elif likely.any():
                 count = int(likely.sum())
@@ -272,7 +304,9 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Covariance of the antennas' places, shape (3 A, 3 A): along and map common to them, height and mounting not."""
+    """Covariance of the antennas' positions, shape (3 A, 3 A): along-track and map errors are common, height and
+    mounting errors are not.
+    """
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])
@@ -282,7 +316,9 @@ def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
-    """Return the covariance of all places, shape (2 A, 2 A): common errors and the map's are alike for all antennas."""
+    """Return the covariance of all positions, shape (2 A, 2 A): common errors and the map's are equal for
+    all antennas.
+    """
     nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
     step = np.diff(nearest.points_m, axis=0)
     middle = nearest.points_m[:-1] + step / 2.0
@@ -296,8 +332,8 @@ def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks
 
 
 def _shift_weights(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Floats:
-    """Return the weight of each shift of the nearest track about the place of the train: 1 clear of all tracks of the
-    map, less between them, 0 on one.
+    """Return the weight of each shift of the nearest track near the position of the train: 1 away from all tracks of
+    the map, less between them, 0 on one.
     """
     points = tracks[nearest].points_m
     start, step = points[:-1], np.diff(points, axis=0)
@@ -307,7 +343,7 @@ def _shift_weights(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, 
     right = np.array([step[k, 1], -step[k, 0]]) / np.linalg.norm(step[k])
     places = foot[k] + shifts_m[:, None] * right
     nearest_m = np.min([_distances(track.points_m, places) for track in tracks], axis=0)
-    return np.where(nearest_m >= _CLEARANCE_M, 1.0, np.where(nearest_m >= _BETWEEN_M, _BETWEEN_SHARE, 0.0))
+    return np.where(nearest_m >= CLEARANCE_M, 1.0, np.where(nearest_m >= _BETWEEN_M, _BETWEEN_SHARE, 0.0))
 
 
 def _distance(points_m: Floats, place_m: Floats) -> float:
@@ -315,7 +351,7 @@ def _distance(points_m: Floats, place_m: Floats) -> float:
 
 
 def _distances(points_m: Floats, places_m: Floats) -> Floats:
-    """Return the distance of places, shape (n, 2), from a polyline, shape (n,)."""
+    """Return the distance of positions, shape (n, 2), from a polyline, shape (n,)."""
     start, step = points_m[:-1], np.diff(points_m, axis=0)
     offset = places_m[:, None] - start
     share = np.clip((offset * step).sum(axis=-1) / (step**2).sum(axis=-1), 0.0, 1.0)
@@ -326,16 +362,18 @@ def _distances(points_m: Floats, places_m: Floats) -> Floats:
 class _Places:
     """Hypotheses of a track, U shifts across it."""
 
-    log_evidence: Floats  #: Likelihood integrated over the place along the track, shape (U,).
-    expected_m: Floats  #: Most likely places of the antennas, shape (U, A, 2).
+    log_evidence: Floats  #: Likelihood integrated over the position along the track, shape (U,).
+    expected_m: Floats  #: Most likely positions of the antennas, shape (U, A, 2).
     heading: Floats  #: Unit vectors along the track there, shape (A, 2).
-    misfit: float = np.inf  #: Least distance of the places from the hypotheses in standard deviations.
+    misfit: float = np.inf  #: Least distance of the positions from the hypotheses in standard deviations.
 
 
 def _places(
     points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
 ) -> _Places:
-    """Likelihood of places of the antennas on a track and at shifts across it; no shift off the ends of the track."""
+    """Likelihood of antenna positions on a track and at shifts across it; without shifts beyond the ends of
+    the track.
+    """
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
     dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
     line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)

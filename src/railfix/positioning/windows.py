@@ -15,11 +15,11 @@ Dated = tuple[np.datetime64, float]
 
 
 class Windows(NamedTuple):
-    """Ages of T epochs since the start of a log, those of A antennas one after the other."""
+    """Ages of T epochs since the start of a log, concatenated for A antennas."""
 
-    step_s: Floats  #: Time since the epoch before; 0 where there is none; shape (T,).
-    growth: Floats  #: Of a sum since the start of its span of windows, shape (T,).
-    decay: Floats  #: Of a sum into the span of an epoch, shape (T,).
+    step_s: Floats  #: Time since the previous epoch; 0 without one; shape (T,).
+    growth: Floats  #: Decay of a sum since the start of its span of windows, shape (T,).
+    decay: Floats  #: Decay of a sum into the span of an epoch, shape (T,).
     ends: Indices  #: Row after the last of each antenna, shape (A,).
     last: list[Dated]  #: Last epoch of each antenna.
 
@@ -60,11 +60,11 @@ def correlated_sums(
     window_s: float,
     correlation_s: float,
 ) -> tuple[Floats, Floats, Floats, list[Dated]]:
-    """Sums over a window of epochs whose errors are alike for `correlation_s`: each counts by the time since the one
-    before.
+    """Sums over a window of epochs whose errors are constant over `correlation_s`: each epoch counts by the time since
+    the previous one.
 
-    Arguments as for `Windows`. Returns decayed sums at each epoch, its own values not included (T, K), what each epoch
-    adds (T, K), running sums after the last epochs (A, K), and these.
+    Arguments as for `Windows`. Returns decayed sums at each epoch, its own values not included (T, K), the contribution
+    of each epoch (T, K), running sums after the last epochs (A, K), and these.
     """
     windows = Windows.of(time, parts, before, window_s=window_s, least_epochs=window_s / correlation_s)
     own = np.minimum(windows.step_s / correlation_s, 1.0)[:, None] * values

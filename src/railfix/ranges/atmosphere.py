@@ -40,8 +40,8 @@ _K1, _K2, _RD, _GM, _G = 77.604, 382_000.0, 287.054, 9.784, 9.80665
 SIGMA_VERTICAL_M: Final = 0.12
 _LOWEST_DEG: Final = 2.0
 #: Klobuchar coefficients that GPS broadcast on 2004-01-01, at middling solar activity; RTKLIB too takes them where it
-#: has none. Their vertical delay is 2.8 m RMS over day and latitude; that of the five other days from 2005 to 2024 at
-#: hand differs from it by 0.7 to 1.7 m RMS (`tests/studies/integrity_tables.py coefficients`).
+#: has none. Their vertical delay is 2.8 m RMS over day and latitude; that of the five other available days from 2005 to
+#: 2024 differs from it by 0.7 to 1.7 m RMS (`tests/studies/integrity_tables.py coefficients`).
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
 #: Radius of the Earth over that of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
@@ -51,6 +51,11 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
     """Return the slant over vertical delay of a thin-shell ionosphere (DO-229D A.4.4.10.4); NaN below the horizon."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
+
+
+def geomagnetic_latitude(latitude: Floats, longitude: Floats) -> Floats:
+    """Return the geomagnetic latitude of the broadcast ionosphere model (IS-GPS-200, 20.3.3.5.2.5) in semicircles."""
+    return np.asarray(latitude + 0.064 * np.cos((longitude - 1.617) * np.pi))
 
 
 def klobuchar_delay_m(
@@ -74,7 +79,7 @@ def klobuchar_delay_m(
     earth_angle = 0.0137 / (elevation + 0.11) - 0.022
     latitude = np.clip(latitude_deg[:, None] / 180.0 + earth_angle * np.cos(azimuth), -0.416, 0.416)
     longitude = longitude_deg[:, None] / 180.0 + earth_angle * np.sin(azimuth) / np.cos(latitude * np.pi)
-    magnetic = latitude + 0.064 * np.cos((longitude - 1.617) * np.pi)
+    magnetic = geomagnetic_latitude(latitude, longitude)
     local = (43_200.0 * longitude + seconds_of_week[:, None]) % SECONDS_PER_DAY
     low = 0.53 - elevation
     slant = 1.0 + 16.0 * low * low * low
@@ -82,7 +87,7 @@ def klobuchar_delay_m(
     period = np.maximum(polyval(magnetic, beta), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
-    # Asked this way round, NaN stays NaN and does not become the delay of the night.
+    # With this order of comparison NaN stays NaN and does not become the delay of the night.
     delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
 
@@ -177,7 +182,7 @@ class Delays:
     #: On the channel's own carrier; 0 where a model is off, NaN where SBAS has none; shape (T, K).
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: To be added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
+    #: Standard deviation added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
     sigma_m: Floats
     reason: Bits  #: Flags of unknown delays (`railfix.core.reasons.Reason`), shape (T, K).
 

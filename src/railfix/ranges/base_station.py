@@ -14,13 +14,13 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 
 Values = TypeVar("Values", Floats, Integers)
-#: An epoch of the base station counts for those of the train up to this time before it [s]: clocks of receivers differ.
+#: An epoch of the base station is used for epochs of the train up to this time before it [s]: receiver clocks differ.
 _SAME_S: Final = 0.05
-#: Age up to which codes, and phases, of the station are used. Without selective availability errors of codes change
-#: by centimetres in 30 s, phases by millimetres in a second.
+#: Age up to which codes, and phases, of the station are used. Without selective availability, code errors change by
+#: centimetres in 30 s, and phase errors by millimetres in a second.
 LONGEST_AGE_S: Final = 60.0
 _PHASE_AGE_S: Final = 1.1
-#: Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
+#: Added for each kilometre between the two: differences of ionosphere, troposphere and orbit errors.
 _PER_KM_M: Final = 0.004
 LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
 
@@ -28,15 +28,15 @@ LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
 class BaseLimits(Settings):
     """Limits of the differences with a base station."""
 
-    #: Standard deviation of a difference beside the train's noise: the station's smoothed multipath.
+    #: Standard deviation of a difference in addition to the train's noise: the station's smoothed multipath.
     sigma_m: float = Field(default=0.3, gt=0)
-    #: Random walk of the differences of phases, in place of `PhaseLimits.drift_m` [m/sqrt(s)].
+    #: Random walk of the differences of phases, which replaces `PhaseLimits.drift_m` [m/sqrt(s)].
     drift_m: float = Field(default=0.001, ge=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaseDifferences:
-    """What a base station subtracts from the ranges of a train, T epochs by K channels."""
+    """Corrections from a base station to the ranges of a train, T epochs by K channels."""
 
     #: NaN where the station has none that is new enough, shape (T, K).
     code_m: Floats
@@ -57,7 +57,7 @@ class BaseErrors:
     signal: Strings
     #: Corrected code less range and receiver clock of its constellation; NaN where not observed; shape (B, S).
     code_m: Floats
-    phase_m: Floats  #: The same of the phase, less one clock for all constellations, with its ambiguity; shape (B, S).
+    phase_m: Floats  #: Error of the phase, less one clock for all constellations, with its ambiguity; shape (B, S).
     arc: Integers  #: Number of the arc of each phase, shape (B, S).
 
     def __len__(self) -> int:
@@ -97,11 +97,11 @@ class BaseErrors:
     def at(
         self, time: Datetimes, satellite: Strings, signal: Strings, receiver_ecef_m: Floats, limits: BaseLimits
     ) -> BaseDifferences:
-        """Return the newest errors at the epochs of a train (T,), by its channels (K,), near approximate places (T, 3)
-        [m].
+        """Return the newest errors at the epochs of a train (T,), for its channels (K,), near approximate positions (T,
+        3) [m].
 
-        A channel that the station has on another signal of the same band takes that one: a constant of the
-        constellation is the difference.
+        A channel that the station has on another signal of the same band uses that one: a constant of the constellation
+        is the difference.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
@@ -128,7 +128,7 @@ class BaseErrors:
 
 
 def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str, str]], blank: float) -> Values:
-    """Return values of channels on those of another list."""
+    """Return values of channels in the order of another list."""
     place = {key: k for k, key in enumerate(keys)}
     columns: Indices = np.array([place[key] for key in own], dtype=np.intp)
     full = np.full((len(values), len(keys)), blank, dtype=values.dtype)

@@ -1,4 +1,4 @@
-"""Channels of a log that may be used: constellations, and signals by preference; those of a clock side by side."""
+"""Usable channels of a log: constellations, and signals by preference; channels of a clock are adjacent."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import carrier_frequency_hz
 
-#: A pseudorange lies between these [m]: nearest satellite less a receiver clock 33 ms off, GEO plus the same.
+#: A pseudorange lies between these [m]: nearest satellite less a receiver clock offset of 33 ms, GEO plus the same.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
@@ -46,17 +46,18 @@ DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
 
 #: Signals with ten times the chip rate of L1 C/A, by constellation and band.
 _FAST: Final = ("G5", "J5", "E5", "E7", "C5", "C6")
-#: Their noise and multipath at the same C/N0: 0.4 on a phone (L5 against L1), 0.8 on an F9P (E5b against E1).
+#: Their noise and multipath relative to L1 at the same C/N0: 0.4 on a phone (L5 against L1), 0.8 on an F9P (E5b against
+#: E1).
 _FAST_NOISE: Final = 0.5
 
 
 def relative_noise(signal: str) -> float:
-    """Return noise and multipath of a signal ("G5Q") over those of L1 C/A at the same C/N0."""
+    """Return noise and multipath of a signal ("G5Q") relative to L1 C/A at the same C/N0."""
     return _FAST_NOISE if signal[:2] in _FAST else 1.0
 
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
-    """Return slices of channels that share a receiver clock; ValueError where they are not side by side."""
+    """Return slices of channels that share a receiver clock; ValueError where they are not adjacent."""
     clocks = [CLOCK_GROUP[str(letter)] for letter in system]
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):
@@ -67,7 +68,7 @@ def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
 def channel_order(
     satellite: Strings, signal: Strings, *, systems: Sequence[str], signals: Mapping[str, Sequence[str]]
 ) -> Indices:
-    """Return channels that may be used, those of one clock side by side, by preference of `signals`, shape (K,)."""
+    """Return usable channels by preference of `signals`, with channels of one clock adjacent, shape (K,)."""
     keys = []
     for i, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
         letter = name[0]
@@ -78,7 +79,7 @@ def channel_order(
 
 
 def first_available(satellite: Strings, available: Masks) -> Masks:
-    """Choose one channel a satellite and epoch: the first available one, in `channel_order`, shape (T, K)."""
+    """Choose one channel per satellite and epoch: the first available one, in `channel_order`, shape (T, K)."""
     starts = np.flatnonzero(np.append(True, satellite[1:] != satellite[:-1])) if len(satellite) else np.empty(0, int)
     if len(starts) == len(satellite):
         return available.copy()
@@ -92,8 +93,7 @@ def first_available(satellite: Strings, available: Masks) -> Masks:
 class Channels:
     """M channels of a log, and the K of them that settings allow."""
 
-    #: Where they stand in the observations, those of one clock side by side, a satellite's best signal first; shape
-    #: (K,).
+    #: Their columns in the observations, channels of one clock adjacent, a satellite's best signal first; shape (K,).
     columns: Indices
     #: Shape (K,).
     satellite: Strings
@@ -108,8 +108,8 @@ class Channels:
     #: Columns of the second signals of each channel's satellite, in order of preference; -1 for none. P is 0 with one
     #: frequency; shape (K, P).
     second: Indices
-    #: Signal with the letter of the constellation, square of the first frequency over it, and its noise over that of L1
-    #: C/A; shape (K, P).
+    #: Signal with the letter of the constellation, squared ratio of the first frequency to it, and its noise relative
+    #: to L1 C/A; shape (K, P).
     second_signal: Strings
     second_ratio: Floats
     second_noise: Floats

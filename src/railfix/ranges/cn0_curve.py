@@ -1,9 +1,9 @@
 """Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
 
-It is fitted per constellation and signal; satellites of BeiDou and QZSS fly in two kinds of orbits with curves of their
-own. Of each bin of elevation the mean is taken without outliers (beyond three robust standard deviations from the
-median). Between the middles of the bins the curve runs by monotone cubic interpolation (PCHIP). Above the highest bin
-the last mean holds; below the lowest bin there is no curve. The file is TOML.
+It is fitted per constellation and signal; BeiDou and QZSS satellites are in two kinds of orbits with separate curves.
+The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the median). Between the
+middles of the bins the curve runs by monotone cubic interpolation (PCHIP). Above the highest bin the last mean is used;
+below the lowest bin there is no curve. The file is TOML.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _NORMAL_MAD: Final = 1.482_602_218_505_602
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
 _QZSS_GEO: Final = frozenset({7, 8})  #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
 
-#: Kinds of satellites of one transmit power, and their names.
+#: Kinds of satellites with equal transmit power, and their names.
 KINDS: Final[dict[str, str]] = {
     "G": "GPS",
     "J": "QZSS",
@@ -78,7 +78,7 @@ class CurveFit(Settings):
     bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
     least_samples: int = Field(default=30, ge=1)  #: A bin of fewer samples is left out.
     least_bins: int = Field(default=4, ge=2)  #: A kind and signal of fewer bins gets no curve.
-    #: Samples further from their bin's median, in robust standard deviations, are left out.
+    #: Samples farther from their bin's median, in robust standard deviations, are left out.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
@@ -119,14 +119,14 @@ class Cn0Mean:
 
 
 class SourceFile(Settings):
-    """A file that a curve was made from, and its SHA-256."""
+    """A file that a curve was fitted on, and its SHA-256."""
 
     name: str
     sha256: str
 
 
 class Cn0CurveSource(Settings):
-    """Log that a curve was made from."""
+    """Log that a curve was fitted on."""
 
     #: From the header of the log, as written.
     antenna: str = ""
@@ -166,7 +166,7 @@ class Cn0Curve:
         return np.array([mean is not None for mean in self._find(satellite, signal)], dtype=bool)
 
     def mean_dbhz(self, elevation_deg: ArrayLike, *, satellite: Strings, signal: Strings) -> Floats:
-        """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where there is no curve."""
+        """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN without a curve."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         result = np.full(elevation.shape, np.nan)
         columns: dict[tuple[str, str], list[int]] = defaultdict(list)
@@ -229,7 +229,7 @@ def fit_cn0_curve(
 ) -> Cn0Curve:
     """Fit the mean C/N0 over elevation, one curve a kind and signal with bins enough.
 
-    `samples` are collected ones, or C/N0 (T, M), elevation (T, M), satellite and signal (M,), from a place with open
+    `samples` are collected ones, or C/N0 (T, M), elevation (T, M), satellite and signal (M,), from a position with open
     sky. ValueError: no kind and signal has samples enough.
     """
     fit = fit or CurveFit()
@@ -248,7 +248,7 @@ def fit_cn0_curve(
 
 
 def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
-    """Return the curve of one kind and signal, None where there are too few bins."""
+    """Return the curve of one kind and signal, None with too few bins."""
     which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
     bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
     if len(bins) < fit.least_bins:

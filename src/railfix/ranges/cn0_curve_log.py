@@ -1,4 +1,4 @@
-"""A C/N0 curve from an observation log of an antenna that stood under open sky."""
+"""A C/N0 curve from an observation log of an antenna under open sky."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Samples
 
 _SHORT_S: Final = 12 * 3600.0  #: P1 2.3(1) requires about a day; below this a note is made [s].
 _DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].
-#: Lowest elevation of that check [deg], and the share of rejected samples of the calibration that gives a note.
+#: Lowest elevation of that check [deg], and the fraction of rejected calibration samples that gives a note.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: Elevation below which a satellite cannot be received: the position of the antenna is wrong [deg].
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: Share of satellites below the horizon that faulty navigation records may cause.
+_BELOW_SHARE: Final = 0.05  #: Fraction of satellites below the horizon that faulty navigation records may cause.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,9 @@ class Cn0Calibration:
 
 
 def satellite_elevation_deg(observations: Observations, navigation: Navigation, position_ecef_m: Floats) -> Floats:
-    """Elevation of each channel's satellite from a fixed place (3,), shape (T, M) [deg]; NaN without orbit or code."""
+    """Elevation of each channel's satellite from a fixed position (3,), shape (T, M) [deg]; NaN without
+    orbit or code.
+    """
     names, first, which = np.unique(observations.satellite, return_index=True, return_inverse=True)
     code = np.full((len(observations), len(names)), np.nan)
     for m, k in enumerate(which.tolist()):
@@ -63,7 +65,7 @@ def cn0_curve_from_log(
 ) -> Cn0Calibration:
     """Fit a curve on the log of a receiver, about a day, whose antenna stood under open sky.
 
-    `position_ecef_m`: position of the antenna, shape (3,), to some kilometres; by default that of the header.
+    `position_ecef_m`: position of the antenna, shape (3,), to some kilometres; by default the header's.
     InputFileError: a file is missing or of another kind; the log has no C/N0. SettingsError: the header has no position
     and none was given. MismatchError: satellites were tracked that are below the horizon of the position, or the
     navigation files have none of them, or too few samples for any curve.

@@ -26,11 +26,11 @@ ORBITS_M: Final = (2e7, 6e7)
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaRanges:
-    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels."""
+    """Corrected ranges of one antenna as input of the screens: T epochs by K channels."""
 
     time: Datetimes  #: Shape (T,).
-    break_before: Masks  #: Epochs that must not be differenced with the one before, shape (T,).
-    #: Of each channel, shape (K,).
+    break_before: Masks  #: Epochs that must not be differenced with the previous one, shape (T,).
+    #: Properties of each channel, shape (K,).
     satellite: Strings
     signal: Strings
     frequency_hz: Floats
@@ -43,7 +43,7 @@ class AntennaRanges:
     #: Shape (T, K).
     elevation_deg: Floats
     azimuth_deg: Floats
-    #: With satellite clock, group delay and atmosphere applied, and standard deviations; shape (T, K).
+    #: Code with satellite clock, group delay and atmosphere applied, and standard deviations; shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
     reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
@@ -61,15 +61,16 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     troposphere_m: Floats
     #: Standard deviation of satellites and atmosphere: by SBAS, otherwise by `NominalErrors`; shape (T, K).
     nominal_m: Floats
-    #: What `NominalErrors` assumes at the elevation alone; 0 with SBAS; shape (T, K).
+    #: Standard deviation that `NominalErrors` assumes for the elevation alone; 0 with SBAS; shape (T, K).
     nominal_elevation_sigma_m: Floats
     #: Overbounding sigma and largest nominal bias of each range by an error model; 0 without one; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: A code is grossly wrong, but not clearly which one: such epochs are no evidence on noise and map; shape (T,).
+    #: A code is grossly wrong, but not clearly which one: such epochs are not used for noise and map estimates; shape
+    #: (T,).
     unsure: Masks
     second: SecondCodes | None = None  #: Second codes of the satellites, where two frequencies are used.
-    base: BaseDifferences | None = None  #: What a base station has subtracted.
+    base: BaseDifferences | None = None  #: Corrections subtracted from a base station.
 
     @property
     def columns(self) -> Indices:
@@ -78,7 +79,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
 
     @property
     def used_code_m(self) -> Floats:
-        """Corrected codes without a reason against them, NaN for the others, shape (T, K)."""
+        """Corrected codes without a rejection reason, NaN for the others, shape (T, K)."""
         return np.where(self.reason == 0, self.corrected_code_m, np.nan)
 
 

@@ -52,7 +52,7 @@ def condition_differences(
 ) -> tuple[str, ...]:
     """Return fields in which two conditions differ, one text each: "codes: model raw, run smoothed".
 
-    The order of screens and constellations does not count; that of signals, which is a preference, does.
+    The order of screens and constellations does not matter; the order of signals, which is a preference, does.
     """
     differences = []
     for name in Conditions.model_fields:
@@ -141,7 +141,7 @@ class BinStatistics:
 
 
 class ErrorModelSource(Settings):
-    """Runs that a model was made from, for its file."""
+    """Runs that a model was fitted on, for its file."""
 
     runs: tuple[str, ...] = ()
     base: str = ""  #: Marker of the reference station.
@@ -152,7 +152,7 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Names and SHA-256.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Measured priors above this come of too few blocks of time to leave a level.
+LARGEST_PRIOR: Final = 0.05  #: Measured priors above this come from too few blocks of time to leave a level.
 
 
 class FaultRate(Settings):
@@ -170,7 +170,8 @@ class FaultRate(Settings):
     #: Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks): the `local_prior` to
     #: use.
     upper: float = Field(ge=0, le=1)
-    #: Blocks of time with two faulty satellites or more, over what independent satellites give; 0 without any.
+    #: Blocks of time with two or more faulty satellites, over the number expected for independent satellites; 0 without
+    #: any.
     together: float = Field(ge=0)
     #: Blocks of time with two low satellites or more on one side of the track, each side counted for itself, and those
     #: in which two of these were faulty.
@@ -200,9 +201,10 @@ class ErrorModel:
     #: "local": multipath and receiver noise alone (a reference station took the rest away). "satellite_and_atmosphere":
     #: these, too, as they were on those days.
     covers: Literal["local", "satellite_and_atmosphere"]
-    conditions: Conditions | None = None  #: Settings under which it holds; None: unknown, compared with nothing.
+    #: Settings under which the model is valid; None: unknown, compared with nothing.
+    conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
-    #: Rate of local faults among the ranges that the model was made of; None: not measured.
+    #: Rate of local faults among the ranges that the model was fitted on; None: not measured.
     faults: FaultRate | None = None
 
     def at(

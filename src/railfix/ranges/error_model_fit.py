@@ -50,8 +50,8 @@ class ErrorModelFit(Settings):
     """Settings of the fit of an error model."""
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
-    #: Independent passes below which a bin takes the samples of a wider set of bins. 30: its largest error is then
-    #: about the quantile of 2 standard scores, so that at least the shoulder of the tail was seen.
+    #: Independent passes below which a bin uses the samples of a wider set of bins. 30: its largest error is then about
+    #: the quantile of 2 standard scores, so that at least the shoulder of the tail is sampled.
     least_blocks: int = option(
         "Passes of a satellite (30 s blocks) below which a bin takes the values of a wider one.", 30, metavar="N", ge=1
     )
@@ -72,14 +72,14 @@ class ErrorSamples:
     block: Integers  #: Number of the satellite's block of time: samples of one block are not independent; shape (n,).
     used: Masks  #: Samples that passed every screen, shape (n,).
     sigma_m: Floats  #: Standard deviation that the protection level of the run gave the range, shape (n,).
-    chainage_m: Floats  #: Place of the train; NaN where unknown; shape (n,).
+    chainage_m: Floats  #: Position of the train; NaN where unknown; shape (n,).
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
     """Return the statistics of the bins from some of the samples, a mask of shape (n,).
 
-    A bin with fewer blocks than `ErrorModelFit.least_blocks` takes those of all azimuths of its elevation and C/N0,
-    then of all C/N0 too, then of all elevations of its C/N0, then all.
+    A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of all azimuths of its elevation and
+    C/N0, then of all C/N0 too, then of all elevations of its C/N0, then all.
     """
     bins = fit.bins
     kept = which & np.isfinite(samples.error_m)
@@ -142,8 +142,8 @@ def summary(model: ErrorModel) -> Iterator[tuple[str, ...]]:
     """Yield rows by elevation, by sector and by C/N0: name, then count, bias, sigma, overbound before and after the
     screens.
 
-    Bias and sigma are those of all samples of the row, from the bins' own figures; the overbound is the span of the
-    bins' sigmas of bounds.
+    Bias and sigma are of all samples of the row, from the bins' own figures; the overbound spans the bounding sigmas of
+    the bins.
     """
     bins = model.bins
     width = 360.0 / bins.sectors
@@ -171,14 +171,14 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
-#: A range that passed the screens is faulty beyond so many of its sigmas; confidence of the bounds of the rates.
+#: A range that passed the screens is faulty beyond this many of its sigmas; confidence of the bounds of the rates.
 _BEYOND_SIGMA: Final = 5.0
 _CONFIDENCE: Final = 0.95
 #: Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg` [deg].
 _SIDE_ELEVATION_DEG: Final = 45.0
 #: Parts of the line that are compared with the whole of it [m].
 _STRETCH_M: Final = 100.0
-#: Blocks of one satellite are numbered by time and satellite (`ErrorSamples.block`): satellites a block of time.
+#: Blocks of one satellite are numbered by time and satellite (`ErrorSamples.block`): satellites in a block of time.
 _SATELLITES: Final = 1_000_000
 
 
@@ -224,9 +224,9 @@ def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
 def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
     """Stretches of the line, chainages from and to [m], where local faults are more frequent than on the whole line.
 
-    A stretch is one whose share of faulty blocks is, at the lower end of its interval (Clopper and Pearson, one-sided),
-    above the share of the line at the upper end of its own; neighbouring ones are joined. Where that holds, no prior of
-    the line bounds the local faults: there the settings leave the train without a level (`Config.no_level_m`).
+    A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of its fraction of faulty blocks exceeds
+    the upper limit of the whole line's; neighbouring stretches are joined. There no prior of the line bounds the local
+    faults, and the settings leave the train without a level (`Config.no_level_m`).
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)

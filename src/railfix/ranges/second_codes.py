@@ -1,4 +1,4 @@
-"""Codes of a second frequency of each satellite, corrected as those of the first."""
+"""Codes of a second frequency of each satellite, corrected like the first."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 class SecondCodes:
     """Second codes of satellites: T epochs by K channels of the first."""
 
-    code_m: Floats  #: Corrected by the models; NaN where there is none; shape (T, K).
+    code_m: Floats  #: Corrected by the models; NaN where missing; shape (T, K).
     noise_m: Floats  #: Standard deviation of noise and multipath that the weights assume, shape (T, K).
     cn0_dbhz: Floats  #: Shape (T, K).
     group_delay_m: Floats  #: That has been subtracted, shape (T, K).
-    #: Of a group delay that is not broadcast in full, beside `TwoFrequencyLimits.delay_sigma_m`; shape (T, K).
+    #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
+    #: shape (T, K).
     delay_sigma_m: Floats
     ratio: Floats  #: Square of the first frequency over the second, shape (T, K).
     pair: Integers  #: Number of satellite and signals among the names of pairs, shape (T, K).
@@ -45,9 +46,9 @@ def second_codes(
 ) -> SecondCodes | None:
     """Return the second code of each satellite, corrected as the first one; None where no channel has one.
 
-    The first signal of the order of preference that is observed, healthy and has a group delay. Satellite and clock
-    are those of the first code, and so is the record that the group delay belongs to; where that record lacks a part of
-    it and another message of the satellite has it, the other's.
+    The first signal of the order of preference that is observed, healthy and has a group delay. Satellite and clock are
+    those of the first code, and the group delay is that of the same record; where that record lacks a part of it,
+    another message of the satellite is used.
     """
     second = channels.second
     if not second.size:
@@ -103,7 +104,7 @@ def _delays(
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
     """Return group delay, its standard deviation and ill health of a signal by record, shape (n,) [m].
 
-    GPS, QZSS and BeiDou: the clocks of all messages refer to the same signals, so that a delay which a record lacks is
+    GPS, QZSS and BeiDou: the clocks of all messages refer to the same signals, so that a missing delay is replaced by
     that of the satellite's record of another message with the nearest reference time.
     """
     records = navigation.kepler

@@ -37,25 +37,25 @@ class SourceSatellites(NamedTuple):
     """Satellites of a source, T epochs by K channels."""
 
     states: SatelliteStates  #: At the times of transmission, corrections of the source applied.
-    fast_m: Floats | None  #: Added to the codes beside the satellite clocks, shape (T, K).
+    fast_m: Floats | None  #: Correction of the codes in addition to the satellite clocks, shape (T, K).
     reason: Bits  #: Reasons of those that the source does not correct, shape (T, K).
-    fixes: SatelliteCorrections | DfmcCorrections | None  #: What SBAS says of the satellites.
+    fixes: SatelliteCorrections | DfmcCorrections | None  #: SBAS status of the satellites.
 
 
 class SourceDelays(NamedTuple):
     """Delays and standard deviations of a source, T epochs by K channels."""
 
     delays: Delays  #: Subtracted from the codes.
-    sigma_m: Floats  #: In the weights beside the receiver's noise, shape (T, K).
+    sigma_m: Floats  #: Standard deviation in the weights in addition to the receiver's noise, shape (T, K).
     #: Standard deviation of satellites and atmosphere, and the part of it that is assumed by elevation alone; (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
-    base: BaseDifferences | None = None  #: What a base station subtracts.
+    base: BaseDifferences | None = None  #: Corrections subtracted from a base station.
     floor: Literal["added", "included"] = "added"  #: Whether `sigma_m` includes the error floor of the codes.
 
 
 class CorrectionSource(Protocol):
-    """Where satellite positions, clocks and delays of pseudoranges come from."""
+    """Source of satellite positions, clocks and delays of pseudoranges."""
 
     @property
     def navigation(self) -> Navigation:
@@ -79,8 +79,8 @@ def choose_ionosphere(
 ) -> tuple[Floats | None, float, tuple[str, ...]]:
     """Return Klobuchar coefficients, the sigma that they add to the vertical delay [m], and a note on a substitute.
 
-    Those of GPS, else of QZSS, else typical ones; None where the ionosphere is "off". Coefficients of BeiDou are made
-    for a model of its own.
+    Coefficients of GPS, or of QZSS, or typical ones; None where the ionosphere is "off". BeiDou's coefficients are for
+    a different model.
     """
     if ionosphere == "off":
         return None, 0.0, ()
@@ -102,10 +102,11 @@ class BroadcastSource:
 
     navigation: Navigation
     klobuchar: Floats | None  #: None leaves the ionosphere uncorrected; shape (8,).
-    ionosphere_sigma_m: float = 0.0  #: Of the vertical delay, by coefficients that were not received.
+    #: Standard deviation of the vertical delay with coefficients that were not received.
+    ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
-    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed errors of satellites and atmosphere.
-    notes: tuple[str, ...] = ()  #: Data that were asked for, and the data used in their place.
+    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed satellite and atmospheric errors.
+    notes: tuple[str, ...] = ()  #: Requested data, and the data used instead.
     second: Literal["none", "optional", "required"] = "optional"
 
     @classmethod
@@ -238,7 +239,7 @@ class BaseStationSource:
         return SourceDelays(given.delays, beyond, nominal, given.nominal_elevation_sigma_m, base, "included")
 
 
-SBAS_SIGNAL: Final = "1C"  #: The signal that corrections are made for: GPS L1 C/A, as RINEX 3 calls it.
+SBAS_SIGNAL: Final = "1C"  #: Signal that the corrections are for: GPS L1 C/A, as RINEX 3 calls it.
 
 _REASON_OF: Final = {
     **dict.fromkeys(SatelliteState, Reason.SBAS_NO_CORRECTION),
@@ -262,7 +263,7 @@ _DFMC_REASON_OF: Final = {
     DfmcState.STOPPED: Reason.SBAS_DO_NOT_USE,
     DfmcState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
 }
-#: The same of SBAS on L5.
+#: Signals of SBAS on L5.
 DFMC_REASONS: Final = np.array([int(_DFMC_REASON_OF[state]) for state in sorted(DfmcState)], dtype=np.int64)
 
 
@@ -294,7 +295,7 @@ def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelle
 
 
 def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
-    """Satellites with long-term corrections applied to the records they are for, and reasons of the others (T, K)."""
+    """Satellites with long-term corrections applied to their records, and reasons of the others (T, K)."""
     moved = states.position_ecef_m + np.nan_to_num(fixes.position_m)
     clock = states.clock_m + SPEED_OF_LIGHT * np.nan_to_num(fixes.clock_s)
     return replace(states, position_ecef_m=moved, clock_m=clock), REASONS[fixes.state]

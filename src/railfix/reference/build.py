@@ -1,9 +1,9 @@
-"""Reference positions of one run: fixes checked, matched to the track, gaps between them bridged.
+"""Reference positions of one run: fixes are checked and matched to the track, gaps are bridged.
 
-1. The positions of each antenna are checked by themselves, in pairs, and against the track (`fixes`).
-2. The Dopplers are solved for the speed along the track at the places so far, which between fixes are at
-   first those of an even run, and after a round those of the smoother.
-3. The distance between fixes is compared with the distance travelled; fixes that disagree are rejected.
+1. The positions of each antenna are checked separately, in pairs, and against the track (`fixes`).
+2. The Dopplers are solved for the speed along the track at the current positions, which are interpolated between fixes
+   at first, and smoothed in the next rounds. 3. The distance between fixes is compared with the distance travelled;
+   fixes that disagree are rejected.
 4. Everything together is smoothed (`smoother`); 2 and 4 are repeated.
 """
 
@@ -40,14 +40,14 @@ from railfix.reference.smoother import (
 )
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Speeds further apart leave the distance between them unknown [s], with this variance [m2].
+#: Speeds farther apart leave the distance between them unknown [s], with this variance [m2].
 LONGEST_STEP_S: Final = 2.5
 UNKNOWN_M2: Final = 1e8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Speeds:
-    """Speeds of one antenna along its path; only instants at which there is one, rising in time."""
+    """Speeds of one antenna along its path, at instants in order of time."""
 
     time: Datetimes
     speed_mps: Floats
@@ -72,7 +72,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where there is none."""
+    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where missing."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
@@ -96,7 +96,7 @@ class ReferenceData:
     """Measurements for a reference."""
 
     logs: Mapping[str, PositionLog]  #: Positions by antenna, front, rear or both.
-    trajectories: Mapping[str, Trajectory]  #: Of these antennas, and of those of `dopplers`.
+    trajectories: Mapping[str, Trajectory]  #: Dopplers of these antennas, and of the antennas of `dopplers`.
     dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: By antenna; may be empty.
     pulses: Pulses | None = None
     acceleration: Acceleration | None = None
@@ -133,7 +133,7 @@ class _ReferenceBuilder:
         self.trajectory = data.trajectories[name]
 
     def built(self, fixes: Fixes) -> Built:
-        """From judged fixes to the reference."""
+        """From checked fixes to the reference."""
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
@@ -202,7 +202,7 @@ class _ReferenceBuilder:
     def _calibrate(
         self, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes
     ) -> tuple[ReferenceSettings, dict[str, Any]]:
-        """Return the settings with sensor errors estimated from the log's own fixes, and where each came from."""
+        """Return the settings with sensor errors estimated from the log's own fixes, and the source of each value."""
         settings, sources, good = self.settings, {}, fixes.good
         joined = self._join(speeds)
         if len(joined.time) > 1:
@@ -240,12 +240,14 @@ class _ReferenceBuilder:
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:
-        """Dopplers that can be put on this antenna's path: its own, and the other's where a vehicle ties the two."""
+        """Dopplers that can be projected on this antenna's path: its own, and those of the other antenna where a
+        vehicle links the two.
+        """
         tied = self.trajectory.body_chainage_m is not None
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 
     def _speeds(self, time: Datetimes, place_m: Floats) -> SolvedSpeeds:
-        """Return Doppler speeds of every receiver, seen from places along this antenna's path."""
+        """Return Doppler speeds of every receiver, computed at positions along this antenna's path."""
         speeds_of = {}
         for name, dopplers in self._sources().items():
             t = _since(dopplers.time, time)
@@ -271,7 +273,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to instants and its variance: by a wheel if any, else by Dopplers."""
+        """Return the distance travelled up to instants and its variance: by a wheel if any, otherwise by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

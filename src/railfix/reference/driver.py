@@ -101,7 +101,7 @@ class ReferenceOptions(Settings):
     logs: LogReading = Field(default_factory=LogReading)
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     track: TrackReading = Field(default_factory=TrackReading)
-    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Of positions in CSV.
+    columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of positions in CSV.
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
@@ -182,7 +182,7 @@ def reference_files(
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================
 
-    `asked`: settings that were given, as opposed to defaults. RailfixError: see `railfix.core.errors`; nothing is left
+    `asked`: settings that were given explicitly. RailfixError: see `railfix.core.errors`; nothing is left
     in `out` then.
     """
     began = clock.perf_counter()

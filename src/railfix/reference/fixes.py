@@ -29,8 +29,8 @@ def _limit(text: str, default: float | None, metavar: str, name: str) -> Any:
 
 
 _TRAVEL_SHARE: Final = 0.005
-#: Fixes that disagree with those before and after are rejected up to twice this long; if they disagree for longer,
-#: the distance travelled is taken to be wrong.
+#: Fixes that disagree with their neighbours are rejected up to twice this long; if they disagree for longer, the
+#: distance travelled is assumed to be wrong.
 _TRAVEL_HOLD_S: Final = 10.0
 _FIX_FLOOR_M: Final = 0.01
 #: Standard deviation and correlation time of the train's acceleration (R. A. Singer, 1970): trains accelerate and
@@ -49,15 +49,15 @@ class ReferenceSettings(Settings):
     spacing_m: float = _limit(
         "Largest difference of the antennas' distance from that on the vehicle.", 0.05, "M", "--spacing"
     )
-    #: Whether a fix is rejected if the other antenna has none at that time, where two logs are given.
+    #: Whether a fix is rejected if the other of two logs has none at that time.
     unpaired: Literal["reject", "keep"] = "reject"
     #: Largest distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
-    lateral_m: float = _limit("Largest distance beside the antenna's trajectory.", 1.0, "M", "--lateral")
+    lateral_m: float = _limit("Largest lateral distance from the antenna's trajectory.", 1.0, "M", "--lateral")
     height_m: float = _limit("Largest distance above or below it.", 2.0, "M", "--height")
     #: Largest difference between the distance of two fixes and the distance travelled (P2 3.3): constant part, and
-    #: share of the distance [m] [-].
+    #: fraction of the distance [m] [-].
     travel_m: float = _positive(0.10)
-    #: Largest speed of a train: of several passes of the line at one place only those within reach are considered.
+    #: Largest speed of a train: of several passes of the line at one point only those within reach are considered.
     max_speed_mps: float = _positive(100.0)
     #: Longer gaps between good fixes are not bridged.
     max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
@@ -84,7 +84,7 @@ class ReferenceSettings(Settings):
     acceleration_mps2: float = _positive(0.02)
 
 
-#: Positions of two antennas that are tagged no further apart belong to one instant [ns].
+#: Positions of two antennas that are tagged no farther apart belong to one instant [ns].
 _PAIR_NS: Final = 5_000_000
 _LOOK_BACK: Final = 60  #: Runs of agreeing fixes that a run may be joined to, back from it.
 #: Standard deviations of the travelled distance that a difference may have.
@@ -122,7 +122,7 @@ class Fixes:
     ratio: Floats  #: NaN where the log has none, shape (n,).
     sigma_enu_m: Floats  #: East, north, up; NaN where the log has none; shape (n, 3).
     rejection: Bits  #: `FixRejection` bits; a row that is rejected at one stage is not checked at the next; shape (n,).
-    #: Distance to the other antenna minus that on the vehicle; NaN where it was not checked; shape (n,).
+    #: Distance to the other antenna minus their distance on the vehicle; NaN where it was not checked; shape (n,).
     spacing_m: Floats
     #: Position on the trajectory, and distance from it; NaN where it was not checked; shape (n,).
     arc_m: Floats
@@ -182,14 +182,17 @@ def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
 
 
 def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
-    """Return the rows of one antenna by their distance to the other antenna's at the same instant (P2 3.3: 5 cm)."""
+    """Check the rows of one antenna by their distance to the other antenna's position at the same instant (P2 3.3: 5
+    cm); return the reasons.
+    """
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     there, place = other.time[rows], other.ecef_m[rows]
     nearest = nearest_rows(there, fixes.time, within_ns=_PAIR_NS)
     paired = (nearest >= 0) & (rejection == 0)
     if len(rows):
-        # At 30 m/s a millisecond between the two receivers' tags is 3 cm: the other one is moved to the same instant.
+        # At 30 m/s a millisecond between the two receivers' tags is 3 cm: the other position is moved to the same
+        # instant.
         velocity = np.gradient(place, seconds(there - there[0]), axis=0) if len(rows) > 1 else np.zeros_like(place)
         late_s = (fixes.time - there[nearest]).astype(np.int64) / 1e9
         moved = place[nearest] + late_s[:, None] * velocity[nearest]
@@ -252,14 +255,16 @@ def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, 
     if len(found) == len(position):
         return np.arange(len(found))
     reach = max_speed_mps * np.diff(time_s[found]) + _JITTER_M
-    # The shortest way counts; a second pass of a crossing costs what it is longer by.
+    # The shortest distance counts; a second pass of a crossing costs the additional length.
     ways = (np.abs(after[:, None] - before) for before, after in pairwise(np.split(arc_m, first[1:])))
     steps = (way + np.where(way > limit, _OUT_OF_REACH_M, 0.0) for way, limit in zip(ways, reach, strict=True))
     return np.asarray(first + cheapest_path(np.split(np.abs(lateral_m), first[1:]), steps))
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
-    """Return the rows by their distance to the trajectory, with their place on it and its standard deviation."""
+    """Check the rows by their distance to the trajectory; return the reasons with their position along it and its
+    standard deviation.
+    """
     rows = fixes.good
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
@@ -277,7 +282,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
         missed = np.isnan(arc) & (rejection == 0)
         _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), FixRejection.OFF_TRACK)
         _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), FixRejection.OFF_HEIGHT)
-        # What is left is beyond an end of the line.
+        # The remainder is beyond an end of the line.
         _reject(rejection, missed, FixRejection.OFF_TRACK)
     return replace(fixes, rejection=rejection, arc_m=arc, lateral_m=lateral, height_m=height, sigma_m=sigma)
 

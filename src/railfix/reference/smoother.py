@@ -1,8 +1,8 @@
 """Smooth the distance between fixes, all sensors weighted by their variances, and assemble the reference.
 
-Unknown at each instant are place, speed, and one slow error for each kind of sensor: of the Doppler speed, the
-difference and scale of the wheel's distance, the accelerometer's offset. A forward-backward smoother shares the closing
-error of a gap in proportion to what each part may have contributed.
+The unknowns at each instant are position, speed, and one slowly varying error per kind of sensor: of the Doppler speed,
+the difference and scale of the wheel's distance, the accelerometer's offset. A forward-backward smoother distributes
+the closing error of a gap in proportion to the variance of each contribution.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from railfix.motion.singer import singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
 from railfix.track.trajectory import Trajectory
 
-#: Standard deviations of what nothing is known of: speed [m/s], difference of the wheel's distance [m].
+#: Standard deviations of unknown initial values: speed [m/s], difference of the wheel's distance [m].
 _ANY_SPEED_MPS: Final = 100.0
 _ANY_DISTANCE_M: Final = 1e4
 #: Doppler speeds beyond this many standard deviations weigh less (P. J. Huber, 1964), in this many rounds.
@@ -54,7 +54,7 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """Measurements along one antenna's path at N instants; NaN where there is none."""
+    """Measurements along one antenna's path at N instants; NaN where missing."""
 
     time: Datetimes  #: Rising, steps of at most some seconds; shape (N,).
     #: Arc length of good fixes, shape (N,).
@@ -64,7 +64,7 @@ class Evidence:
     doppler_mps: Floats
     doppler_sigma_mps: Floats
     wheel_m: Floats  #: Cumulated distance of the wheel along rising chainage, from any start; shape (N,).
-    wheel_sigma_m: float  #: Of one reading: half a pulse and the like.
+    wheel_sigma_m: float  #: Standard deviation of one reading: half a pulse and similar errors.
     acceleration_mps2: Floats  #: Mean of each step along rising chainage, without gravity; shape (N - 1,).
 
 
@@ -78,14 +78,14 @@ class SmoothedReference:
     #: Shape (N,).
     speed_mps: Floats
     speed_sigma_mps: Floats
-    wheel_scale: Floats  #: Share that the wheel's distance is too long by; NaN without a wheel; shape (N,).
+    wheel_scale: Floats  #: Fraction by which the wheel's distance is too long; NaN without a wheel; shape (N,).
 
 
 class _States:
-    """Column of each state that the evidence needs; -1 of the others.
+    """Column of each state that the measurements need; -1 for the others.
 
-    Place, speed and acceleration of the train; with an accelerometer its offset and the speed at the instant before;
-    the time-correlated error of the Doppler speed; difference and scale error of the wheel's distance.
+    Position, speed and acceleration of the train; with an accelerometer its offset and the speed at the previous
+    instant; the time-correlated error of the Doppler speed; difference and scale error of the wheel's distance.
     """
 
     def __init__(self, evidence: Evidence) -> None:
@@ -171,7 +171,7 @@ def _first_sigmas(states: _States, settings: ReferenceSettings) -> Floats:
 
 
 def _motion(states: _States, evidence: Evidence, dt: Floats, settings: ReferenceSettings) -> tuple[Floats, Floats]:
-    """Return the transition to each instant from the one before and the covariance of its noise, shapes (N, n, n).
+    """Return the transition to each instant from the previous one and its noise covariance, shapes (N, n, n).
 
     Position, speed and a time-correlated acceleration (Singer's model); the Doppler speed's error is a first-order
     Gauss-Markov process; the wheel's difference changes with the distance by the scale error, and by slip; its scale
@@ -206,7 +206,7 @@ _FIX, _DOPPLER, _WHEEL, _ACCELERATION = range(4)
 def _measurements(
     states: _States, evidence: Evidence, dt: Floats, origin_m: float, settings: ReferenceSettings
 ) -> tuple[Floats, Floats, Floats]:
-    """Return values (N, 4), NaN where there is none, their variances (N, 4) and design (N, 4, n).
+    """Return values (N, 4), NaN where missing, their variances (N, 4) and design (N, 4, n).
 
     Fix = place. Doppler speed = speed + error. Wheel = place + difference. The accelerometer's mean over a step times
     its duration = gain of speed + offset times the duration.
@@ -271,7 +271,7 @@ def closings(
 
 
 def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the sigma of the time-correlated Doppler speed error [m/s] by what noise leaves of the closing errors."""
+    """Return the sigma of the time-correlated Doppler speed error [m/s], from the closing errors less their noise."""
     if len(misclosures) < WINDOWS:
         return settings.doppler_bias_mps
     tau = settings.doppler_bias_s
@@ -281,7 +281,9 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the random error of the wheel from the closing errors, its scale taken off [m per square root of m]."""
+    """Return the random error of the wheel from the closing errors, without its scale error [m per square
+    root of m].
+    """
     moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
@@ -301,7 +303,7 @@ _LEAST_SLIP_M: Final = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """Gap between two good fixes that are further apart than the log's usual step."""
+    """Gap between two good fixes that are farther apart than the log's usual step."""
 
     start: np.datetime64
     end: np.datetime64
@@ -311,7 +313,7 @@ class Gap:
 
 @dataclass(frozen=True, kw_only=True)
 class Built:
-    """Reference of one antenna, with its fixes and gaps."""
+    """Reference trajectory of one antenna, with its fixes and gaps."""
 
     reference: AntennaReference
     fixes: Fixes  #: Every row of the position log with its reasons for rejection.
@@ -332,7 +334,9 @@ def assemble_reference(
     settings: ReferenceSettings,
     facts: dict[str, Any],
 ) -> Built:
-    """Return the reference of one antenna: places of fixes, smoothed between; `excess` (G - 1,) in sigmas."""
+    """Return the reference trajectory of one antenna: positions of fixes, smoothed between them; `excess` (G - 1,) in
+    sigmas.
+    """
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
     is_fix = np.zeros(len(time), dtype=np.bool_)

@@ -22,7 +22,8 @@ from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
 
-#: Epochs that are listed, one at most in so many seconds of a run [s]; pieces of the line that each run is drawn in.
+#: Number of epochs that are listed, at most one in this time of a run [s]; number of pieces of the line in which each
+#: run is drawn.
 _WORST: Final = 10
 _EVENT_S: Final = 60
 _PIECES: Final = 400
@@ -48,8 +49,8 @@ _FIGURES: Final[Sequence[Column]] = (
 class CampaignReport:
     """What a campaign found."""
 
-    sentences: tuple[str, ...]  #: At most five: how many runs, how good, the worst, what has failed.
-    tables: tuple[Table, ...]  #: Of the runs, of those that failed, of the worst epochs.
+    sentences: tuple[str, ...]  #: At most five sentences: number of runs, accuracy, the worst, failures.
+    tables: tuple[Table, ...]  #: Tables of the runs, of failed runs, of the worst epochs.
     charts: tuple[Chart, ...]
     notes: tuple[str, ...]  #: On runs that could not be compared with their reference.
 
@@ -90,7 +91,7 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
 def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Path:
     """Write a campaign as one HTML page that opens without a network; return its path."""
     runs, *rest = report.tables
-    # what has failed stands first
+    # failed runs come first
     blocks: list[Block] = [*rest, runs, *([Notes("Notes", report.notes)] if report.notes else [])]
     lead = [Sentence(f"{sentence[0].upper()}{sentence[1:]}.") for sentence in report.sentences]
     write_whole(path, charts_page(title, report.charts, blocks, lead=lead), what="page")

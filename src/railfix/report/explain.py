@@ -1,9 +1,9 @@
-"""One epoch of a run explained: its position, each satellite and its outcome, what set sigma and level, what would
-change it.
+"""One epoch of a run explained: its position, each satellite and its outcome, what set sigma and level, and the effect
+of each satellite.
 
-Everything is read from the tables of the run. What the position would be without a satellite is computed from them:
-weighted least squares of the residuals in the place along, across and above the line, the map's error as a prior, and
-one free clock a constellation, linear around the position (P1 2.2(3)).
+Everything is read from the tables of the run. The position without a satellite is computed from the residuals by
+weighted least squares along, across and above the line, with the map's error as a prior and one free clock per
+constellation, linearised at the position (P1 2.2(3)).
 """
 
 from __future__ import annotations
@@ -27,35 +27,37 @@ from railfix.evaluate.inputs import RunFolder, read_run
 from railfix.report.charts_page import read_template
 from railfix.track import Trajectory, read_track
 
-#: What the status of a single epoch says.
+#: Meanings of the statuses of a single epoch.
 SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
-    "ambiguous": "another place on the line fits the ranges as well",
-    "off_map": "at an end of the map, or too far from the position without the map",
+    "ambiguous": "another position on the line fits the ranges equally well",
+    "off_map": "beyond an end of the map, or too far from the position without the map",
+    "map_end": "at an end of the map: the ranges put it a little beyond",
     "too_few_satellites": "no position: too few usable satellites",
-    "unobservable": "no position: the satellites do not determine the place along the line",
+    "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",
     "no_observation": "no position: the antenna has no observation",
     "inconsistent": "the ranges contradict each other, and no exclusion mends it",
     "antennas_disagree": "the positions of the two antennas are not as far apart as the antennas are",
     "uncertain": "its standard deviation is over the limit",
-    "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
+    "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or the train is on "
+    "another track",
     "jamming_suspected": "passed every check, but the signals are jammed (column interference_causes)",
     "spoofing_suspected": "the signals may be those of a spoofer (column interference_causes)",
 }
-#: What the status of the filter says.
+#: Meanings of the statuses of the filter.
 FILTER_STATUS: Final[Mapping[str, str]] = {
-    "tracking": "one place, from measurements of this epoch",
-    "several_branches": "several places are possible; one of the most probable is given",
+    "tracking": "one position, from measurements of this epoch",
+    "several_branches": "several positions are possible; the most probable one is given",
     "coasting": "predicted: no measurement of this epoch is believed",
-    "lost": "measurements contradict the track: places are sought again",
+    "lost": "measurements contradict the track: positions are searched for again",
     "expired": "no position: dead reckoning for too long",
     "not_started": "no position yet: no epoch so far had redundant codes",
     "off_map": "no position: the satellites have put the train away from the line for some time",
     "map_offset": "positions of the last minutes lie beside the line: the map is wrong here, or it is another track",
-    "antennas_disagree": "not as far from the other antenna's place as the antennas are apart",
-    "doubtful": "measurements contradict the place, or what bounds it: nothing bounds its error",
-    "spoofing_suspected": "the signals may be those of a spoofer: nothing bounds its error",
+    "antennas_disagree": "its distance from the other antenna's position disagrees with the antenna spacing",
+    "doubtful": "measurements contradict the position or its bound: its error is not bounded",
+    "spoofing_suspected": "the signals may be those of a spoofer: its error is not bounded",
 }
 #: Columns of `Explanation.satellites` that are computed here.
 WITHOUT: Final = ("without_shift_m", "without_sigma_m")
@@ -72,7 +74,7 @@ class Explanation:
     run: Path
     antenna: str
     time: np.datetime64  #: GPS time of the epoch.
-    asked: str  #: The time that was asked for.
+    asked: str  #: The requested time.
     #: Rows of ``positions`` and ``train``; `track` is empty where the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
@@ -80,7 +82,7 @@ class Explanation:
     #: filter gave it, and for those used how far the single position would move along the line without it, and its
     #: standard deviation then [m]; null where it would have none.
     satellites: pl.DataFrame
-    sentences: tuple[str, ...]  #: Where, how sure, and what set sigma, level and status.
+    sentences: tuple[str, ...]  #: Lines on position, sigma, level and status.
 
 
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
@@ -116,7 +118,7 @@ def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanat
 
 
 def _nearest(times: Any, at: str) -> int:
-    """Return the row whose time is the nearest to what was asked for."""
+    """Return the row nearest to the requested time."""
     text = at.strip()
     days = np.unique(times.astype("datetime64[D]")) if ":" in text and "-" not in text else [None]
     try:
@@ -186,7 +188,7 @@ def _solve(
 
 
 def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: pl.DataFrame) -> list[str]:
-    """Say where, how sure, and what set sigma, level and status."""
+    """Return lines on position, sigma, level and status."""
     lines = []
     if track:
         text = f"filter: {_place(track)}; {track['status']}: {FILTER_STATUS.get(track['status'], 'see the reference')}"

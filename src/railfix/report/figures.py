@@ -41,8 +41,8 @@ _KINDS: Final = {
     "separation": "solution separation; hypotheses of satellite and local faults",
 }
 _EXPLAINED: Final = (
-    "Usable levels: status ok and no alarm; every other position counts as having an infinite level. All: every "
-    "finite level, whatever its status."
+    "Usable levels: status ok and no alarm; every other position counts as having an infinite level. Every finite "
+    "level is counted, whatever its status"
 )
 
 
@@ -83,7 +83,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
 
 
 def _priors(priors: Any) -> str:
-    """Return priors by constellation, equal ones together."""
+    """Return priors by constellation, equal ones merged."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}
@@ -104,7 +104,7 @@ def _availability(run: ReportedRun) -> Table:
         name="availability",
         head=["antenna", "levels", "limit, m", "epochs", "finite", "p50", "p95", "available", "15 s", "60 s"],
         rows=list(_rows_available(run, limits, options)),
-        caption=f"Share of all epochs that are available, and of windows beginning at an available epoch that stay "
+        caption=f"Fraction of all epochs that are available, and of windows beginning at an available epoch that stay "
         f"available. {_EXPLAINED} Levels in metres; without a reference they are not compared with errors",
         numeric=range(2, 10),
     )
@@ -131,11 +131,11 @@ def _rows_available(run: ReportedRun, limits: Sequence[float], options: Evaluati
                 ]
 
 
-#: Number of largest errors whose epochs are among those of the sky plot.
+#: Number of epochs with the largest errors that the sky plot includes.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
     "No reference was given (--reference), so there are no errors, figures of merit and Stanford diagrams; intervals "
-    "are those between the positions themselves."
+    "are those between the positions."
 )
 NO_OBSERVATIONS: Final = (
     "The run wrote no observations (railfix run --observations), so there are no charts of the sky, of C/N0 and of "

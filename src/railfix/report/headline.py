@@ -21,7 +21,7 @@ from railfix.run.verdict import judge_run
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFigure:
-    """A figure of single epochs with its name, that of the filter, and the conventional one or a remark."""
+    """A figure of single epochs with its name, the filter's figure, and the conventional one or a remark."""
 
     name: str
     value: str
@@ -31,7 +31,7 @@ class KeyFigure:
 
 @dataclass(frozen=True, kw_only=True)
 class Headline:
-    """Verdict, five key figures, what they are of, and remarks on one antenna of a run."""
+    """Verdict, five key figures with their basis, and remarks on one antenna of a run."""
 
     verdict: str
     figures: tuple[KeyFigure, ...]
@@ -51,13 +51,13 @@ def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> H
 
 @dataclass(frozen=True, kw_only=True)
 class _Compared:
-    """Positions that passed every check beside the conventional ones of the same epochs."""
+    """Positions that passed every check compared with the conventional ones of the same epochs."""
 
     #: Error sizes, shape (N,).
     on_map_m: Floats
     conventional_m: Floats
     epochs: pl.DataFrame  #: Of the N epochs.
-    #: Share of the epochs with observations that have such a position.
+    #: Fraction of the epochs with observations that have such a position.
     rate: float
     conventional_rate: float
     marked_m: Floats  #: Error sizes of the positions that failed a check.

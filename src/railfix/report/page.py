@@ -62,7 +62,7 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                 row += [number(figures["conventional"].get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
     caption = (
-        "settings: preset and changed settings; rate: share of the epochs with observations that have a position; "
+        "settings: preset and changed settings; rate: fraction of the epochs with observations that have a position; "
         "sigma p95: stated standard deviation along the line, in metres"
     )
     if evaluation:
@@ -112,14 +112,14 @@ def provenance(run: ReportedRun) -> list[Block]:
 
 
 def settings(run: ReportedRun) -> list[Block]:
-    """Return settings asked for beside those used."""
+    """Return requested settings and those used."""
     asked = flat_settings(run.record.get("settings_asked") or {})
     used = flat_settings(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
     names += [name for name in used if name not in asked]
     rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]
     return [
-        Sentence(f"{len(asked)} of {len(used)} settings were asked for; the others are defaults."),
+        Sentence(f"{len(asked)} of {len(used)} settings were given; the others are defaults."),
         Table(name="settings", head=["setting", "asked", "used"], rows=rows, marked=range(len(asked))),
     ]
 
@@ -145,7 +145,7 @@ def budget(run: ReportedRun) -> list[Block]:
 
 
 def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
-    """Return the figures of merit of one run, on the map beside conventional."""
+    """Return the figures of merit of one run, on the map and conventional."""
     return _with_groups(select_evaluation(evaluation, run.name_in(evaluation)))
 
 
@@ -219,7 +219,7 @@ def report_page(
     """HTML of the report; `background`: longitude and latitude of lines below the plan, each of shape (P, 2) [deg]."""
     numbers = counter()
     antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
-    # many antennas share the size that two have
+    # with many antennas each gets a smaller chart
     epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // antennas))
     return render(
         "page.html.j2",
@@ -289,7 +289,7 @@ def _run(
             Folded("Epochs and pseudoranges", budget(run)),
             Folded("Protection level", protection(run, evaluation)),
             Folded("Run, inputs and notes", provenance(run)),
-            Folded("Settings asked for and used", settings(run)),
+            Folded("Settings given and used", settings(run)),
         ),
         "timing": _part(run_group(run), numbers, "", anchor),
         "antennas": [

@@ -23,7 +23,7 @@ from railfix.track import Track
 
 _OBSERVATIONS: Final = "observations.parquet"
 _NEEDED: Final = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
-#: Columns that the report uses beside those of every table: of the positions, of the filter, of the errors.
+#: Columns that the report uses besides those of every table: of the positions, of the filter, of the errors.
 _POSITIONS: Final = cs.contains("protection_level", "protection_status", "protection_cause", "_fault") | cs.by_name(
     "kilometrage_m", "n_rejected", "raim_statistic", "raim_threshold", "raim_level_m", "protection_kind",
     *(column.name for screen in SCREENS for column in screen.columns if column.table == "positions"),
@@ -41,23 +41,23 @@ _ERRORS: Final = (
 class ReportedRun:
     """One run with the content of its part of the report."""
 
-    name: str  #: Of the folder, with as many parent folders as are needed to tell the runs apart.
+    name: str  #: Name of the folder, with as many parent folders as distinguish the runs.
     folder: RunFolder
     config: Config  #: Settings that were used.
     observations: pl.LazyFrame | None  #: None where the run wrote none.
-    #: Of `railfix.evaluate.EPOCH_COLUMNS` those that the report uses, and levels: of the single-epoch positions, and of
-    #: the filter along the track; None without a reference or without a filter.
+    #: Columns of `railfix.evaluate.EPOCH_COLUMNS` that the report uses, and levels: of the single-epoch positions, and
+    #: of the filter along the track; None without a reference or without a filter.
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
-    train: pl.DataFrame | None  #: Times, places and sigmas by the filter along the track, None without.
+    train: pl.DataFrame | None  #: Times, positions and sigmas by the filter along the track, None without it.
     reference: str  #: Path of the reference; empty without one.
-    conventional: Path | None  #: Run that the conventional positions come from, where it is another one.
+    conventional: Path | None  #: Run of the conventional positions, where it is another one.
     track: Track | None  #: None where its files cannot be read.
     curve: Cn0Curve | None
     notes: tuple[str, ...]
 
     def name_in(self, evaluation: Evaluation, table: str = POSITIONS_TABLE) -> str:
-        """Return the name of one of its tables of positions in the tables of an evaluation; empty if not there."""
+        """Return the name of one of its tables of positions in the tables of an evaluation; empty if absent."""
         mine = (run for run in evaluation.runs if run.path.resolve() == self.folder.path.resolve())
         return next((run.name for run in mine if run.table == table), "")
 
@@ -84,7 +84,7 @@ class ReportedRun:
 
 
 def get_figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
-    """Return the figures of merit of one antenna and kind of position; empty where there are none."""
+    """Return the figures of merit of one antenna and kind of position; empty where none exist."""
     rows = evaluation.figures.filter(
         grouping="all", epochs_of="own", run=run.name_in(evaluation), antenna=antenna, position=position
     )
@@ -98,14 +98,14 @@ def read_runs(
     conventional: Sequence[Path] = (),
     options: EvaluationOptions | None = None,
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
-    """Read runs, and evaluate them where there is a reference; None in place of the evaluation without.
+    """Read runs, and evaluate them where there is a reference; None replaces the evaluation without references.
 
     `references`: none, one for all runs, or one for each in order. `conventional`: none, or for each run in order
     another run on the same log, whose conventional positions are shown: one with the screens of elevation and C/N0
     alone gives the unscreened ones of P1. The table of epochs of the evaluation is empty: the runs have the columns
     that the report uses.
 
-    InputFileError, MismatchError: a file is not what it should be, or a reference is not that of the run.
+    InputFileError, MismatchError: a file is not as expected, or a reference is not that of the run.
     SettingsError: the number of references or of conventional runs does not fit, or a run is given twice.
     """
     if not paths:

@@ -1,4 +1,4 @@
-"""Campaigns: many logs positioned side by side, resumable, each with its own results folder.
+"""Campaigns: many logs positioned adjacent, resumable, each with its own results folder.
 
 The folders are named by the fields of the campaign (``runs/train=A/day=2024-03-05``), so that all tables
 together are one hive-partitioned data set: ``pl.scan_parquet(out / "runs/**/positions.parquet")``.
@@ -42,11 +42,11 @@ class Campaign(Settings):
     #: Patterns of the logs: ``logs/{train}/{day}/front.obs*``. Logs with the same fields are one run; several files of
     #: one antenna are joined in the order of their names. `rear` may be empty.
     front: str
-    nav: str  #: Pattern of navigation files; that of precise orbits (`sp3`) may be empty.
+    nav: str  #: Pattern of navigation files; the pattern of precise orbits (`sp3`) may be empty.
     track: tuple[str, ...]  #: Patterns of the track's files, joined to a route in this order.
     rear: str = ""
     sp3: str = ""
-    #: Patterns, each of one file a run; may be empty.
+    #: Patterns of one file per run; may be empty.
     vehicle: str = ""
     tachometer: str = ""
     inertial: str = ""
@@ -56,7 +56,7 @@ class Campaign(Settings):
     options: RunOptions = RunOptions()  #: Of every run.
 
 
-#: Patterns of several files a run, and of one.
+#: Patterns of several files per run, and of one.
 _MANY: Final = ("front", "rear", "nav", "sp3")
 _ONE: Final = ("vehicle", "tachometer", "inertial", "radar", "reference")
 
@@ -107,7 +107,7 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     for name, pattern in patterns.items():
         _check_pattern(path, name, pattern)
         if other := sorted(set(_FIELD.findall(pattern)) - set(fields)):
-            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front has not")
+            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front lacks")
     found = {name: _find(folder, pattern) for name, pattern in patterns.items()}
     keys = list(dict.fromkeys(tuple(values[name] for name in fields) for _, values in found["front"]))
     if not keys:
@@ -150,11 +150,11 @@ def run_campaign(
 ) -> pl.DataFrame:
     """Position all logs of a campaign file and write one row per run to ``campaign.csv``.
 
-    Runs whose results are there, of the same inputs and settings, are not repeated: a campaign that was killed goes on
-    where it was. A run that fails is a row with its error: the fields, `status` ("done", "failed"), `error`, `epochs`,
-    `positioning_rate`, `ok_rate`, `wall_s`, `reference`, `folder` (below `out`).
+    Runs with results of the same inputs and settings are not repeated: a campaign that was killed continues. A run that
+    fails is a row with its error: the fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`,
+    `ok_rate`, `wall_s`, `reference`, `folder` (below `out`).
 
-    `reading` takes the place of that in the campaign's options, where it is given and not the default.
+    `reading` replaces that of the campaign's options, where it differs from the default.
     The executor is of `concurrent.futures`: processes on this machine, or any other with its interface whose workers
     see the same files; by the errors `lost` it reports that a worker process is gone.
     """
@@ -232,7 +232,7 @@ def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
 def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
     """Return the files that match a pattern, in order of their names, with the values of its fields.
 
-    A name without fields or ``*`` is that file, whether it is there or not: the run says what is wrong with it.
+    A name without fields or ``*`` is that file, existing or not: the run reports the fault.
     """
     if not pattern:
         return []
@@ -265,7 +265,7 @@ def _regex(part: str, seen: set[str]) -> str:
 
 
 def _check_pattern(path: Path, name: str, pattern: str) -> None:
-    """Raise SettingsError where a pattern does not say where the value of each field ends."""
+    """Raise SettingsError where a pattern does not determine where the value of each field ends."""
     if re.search(r"\}\{", pattern):
         raise SettingsError(f"{path}: {name} = {pattern!r}: put a character between the two fields: {{a}}_{{b}}")
     if "**" in pattern:

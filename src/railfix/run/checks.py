@@ -22,9 +22,9 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 
 _SECOND: Final = np.timedelta64(1, "s")
-#: Conventional positions that must all be so far before a run is stopped early.
+#: Number of conventional positions, all this far away, after which a run is stopped early.
 ENOUGH_TO_STOP: Final = 10
-#: Navigation records further from the log than this are of another day.
+#: Navigation records farther from the log than this are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
 #: Records reach about this far beyond their reference time (Galileo, IODnav of 4 h and its margin).
 RECORD_REACH: Final = np.timedelta64(4, "h")
@@ -44,7 +44,7 @@ def navigation_times(navigation: Navigation) -> Datetimes:
 
 
 def navigation_span(navigation: Navigation) -> Span | None:
-    """Return the reference times of the first and the last record; None where there is none."""
+    """Return the reference times of the first and the last record; None without one."""
     times = navigation_times(navigation)
     return (times[0], times[-1]) if len(times) else None
 
@@ -71,7 +71,7 @@ def spans_apart(one: Span, other: Span, *, reach: np.timedelta64 = _SECOND * 0) 
 
 
 def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta64 = ANOTHER_DAY) -> None:
-    """Raise MismatchError where no pseudorange was used and the log lies further than `reach` from every record."""
+    """Raise MismatchError where no pseudorange was used and the log is farther than `reach` from every record."""
     if any(antenna.used for antenna in tally.antennas.values()):
         return
     span = navigation_span(navigation)
@@ -89,7 +89,7 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
 
 
 def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -> None:
-    """Raise MismatchError where all conventional positions lie further than `ANOTHER_PLACE_M` from the line.
+    """Raise MismatchError where all conventional positions are farther than `ANOTHER_PLACE_M` from the line.
 
     `antennas`: whether every antenna must be elsewhere (during a run, after a few positions of each), or one is enough
     (at the end).

@@ -1,7 +1,7 @@
 """Receiver logs as RINEX files, positions of a run as messages of ROS 2, tables of EGNSS MATE in and out.
 
 Definitions of messages in an MCAP file are those of sensor_msgs, and of https://github.com/EGNSS-MATE/emate_ros (MIT),
-commit 9067868 of 16 April 2024, written for ROS 1; the third holds the row of the table.
+commit 9067868 of 16 April 2024, written for ROS 1; the third contains the row of the table.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ def convert_logs(
     reading: LogReading | None = None,
     overwrite: Overwrite = "refuse",
 ) -> list[str]:
-    """Write RINEX files (version 3.04 or 4.02) of the logs of one receiver; return what was written and passed over.
+    """Write RINEX files (version 3.04 or 4.02) of the logs of one receiver; return the written files and the skipped
+    items.
 
-    InputFileError: a log cannot be read or holds nothing of what is asked for. OutputError: a file exists already, is
+    InputFileError: a log cannot be read or contains nothing that was requested. OutputError: a file exists already, is
     an input, or cannot be written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
@@ -77,7 +78,7 @@ def convert_logs(
 
 
 def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeader, int, Counter[str], list[str]]:
-    """Return the header with the signals of the whole log, number of epochs, what is skipped, and notes."""
+    """Return the header with the signals of the whole log, number of epochs, counts of skipped items, and notes."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
     header, epochs, skipped, problems = ObservationHeader(), 0, Counter[str](), list[str]()
@@ -117,9 +118,9 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
     """Write the rows of a table of positions that have coordinates, three topics an antenna; return their number.
 
     ``/ANTENNA/fix`` is sensor_msgs/NavSatFix, ``/ANTENNA/row`` has every column, and ``/ANTENNA/track``, of the filter
-    alone, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The file has the
-    `description`: what the positions are, and the frame of the coordinates. NoPositionError: no row has coordinates.
-    ModuleNotFoundError: mcap-ros2-support is not installed.
+    alone, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The file
+    contains the `description`: the kind of positions, and the frame of the coordinates. NoPositionError: no row has
+    coordinates. ModuleNotFoundError: mcap-ros2-support is not installed.
     """
     from mcap_ros2.writer import Writer
 
@@ -226,7 +227,7 @@ def sensor_table(path: Path, kind: str) -> pl.DataFrame:
 
 
 def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of the balise of each group that its place is that of."""
+    """Return the rows of the balise whose position represents each group."""
     return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
 
 

@@ -1,4 +1,4 @@
-"""Files examined before a run: what each is, what is inside, what is missing, and the command to run."""
+"""Files examined before a run: kind and content of each, missing files, and the command to run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.files import LENIENT
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import ObservationHeader
 from railfix.io.file_kind import KIND_WORDS, MAPS, POSITIONS, FileKind, find_kind, has_times
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.mate import mate_table
@@ -40,7 +40,9 @@ Kind = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class FileFinding:
-    """What one file is: kind, facts in words, span in GPS time and place (ECEF, shape (3,) [m]) where it has them."""
+    """Properties of one file: kind, facts in words, span in GPS time and position (ECEF, shape (3,) [m])
+    where known.
+    """
 
     path: Path
     kind: Kind
@@ -49,12 +51,12 @@ class FileFinding:
     place_ecef_m: Floats | None = None
     ephemerides: Span | None = None  #: Reference times of the ephemerides in the file; None without any.
     options: tuple[str, ...] = ()  #: Options that a command needs to read the file.
-    problems: tuple[str, ...] = ()  #: What is wrong with the file alone, a sentence each.
+    problems: tuple[str, ...] = ()  #: Faults of the file alone, one sentence each.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """Findings on each file, what does not fit together or is missing, and the command to run (blank: none)."""
+    """Findings on each file, mismatches and missing files, and the command to run (blank: none)."""
 
     findings: tuple[FileFinding, ...]
     problems: tuple[str, ...]
@@ -79,7 +81,7 @@ class Diagnosis:
         }
 
 
-def examine_files(paths: Sequence[Path]) -> Diagnosis:
+def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
     """Read each file as every kind until one fits, and compare them with each other; InputFileError where one is
     missing.
     """
@@ -90,18 +92,20 @@ def examine_files(paths: Sequence[Path]) -> Diagnosis:
             raise InputFileError(path, "there is no such file; check the name")
         if sum(path.samefile(other) for other in paths if other.exists()) > 1:
             raise InputFileError(path, "is given twice; name each file once")
-    findings = tuple(_examine(path) for path in paths)
+    findings = tuple(_examine(path, date) for path in paths)
     problems = tuple(_problems(findings))
-    return Diagnosis(findings=findings, problems=problems, command=_command(findings))
+    return Diagnosis(findings=findings, problems=problems, command=_command(findings, date))
 
 
-def _examine(path: Path) -> FileFinding:
-    """Return what a file is: its content decides the kind, and the reader of that kind says what is wrong with it."""
+def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
+    """Return the properties of a file: its content determines the kind, and the reader of that kind reports
+    its faults.
+    """
     errors: list[str] = []
     kinds = _find_kinds(path)
     for kind in kinds:
         try:
-            return _READERS[kind](path)
+            return _DATED[kind](path, date) if kind in _DATED else _READERS[kind](path)
         except RailfixError as error:
             errors.append(str(error))
             if "--date" in str(error):  # the kind is known, the date is not
@@ -124,79 +128,70 @@ def _unknown(path: Path) -> FileFinding:
     raise InputFileError(path, f"not recognised: it is {KIND_WORDS[find_kind(path)]}, and no command reads it")
 
 
-def _observations(path: Path) -> FileFinding:
+def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
     """Read a log piece by piece: the facts of the whole, in the memory of a piece."""
-    first: Observations | None = None
-    epochs, longest_s, steps = 0, 0.0, []
-    satellites: set[str] = set()
-    signals: set[str] = set()
-    end = np.datetime64("NaT", "ns")
+    header: ObservationHeader | None = None
+    times, channels = [np.empty(0, dtype="datetime64[ns]")], set[tuple[str, str]]()
     broken, notes = Counter[str](), list[str]()
-    for piece in scan_observations(path, broken_lines="count"):
+    for piece in scan_observations(path, broken_lines="count", date=date):
         broken.update({what: n for what, n in piece.skipped.items() if what.startswith(("broken", "epochs out of"))})
         notes += piece.problems
-        if not len(piece):
-            continue
-        first = piece if first is None else first
-        time = piece.time if np.isnat(end) else np.concatenate([[end], piece.time])
-        between = np.diff(time) / _SECOND
-        steps.append(float(np.median(between)) if len(between) else np.nan)
-        longest_s = max(longest_s, float(between.max(initial=0.0)))
-        epochs, end = epochs + len(piece), piece.time[-1]
-        satellites |= set(piece.satellite.tolist())
-        signals |= {f"{name[0]} {code}" for name, code in zip(piece.satellite, piece.signal, strict=True)}
-    if first is None:
+        header = piece.header if header is None and len(piece) else header
+        times.append(piece.time)
+        channels |= {*zip(piece.satellite.tolist(), piece.signal.tolist(), strict=True)}
+    if header is None:
         raise InputFileError(path, "has no epoch of observations")
-    step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else np.nan
-    systems = {letter: sum(name[0] == letter for name in satellites) for letter in sorted({s[0] for s in satellites})}
+    time = np.concatenate(times)
+    between = np.diff(time) / _SECOND if len(time) > 1 else np.array([np.nan])
+    systems = Counter(satellite[0] for satellite in {satellite for satellite, _ in channels})
+    signals = sorted({f"{satellite[0]} {signal}" for satellite, signal in channels})
     facts = [
-        f"{epochs:,} epochs, one every {step:g} s, the longest gap {longest_s:g} s",
-        "satellites: " + ", ".join(f"{letter} {count}" for letter, count in systems.items()),
-        f"signals: {', '.join(sorted(signals))}",
+        f"{len(time):,} epochs, one every {np.median(between):g} s, the longest gap {between.max():g} s",
+        "satellites: " + ", ".join(f"{letter} {count}" for letter, count in sorted(systems.items())),
+        f"signals: {', '.join(signals)}",
     ]
-    header = first.header
     words = [word for word in (header.receiver, header.antenna) if word]
     facts += [f"receiver and antenna: {', '.join(words)}"] if words else []
     facts += [f"note: {note.removeprefix(f'{path}, ')}" for note in notes[:_MOST_NOTES]]
     place = header.approximate_ecef_m
-    own = _own_ephemerides(path)
+    own = _own_ephemerides(path, date)
     if own is not None:
         facts.append(f"{own[0]:,} ephemerides inside")
     return FileFinding(
         path=path,
         kind="observations",
         facts=(*facts, *_place_facts(place)),
-        span=(first.time[0], end),
+        span=(time[0], time[-1]),
         place_ecef_m=place if np.isfinite(place).all() else None,
         ephemerides=None if own is None else own[1],
-        options=("--lenient",) if broken and _needs_lenient(path) else (),
+        options=("--lenient",) if broken and _needs_lenient(path, date) else (),
     )
 
 
-def _needs_lenient(path: Path) -> bool:
+def _needs_lenient(path: Path, date: np.datetime64 | None) -> bool:
     """Return whether a reader of the default policy stops at a line of the file."""
     try:
-        for _ in scan_observations(path):
+        for _ in scan_observations(path, date=date):
             pass
     except InputFileError:
         return True
     return False
 
 
-def _own_ephemerides(path: Path) -> tuple[int, Span] | None:
+def _own_ephemerides(path: Path, date: np.datetime64 | None) -> tuple[int, Span] | None:
     """Return the number and the reference times of the ephemerides in a receiver's log; None without any."""
     if find_kind(path) != "receiver":
         return None
     try:
-        navigation = read_navigation([path])
-    except InputFileError:  # it has none: observations alone are no fault of a log
+        navigation = read_navigation([path], date=date)
+    except InputFileError:  # without navigation records: observations alone are no fault of a log
         return None
     span = navigation_span(navigation)
     return None if span is None else (len(navigation.kepler) + len(navigation.glonass), span)
 
 
-def _navigation(path: Path) -> FileFinding:
-    navigation = read_navigation([path], broken_lines="count")
+def _navigation(path: Path, date: np.datetime64 | None) -> FileFinding:
+    navigation = read_navigation([path], broken_lines="count", date=date)
     span = navigation_span(navigation)
     if span is None:
         raise InputFileError(path, "has no ephemeris")
@@ -211,7 +206,7 @@ def _navigation(path: Path) -> FileFinding:
 
 
 def _track(path: Path) -> FileFinding:
-    """Return what a track map is: one route, or a network of which a run finds the route; without heights, too."""
+    """Return the kind of a track map: one route, or a network in which a run finds the route; also without heights."""
     options: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     try:
@@ -257,14 +252,14 @@ def _track(path: Path) -> FileFinding:
     )  # fmt: skip
 
 
-def _positions(path: Path) -> FileFinding:
+def _positions(path: Path, date: np.datetime64 | None) -> FileFinding:
     options: tuple[str, ...] = ()
     try:
-        log = read_positions(path, heights="optional", antennas="several")
+        log = read_positions(path, date=date, heights="optional", antennas="several")
     except InputFileError as error:
         if LENIENT not in str(error):
             raise
-        log = read_positions(path, broken_lines="count", heights="optional", antennas="several")
+        log = read_positions(path, broken_lines="count", date=date, heights="optional", antennas="several")
         options = ("--lenient",)
     known = log.time[~np.isnat(log.time)]
     span = (known.min(), known.max()) if len(known) else None
@@ -304,18 +299,25 @@ def _sbas(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
 
 
-#: What a file of each kind can be for railfix.
+#: Uses of a file of each kind.
 _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
-    "observations": ("observations",), "navigation": ("navigation",), "sp3": ("orbits",), "sbas": ("sbas",),
-    "receiver": ("observations", "navigation", "positions"), "gpx": ("positions", "track"),
-    "toml": ("vehicle", "settings"), **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
+    "observations": ("observations",),
+    "navigation": ("navigation",),
+    "sp3": ("orbits",),
+    "sbas": ("sbas",),
+    "receiver": ("observations", "navigation", "positions"),
+    "gpx": ("positions", "track"),
+    "toml": ("vehicle", "settings"),
+    **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
-}  # fmt: skip
-#: What reads each kind of file.
-_READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
+}
+#: Readers of each kind of file, with a date and without.
+_DATED: Final[dict[Kind, Callable[[Path, np.datetime64 | None], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
     "positions": _positions,
+}
+_READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "track": _track,
     "orbits": _orbits,
     "sbas": _sbas,
@@ -337,17 +339,17 @@ def _filter(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
 
 
 def _problems(findings: Sequence[FileFinding]) -> list[str]:
-    """Return what does not fit together, and what is missing for a run, a sentence each."""
+    """Return mismatches, and files missing for a run, one sentence each."""
     problems = [problem for finding in findings for problem in finding.problems]
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     readable = [log for log in logs if log.span is not None]
     navigation = [finding for finding in findings if finding.ephemerides is not None or finding.kind == "navigation"]
     if not logs:
-        problems.append("there is no log of observations: give a RINEX observation file or a receiver's log")
+        problems.append("no log of observations: give a RINEX observation file or a receiver's log")
     if not navigation and logs:
-        problems.append("there is no navigation file: give the broadcast ephemerides of the day")
+        problems.append("no navigation file: give the broadcast ephemerides of the day")
     if not tracks and logs:
-        problems.append("there is no track map: railfix map survey makes one of runs over the line")
+        problems.append("no track map: railfix map survey makes one from runs over the line")
     if len(logs) > 2:
         problems.append("there are more than two logs: give the files of one run")
     for log in readable:
@@ -373,7 +375,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
     return problems
 
 
-def _command(findings: Sequence[FileFinding]) -> str:
+def _command(findings: Sequence[FileFinding], date: np.datetime64 | None) -> str:
     """Return the command of a run, blank where a file for it is missing."""
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     logs = [log for log in logs if log.span is not None]
@@ -394,4 +396,5 @@ def _command(findings: Sequence[FileFinding]) -> str:
     for kind, (option, most) in options.items():
         words += [word for finding in _filter(findings, kind)[:most] for word in (option, str(finding.path))]
     words += list(dict.fromkeys(word for finding in findings for word in finding.options))
+    words += [] if date is None else ["--date", str(date.astype("datetime64[s]"))]
     return shlex.join([*words, "--out", "results"])

@@ -46,7 +46,7 @@ class Progress(Protocol):
     """Callback for the progress of a run."""
 
     def __call__(self, *, epochs: int, fraction: float) -> None:
-        """Epochs done so far, and the part of the logs that has been read, 0 to 1."""
+        """Epochs done so far, and the fraction of the logs that has been read, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,7 @@ class RunSummary:
 
     tally: Tally
     record: Mapping[str, Any]  #: Content of ``run.json``.
-    verdict: Verdict  #: What the terminal, the report and JSON state of the run.
+    verdict: Verdict  #: Verdict of the run for the terminal, the report and JSON.
     files: Mapping[str, Path]
     wall_s: float
 
@@ -76,7 +76,7 @@ def run_files(
 ) -> RunSummary:
     """Position the logs of one run along its line and write the results into the folder `out`.
 
-    `config` are all settings, `asked` those that were given as opposed to defaults, for ``run.json``. RailfixError: see
+    `config` are all settings, `asked` the explicitly given ones, for ``run.json``. RailfixError: see
     `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
@@ -91,6 +91,7 @@ def run_files(
     ):
         entries, packages = inputs.entries(hashing, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
+        config = config if line.route is None else line.route.with_unmapped(config)
         sensors, units = read_samples_and_units(inputs)
         balises = load_balises(inputs.balises, inputs.balise_list, inputs.virtual_balises, line.track, config)
         base = base_log(inputs.base, options)
@@ -162,7 +163,7 @@ def open_inputs(
     offset = None if inputs.vehicle is None else read_vehicle(inputs.vehicle).antennas.get(antenna)
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
-        reading=options.track, antenna_up_m=0.0 if offset is None else offset.up_m,
+        reading=options.track, antenna_up_m=None if offset is None else offset.up_m,
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,
@@ -201,7 +202,7 @@ def _position(
 ) -> Tally:
     """Position chunk by chunk: counts and rows.
 
-    Five chunks are on their way at a time: one is read, one is screened, one has its single epochs positioned, one is
+    Five chunks are processed at a time: one is read, one is screened, one has its single epochs positioned, one is
     filtered, and the rows of one are written by `beside`.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
@@ -234,7 +235,7 @@ def _screen_chunks(
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
 ) -> Iterator[Chunk]:
-    """Yield the screened ranges of chunks, each with what sensors and base station measured up to its end."""
+    """Yield the screened ranges of chunks, each with samples of sensors and base station up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
@@ -341,12 +342,12 @@ def collect_notes(
     return tuple(dict.fromkeys(notes))
 
 
-#: Differences of other time scales from GPS time, which tags have by mistake [s].
+#: Differences of other time scales from GPS time, for tags in a wrong scale [s].
 _SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
 
 
 def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
-    """Return what a sign of all satellites tells, the beginning of a sentence."""
+    """Return the meaning of a common sign of all satellites, the beginning of a sentence."""
     if sign == "left_map":
         return "the 3-D positions have left the map (column interference_causes)"
     if sign == "contradicted":
@@ -362,7 +363,7 @@ def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     return f"the time tags are {size} {which}, so that no position has a level ({guess}?)"
 
 
-#: Errors of time tags that differ by more are no constant [s].
+#: Errors of time tags that differ by more are not constant [s].
 _STEADY_S: Final = 0.5
 
 
@@ -396,7 +397,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
         return
     used = sum(antenna.used for antenna in tally.antennas.values())
     excluded = sum(antenna.first_reason["fault_excluded"] for antenna in tally.antennas.values())
-    # Noise alone is excluded at the rate of false alarms; what is over that stands against the prior.
+    # Noise alone is excluded at the rate of false alarms; a larger rate contradicts the prior.
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     faults = excluded - config.raim.false_alarm * observed
     prior = risk.local_prior + max(risk.satellite_prior.values())

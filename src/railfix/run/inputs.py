@@ -24,7 +24,7 @@ from railfix.track.frames import MapMotion
 from railfix.track.route import MapReading
 from railfix.track.vehicle import Reference
 
-#: In place of a file: the heights of the log's own positions.
+#: Word for the heights of the log's own positions.
 OF_LOG = Path("log")
 Antenna = Literal["front", "rear"]
 
@@ -36,7 +36,8 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
 
 #: Texts of options that several commands have.
 NAVIGATION: Final = (
-    "Navigation file, RINEX or a receiver's log; repeat it for several. Without it a receiver's log serves by its own "
+    "Navigation file, RINEX or a receiver's log; repeat it for several. Without it a receiver's log is used with its "
+    "own "
     "ephemerides."
 )
 TRACK: Final = (
@@ -44,14 +45,17 @@ TRACK: Final = (
     "found from the log."
 )
 VEHICLE: Final = (
-    "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is taken as the antenna's own "
-    "path."
+    "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is assumed to be the antenna's "
+    "own path."
 )
 BALISE_LIST: Final = (
-    "Places of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts from "
+    "Positions of the balises: CSV with balise, chainage_m and, where there are such, track (chainage_m then counts "
+    "from "
     "the beginning of that track) and sigma_m."
 )
-VIRTUAL_BALISES: Final = "Places whose passing is reported with its interval: a list as of --balise-list. Needs levels."
+VIRTUAL_BALISES: Final = (
+    "Points whose passing is reported with its interval: a list like that of --balise-list. Needs levels."
+)
 
 
 class InputFiles(Settings):
@@ -91,7 +95,7 @@ class InputFiles(Settings):
             _check_file(f"--set {name}" if name == "integrity_support" else f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Hash every file beside other work."""
+        """Hash every file in parallel to other work."""
         return [
             pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
         ]
@@ -125,9 +129,10 @@ class RunInputs(InputFiles):
         (),
         metavar="OBS",
     )
-    sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used in place of the broadcast ones.", ())
+    sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used instead of the broadcast ones.", ())
     heights: Path | None = input_option(
-        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or kilometrage_m, "
+        "Heights for a map without heights: a raster (GeoTIFF, ESRI ASCII grid, SRTM), CSV by chainage_m or "
+        "kilometrage_m, "
         "positions of a run, or the word log for those of the log itself.",
         None,
     )
@@ -164,7 +169,7 @@ class RunInputs(InputFiles):
     @model_validator(mode="before")
     @classmethod
     def _with_mate(cls, values: Any) -> Any:
-        """Return the inputs that a folder of tables gives, beside those that are given themselves."""
+        """Return the inputs of a folder of tables, with explicitly given ones added."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
@@ -186,7 +191,7 @@ class RunInputs(InputFiles):
         return inputs, config
 
     def with_settings(self, config: Config) -> Self:
-        """Return the same with the files that settings name."""
+        """Return the inputs with the files that settings name."""
         models = {name: getattr(config, name) for name in ("cn0_curve", "error_model", "integrity_support")}
         return self.replaced(**models, sbas=() if config.sbas == "stream" else config.sbas)
 
@@ -264,7 +269,7 @@ LAST_YEAR: Final = 2261
 
 
 class TrackReading(Settings):
-    """How to read the track, and which point of the vehicle the chainage is that of."""
+    """Options for reading the track, and the point of the vehicle to which the chainage refers."""
 
     crs: str | None = option("CRS of the track where its file does not name one.", None, metavar="EPSG")
     height_datum: str | None = option("Heights of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
@@ -274,14 +279,14 @@ class TrackReading(Settings):
         metavar="MODEL",
     )
     plan_sigma: float | None = option(
-        "Standard deviation of the track in plan, in place of its own (OpenStreetMap: 2 m where the file states none).",
+        "Standard deviation of the track in plan, instead of its own (OpenStreetMap: 2 m where the file states none).",
         None,
         metavar="M",
         gt=0,
         le=1000.0,
     )
     height_sigma: float | None = option(
-        "Standard deviation of the track's heights, in place of its own; of a raster needed.",
+        "Standard deviation of the track's heights, instead of its own; required for a raster.",
         None,
         metavar="M",
         gt=0,
@@ -304,12 +309,12 @@ class TrackReading(Settings):
 
     @property
     def of_map(self) -> MapReading:
-        """What the readers of maps take."""
+        """Keyword arguments of the map readers."""
         return MapReading(crs=self.crs, height_datum=self.height_datum, geoid=self.geoid, sigma_plan_m=self.plan_sigma)
 
     @property
     def motion(self) -> MapMotion:
-        """What moves the track to the frame of the satellites."""
+        """Transformation of the track to the frame of the satellites."""
         return {"epoch": self.map_epoch, "plate": self.plate, "parameters": self.jgd_parameters}
 
     cache: Literal["use", "skip"] = option(
@@ -326,7 +331,7 @@ class LogReading(Settings):
         metavar="TIME",
     )
     broken_lines: BrokenLines = option(
-        "Skip and count what is broken in the input files, instead of stopping. What loses nothing is read without it: "
+        "Skip and count broken parts of the input files, instead of stopping. What loses nothing is read without it: "
         "comments, further headers, doubled and exchanged epochs, a cut last record.",
         "stop",
         name="--lenient",
@@ -355,7 +360,7 @@ class LogReading(Settings):
 
 
 class ColumnNames(Settings):
-    """How to read logs of positions: names of columns in tables, and what `LogReading` has."""
+    """Options for reading logs of positions: names of columns in tables, and the fields of `LogReading`."""
 
     column: tuple[str, ...] = option(
         "Column of CSV positions under another name, such as time_utc=Timestamp; may be repeated. Names: time_gpst, "
@@ -398,7 +403,7 @@ class RunOptions(Settings):
         "Epochs in memory at a time; the results do not depend on it.", 4000, name="--chunk", metavar="EPOCHS", ge=1
     )
     smooth: Literal["off", "on"] = option(
-        "Also smooth the filter along the track: places by everything measured before and after, in columns of train.*",
+        "Also smooth the filter along the track: positions by all measurements before and after, in columns of train.*",
         "off",
         name="--smooth",
     )

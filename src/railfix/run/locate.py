@@ -123,7 +123,7 @@ _CHUNK_EPOCHS: Final = 3000
 #: Epochs that are tried, and how near the line a position is on it, in plan [m].
 _EPOCHS: Final = 5
 _ON_LINE_M: Final = 150.0
-#: Positions so far above or below the line have another cause than errors of ranges [m].
+#: Positions this far above or below the line have another cause than range errors [m].
 _HEIGHT_M: Final = 30.0
 #: Seconds between GPS time and UTC since 2017; BeiDou time is 14 s behind GPS time.
 _LEAP_S: Final = 18
@@ -134,7 +134,7 @@ _FEET: Final = 0.3048
 
 
 def likely_cause(observations: Observations, received: Received, config: Config, line: Trajectory) -> str:
-    """Return why the positions of a log may lie off the line, in a clause; "" where nothing was found.
+    """Return why the positions of a log may lie off the line, in a clause; "" if no cause was found.
 
     Conventional positions of some epochs are compared with the line: in height, and with the time tags shifted by leap
     seconds and by whole hours.
@@ -265,7 +265,7 @@ def survey_files(
 
 
 def _check_together(runs: Sequence[SurveyRun]) -> None:
-    """Raise MismatchError where a run is of another place than the first."""
+    """Raise MismatchError where a run is at another location than the first."""
     places: list[Floats] = [np.nanmedian(run.ecef_m, axis=0) for run in runs]
     for run, place in zip(runs, places, strict=True):
         distance = float(np.linalg.norm(place - places[0]))
@@ -277,19 +277,19 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
             )
 
 
-#: Columns of ``train.parquet`` with what a run has measured of the line, and the unit of the second and third.
+#: Columns of ``train.parquet`` with measured properties of the line, and the unit of the second and third.
 _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
-#: A change counts when it is so many times its standard deviation, from so many values on either side.
+#: A change counts when it is this multiple of its standard deviation, from this many values on either side.
 _SIGMAS: Final = 5.0
 _LEAST_VALUES: Final = 3
-#: Rounds in which the window about a change moves to its middle.
+#: Iterations that centre the window on a change.
 _CENTRED: Final = 5
-#: A slip is in the gradient for a while before it is found: what is so near to one is left out.
+#: A slip affects the gradient for some time before it is detected: values this near to one are left out.
 _BEFORE_SLIP: Final = np.timedelta64(1500, "ms")
 
 
 def read_measured(folder: Path) -> pl.DataFrame:
-    """Read what a run has measured of its line, by chainage; of two antennas the rows of the first.
+    """Read the measured properties of the line from a run, by chainage; of two antennas the rows of the first.
 
     InputFileError: the folder has no results of a filter, or these none by wheel and inertial unit.
     """
@@ -314,12 +314,12 @@ class MeasuredFeature:
     """A feature that runs show together."""
 
     feature: Feature  #: Its `arc_m` is a chainage.
-    places_m: Floats  #: Its chainage by each of the runs that show it alone, shape (R,).
+    places_m: Floats  #: Its chainage by each of the runs that detect it alone, shape (R,).
     map_m: float  #: Chainage of the same feature of the map; NaN where the map has none.
 
 
 def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
-    """Return the features that all runs (`read_measured`) together show, in order; `of_map`: those of the map."""
+    """Return the features that all runs (`read_measured`) together show, in order; `of_map`: features of the map."""
     alone = [_features(run) for run in runs]
     found = []
     for feature in _features(pl.concat(runs).sort(_COLUMNS[0])):
@@ -330,7 +330,7 @@ def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) 
 
 
 def _nearest(feature: Feature, others: Sequence[Feature]) -> float:
-    """Place of the nearest one of the same kind and direction; NaN where there is none near."""
+    """Position of the nearest one of the same kind and direction; NaN where none is near."""
     alike = [f.arc_m for f in others if f.quantity == feature.quantity and f.change * feature.change > 0.0]
     near = [at for at in alike if abs(at - feature.arc_m) < 2.0 * BASE_M]
     return min(near, key=lambda at: abs(at - feature.arc_m), default=float("nan"))
@@ -358,7 +358,9 @@ def _features(rows: pl.DataFrame) -> list[Feature]:
 
 
 def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
-    """Return features at the middle of their change: that of a transition curve is flat, and noise chooses on it."""
+    """Return features at the middle of their change: the change of a transition curve is flat, and noise would choose a
+    point on it.
+    """
     lag = max(round(BASE_M / STEP_M), 1)
     found = []
     for feature in features:

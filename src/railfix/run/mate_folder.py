@@ -30,6 +30,6 @@ def find_inputs(folder: Path) -> dict[str, Any]:
     for name, needed in (("front", "S_GNSS_SAT"), ("track", "S_DM_TRACK_SEGMENT_POSITION or S_DM_TRACKPOINT")):
         if name not in given:
             raise InputFileError(folder, f"has no table {needed} (.parquet or .csv) of EGNSS MATE; add it")
-    if not {"balises", "balise_list"} <= given.keys():  # one does not serve without the other
+    if not {"balises", "balise_list"} <= given.keys():  # the files are only usable together
         given = {name: path for name, path in given.items() if not name.startswith("balise")}
     return given

@@ -1,6 +1,7 @@
-"""Outputs of all commands: written under temporary names, moved in place when complete, never over an input.
+"""Outputs of all commands: written under temporary names, moved into the output folder when complete, never over an
+input.
 
-Staging folders are hidden, and held by a lock. A process that is killed leaves its staging folder behind; the
+Staging folders are hidden, and locked. A process that is killed leaves its staging folder behind; the
 operating system releases the lock at the same moment, which distinguishes a leftover from the folder of a living run.
 """
 
@@ -36,9 +37,7 @@ READY: Final = "ready"
 
 @dataclass(frozen=True, kw_only=True)
 class Staging:
-    """A hidden folder inside a results folder, and the open, locked file that holds it, with the number of the
-    process.
-    """
+    """A hidden folder inside a results folder, and its open, locked file with the number of the process."""
 
     path: Path
     lock: IO[str]
@@ -77,7 +76,7 @@ def make_staging(folder: Path) -> Staging:
 
 
 def clean_up(folder: Path) -> None:
-    """Remove what killed processes left in a folder; finish what they had only to move in place.
+    """Remove the staging folders of killed processes; finish those that only had to be moved.
 
     OutputError: a living process is writing to the folder.
     """
@@ -111,9 +110,9 @@ def _release(lock: Path) -> None:
 
 
 def move_in_place(ready: Path, folder: Path) -> dict[str, Path]:
-    """Move all files of a folder into another one, records (JSON) last, and return where each stands.
+    """Move all files of a folder into another one, records (JSON) last, and return their paths.
 
-    A record that is replaced is removed first, so that it never stands beside the tables of another run.
+    A record that is replaced is removed first, so that it is never in one folder with the tables of another run.
     """
     files = sorted(ready.iterdir(), key=lambda path: (path.suffix == ".json", path.name))
     for source in files:
@@ -124,7 +123,7 @@ def move_in_place(ready: Path, folder: Path) -> dict[str, Path]:
 
 
 def _try_lock(file: IO[str]) -> bool:
-    """Lock a file for this process; False where another one holds it."""
+    """Lock a file for this process; false where another process has locked it."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -141,7 +140,7 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-#: Rows of a group of a file, which is put together in memory.
+#: Rows of a group of a file, which is combined in memory.
 _GROUP: Final = 30_000
 #: How often a caller that waits looks whether the writer has failed [s].
 _LOOK_S: Final = 0.1
@@ -163,7 +162,7 @@ class ParquetFile:
         self._thread.start()
 
     def append(self, table: pl.DataFrame) -> None:
-        """Append rows; raises what the writing of earlier ones has raised."""
+        """Append rows; raises errors of writing earlier ones."""
         from polars.exceptions import SchemaError
 
         if table.schema != self._schema:
@@ -171,7 +170,7 @@ class ParquetFile:
         self._give(table)
 
     def end(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write the footer, with `metadata`; raises what writing has raised."""
+        """Write the footer, with `metadata`; raises errors of writing."""
         self._metadata = dict(metadata or {})
         self._give(None)
         self._thread.join()
@@ -195,17 +194,17 @@ class ParquetFile:
 
         try:
             rows = register_io_source(tables, schema=self._schema)
-            # The metadata is asked for last, with the footer.
+            # The metadata is requested last, with the footer.
             rows.sink_parquet(self._path, row_group_size=_GROUP, metadata=lambda _: self._metadata)
         except BaseException as error:  # noqa: BLE001  raised again where rows are given
             self._error = error
 
 
-#: What becomes of files that are already there.
+#: Treatment of existing files.
 Overwrite = Literal["refuse", "replace"]
-#: What a single file is, for `check_output_file`.
+#: Kind of a single file, for `check_output_file`.
 FileKind = Literal["page", "csv", "pos", "picture", "png", "map", "any"]
-#: Of each kind what it is, how its name ends, and how to come by another form.
+#: For each kind: description, ending of the name, and how to obtain other forms.
 _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "page": ("an HTML page", (".html", ".htm"), "; for a PDF file, print the page in a browser"),
     "csv": ("a table in CSV", (".csv",), ""),
@@ -226,10 +225,10 @@ _ATTEMPTS: Final = 10
 class OutputFolder:
     """A folder that receives all files of a command at once, or none; made where it does not exist.
 
-    Used as a context manager. Inside it, files are written to a hidden staging folder; `commit` moves them in place.
-    Leaving without `commit` (an error) removes what was written, and the folder itself where it had not been there
-    before. What a killed process left behind is cleaned up by the next `OutputFolder` there. With "replace" a folder
-    may have files, those of the same names are replaced at the end; `inputs` are never overwritten.
+    Used as a context manager. Inside it, files are written to a hidden staging folder; `commit` moves them to their
+    folder. Leaving without `commit` (an error) removes the written files, and the folder itself if it is new. The next
+    `OutputFolder` there removes the remains of a killed process. With "replace" a folder may have files; files of the
+    same names are replaced at the end; `inputs` are never overwritten.
 
     OutputError: the folder cannot be made or written, is not empty, is being written by another process, or a file
     would overwrite an input.
@@ -294,7 +293,7 @@ class OutputFolder:
         return self._staging.path
 
     def stage(self, name: str) -> Path:
-        """Return the temporary path at which to write one file; `commit` moves it in place.
+        """Return the temporary path at which to write one file; `commit` moves it to its path.
 
         OutputError: the file would overwrite an input, or a folder of that name is there.
         """
@@ -315,7 +314,7 @@ class OutputFolder:
             table.write_csv(self._csv[name], include_header=first, datetime_format=CSV_TIME)
 
     def append_parquet(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a Parquet file; they are written while the caller goes on (`ParquetFile`)."""
+        """Append rows to a Parquet file; they are written while the caller continues (`ParquetFile`)."""
         with _writing(self.path / name):
             if name not in self._parquet:
                 self._parquet[name] = ParquetFile(self.stage(name), table.schema)
@@ -358,7 +357,7 @@ class OutputFolder:
             self.stage(name).write_text(text + "\n", encoding="utf-8")
 
     def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
-        """Move every file in place; return where each stands, by its name.
+        """Move every file to its folder; return the paths by name.
 
         `metadata` is written into the footer of each Parquet file that has not ended.
         """
@@ -371,7 +370,7 @@ class OutputFolder:
             ready.mkdir()
             for name in self._staged:
                 self.stage(name).replace(ready / name)
-            # From this rename on, a killed process has finished: the next one moves the files in place.
+            # From this rename on, a killed process has finished: the next one moves the files to their folder.
             return move_in_place(ready.replace(staging / READY), self.path)
 
 
@@ -399,7 +398,8 @@ def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
     """Raise OutputError where a single file of a kind cannot or must not be written.
 
-    Its folder is not there or cannot be written, it exists, is one of `inputs`, or its name ends as another kind does.
+    Its folder does not exist or is not writable, it exists, is one of `inputs`, or its name has the ending of another
+    kind.
     """
     with _writing(target):
         check_not_input(target, inputs)

@@ -2,7 +2,7 @@
 
 Reading a line of 2000 km and computing the paths of two antennas takes seconds, and gives the same for the same files,
 settings and version of railfix: lines of some length are kept in the user's cache folder, which can be deleted at any
-time. It is that of the platform (``~/.cache/railfix`` on Linux), or the one that `VARIABLE` names.
+time. It is that of the platform (``~/.cache/railfix`` on Linux), or the one named by `VARIABLE`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LEAST_POINTS: Final = 2_000
 MOST_ENTRIES: Final = 48
 #: Computed from the points of a trajectory, and kept with them.
 _DERIVED: Final = ("up", "across")
-#: What reading a damaged file can raise.
+#: Errors of reading a damaged file.
 _DAMAGE: Final = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
@@ -51,14 +51,14 @@ def cache_folder() -> Path:
 
 
 class PreparedLines:
-    """Prepared lines of one command; `notes` say what was damaged and could not be written."""
+    """Prepared lines of one command; `notes` report damaged files and files that could not be written."""
 
     def __init__(self, *, use: bool = True) -> None:
         self.notes: list[str] = []
         self._folder = cache_folder() if use else None
 
     def track(self, key: str) -> Track | None:
-        """Return the track that was kept under a key; None where there is none."""
+        """Return the track that was kept under a key; None without one."""
         found = self._load(key)
         if found is None:
             return None
@@ -75,7 +75,7 @@ class PreparedLines:
             self._keep(key, {**plain, "provenance": asdict(track.provenance)}, arrays)
 
     def path(self, key: str) -> Trajectory | None:
-        """Return the trajectory that was kept under a key; None where there is none."""
+        """Return the trajectory that was kept under a key; None without one."""
         found = self._load(key)
         if found is None:
             return None
@@ -125,7 +125,7 @@ class PreparedLines:
 
 
 def compute_key(kind: str, *parts: object) -> str:
-    """Return the key of what is made of `parts`: files by their content, arrays, and anything else as text."""
+    """Return the key of an object made from `parts`: files by their content, arrays, and other values as text."""
     digest = hashlib.sha256(f"{kind} {__version__} {_code()}".encode())
     for part in parts:
         if isinstance(part, Path):

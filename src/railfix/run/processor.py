@@ -54,10 +54,10 @@ def make_processor(
 ) -> EpochProcessor:
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
-    `track` is the line itself, for places by its features; `units` are the surveyed stations of two-way ranges,
-    `balises` the places of those that the train reads. `base_ecef_m`: position of a base station; "stream": that of the
-    headers of its observations. InputFileError: a file that the settings name is not what it should be. SettingsError:
-    SBAS and precise ephemerides together, or no SBAS message of the GEO asked for.
+    `track` is the line itself, for positions by its features; `units` are the surveyed stations of two-way ranges,
+    `balises` the positions of those that the train reads. `base_ecef_m`: position of a base station; "stream": the
+    position in the headers of its observations. InputFileError: a file named by the settings is not as expected.
+    SettingsError: SBAS and precise ephemerides together, or no SBAS message of the requested GEO.
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
@@ -81,7 +81,7 @@ def make_processor(
     )
 
 
-#: Time tags of the base station up to this after those of the train are of the same instant.
+#: Time tags of the base station up to this after those of the train count as the same instant.
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 
@@ -103,7 +103,7 @@ class BaseLog:
         self._parts = log.parts()
         self._waiting = next(self._parts, None)
         if self._waiting is None:
-            raise InputFileError(log.paths[0], "has no epoch in the time asked for")
+            raise InputFileError(log.paths[0], "has no epoch in the requested time")
         header = self._waiting.header
         self.span = self._waiting.time[0], self._waiting.time[-1]  #: Times of the epochs read so far.
         self.ecef_m = header.approximate_ecef_m if place is None else parse_position(place, "--base-place")

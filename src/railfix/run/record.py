@@ -41,10 +41,10 @@ NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_leve
 
 
 def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
-    """Return percentiles of each antenna from the rows written [m]; None in place of what the run has not.
+    """Return percentiles of each antenna from the rows written [m]; None replaces what the run does not have.
 
-    Of sigma along the line; of protection levels, the finite ones, with epochs by status; of the filter, with epochs by
-    status, and its levels with the numbers of those within `WITHIN_M`.
+    Statistics of sigma along the line; of finite protection levels, with epochs by status; of the filter, with epochs
+    by status, and its levels with the numbers of those within `WITHIN_M`.
     """
     return {
         name: {
@@ -100,19 +100,19 @@ def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:
 
 
 def _figures(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str, Any]:
-    """Return figures of many rows of one column."""
+    """Return statistics of many rows of one column."""
     return rows.select(**figures).collect().row(0, named=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunProvenance:
-    """What a run was made from."""
+    """Inputs of a run."""
 
     files: Sequence[Mapping[str, Any]]  #: Inputs with size and hash.
     packages: Mapping[str, str]  #: `package_versions`.
     asked: Mapping[str, Any]  #: Settings as given.
     config: Config  #: Settings that were in force.
-    options: RunOptions  #: Choices that are no settings of the positions.
+    options: RunOptions  #: Options that are not settings of the positions.
     line: Mapping[str, Any]  #: Facts of the track map, the vehicle and the trajectories.
     navigation: Navigation
 
@@ -124,7 +124,7 @@ def run_record(
     figures: Mapping[str, Mapping[str, Any]],
     wall_s: float,
 ) -> dict[str, Any]:
-    """Return the content of ``run.json`` as plain values; `figures` are those of `compute_figures`."""
+    """Return the content of ``run.json`` as plain values; `figures` are the result of `compute_figures`."""
     navigation, config = made_from.navigation, made_from.config
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
@@ -241,7 +241,7 @@ class RunRecord:
                 )
 
     def input_paths(self, kind: str) -> list[Path]:
-        """Return where the files of one kind of input are now, in order; see `railfix.run.inputs.input_path`."""
+        """Return the present paths of one kind of input, in order; see `railfix.run.inputs.input_path`."""
         return [input_path(entry, self.path) for entry in self.entries if entry["input"] == kind]
 
     @property
@@ -259,13 +259,13 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read the record of a run from its folder; InputFileError: there is none, or it is not one."""
+    """Read the record of a run from its folder; InputFileError: the file does not exist, or is not a record."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
         raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; name that")
     path = folder / "run.json"
     if not path.is_file():
-        raise InputFileError(path, "there is no such file; railfix run writes it beside the positions")
+        raise InputFileError(path, "there is no such file; railfix run writes it with the positions")
     return RunRecord(path=folder, record=read_json_object(path, what="the record of a run"))
 
 
@@ -284,7 +284,7 @@ _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
 def level_basis(record: Facts) -> str:
-    """Return what the levels of a run are called: their priors are measured, or assumed."""
+    """Return the term for the levels of a run: their priors are measured, or assumed."""
     risk = (record.get("settings_used") or {}).get("risk") or {}
     return "protection" if risk.get("priors") == "measured" else "indicative protection"
 
@@ -292,10 +292,10 @@ def level_basis(record: Facts) -> str:
 def budget_tables(antennas: Mapping[str, Facts], basis: str) -> list[Table]:
     """Return the filter by status, where it is on, single epochs by status, and pseudoranges by reason.
 
-    `antennas` are those of ``run.json``; what a record of an earlier version lacks is shown as a dash.
+    `antennas` are those of ``run.json``; fields that a record of an earlier version lacks are shown as a dash.
     """
     filtered = {name: facts["filter"] for name, facts in antennas.items() if facts.get("filter")}
-    caption = "Each epoch by itself (positions.csv)" if filtered else "Epochs by status"
+    caption = "Single epochs (positions.csv)" if filtered else "Epochs by status"
     tables = [_filter_table(filtered)] if filtered else []
     return [*tables, _epochs_table(antennas, basis, caption), _ranges_table(antennas)]
 
@@ -385,7 +385,7 @@ def _ratio(part: float, whole: float) -> float | None:
 
 
 def _metres(what: str, found: Sequence[Facts | None], fields: Mapping[str, str]) -> Iterator[list[str]]:
-    """Yield a row for each field of what was found of the antennas, None where nothing was."""
+    """Yield a row for each field of the antennas' figures, None where missing."""
     for label, field in fields.items():
         yield [f"{what}, {label}", *(number(None if each is None else each[field], 2, " m") for each in found)]
 

@@ -1,4 +1,4 @@
-"""Route of a log through a network of tracks, found from the log itself, and the tracks beside it as hypotheses.
+"""Route of a log through a network of tracks, found from the log itself, with neighbouring tracks as hypotheses.
 
 Conventional positions once a second are matched to the network (`railfix.track.network_match`); the most probable
 sequence of tracks is the route on which positions are computed, and every other track keeps its probability.
@@ -7,7 +7,7 @@ sequence of tracks is the route on which positions are computed, and every other
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -28,30 +28,37 @@ from railfix.pipeline.received import known_from_start
 from railfix.run.inputs import TrackReading
 from railfix.track import Track
 from railfix.track.frames import in_map_frame
-from railfix.track.network import Network
+from railfix.track.network import UNMAPPED_PRIOR, Network
 from railfix.track.network_match import Matched, PlanLog, match, plan_log
 from railfix.track.network_route import find_route
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
-#: Tracks of the route this near count for a place on it [m], and how far lengths in plan and of the line differ.
+#: Tracks of the route within this distance are candidates for a position on it [m]; difference between lengths in plan
+#: and along the line.
 _REACH_M: Final = 50.0
 _LENGTHS_DIFFER: Final = 1e-3
-#: Least probability of a track beside the route that is written and named.
+#: Least probability of another track than the route's at which it is written and named.
 _LEAST_WRITTEN: Final = 1e-4
 _LEAST_NAMED: Final = 0.01
 #: Alternatives named in the notes; all are in ``run.json``.
 _NAMED: Final = 8
 #: Epochs of an alternative nearer than this belong together [s].
 _TOGETHER_S: Final = 60.0
+#: Probability of a track that the map lacks beyond which the log speaks for one: twice what it has before the log.
+_UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
 #: Name of a track that the map does not have.
 NONE: Final = "none"
 
-#: Columns that positions on a network have besides.
+#: Additional columns of positions on a network.
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
-    "track": "track of the network on which the position lies, of the route found from the log",
+    "track": "track of the network on which the position lies, part of the route found from the log",
     "track_chainage_m": "distance in plan along that track from its first point, of the antenna",
-    "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the tracks beside it",
+    "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the alternatives",
+    "unmapped_probability": "probability of a track that the map lacks, given the whole log",
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map, at the nearest second, from that "
+    "track; positive right of it",
+    "unconstrained_up_m": "height of that position above the track, less the antenna's where the vehicle is known",
 }
 #: Columns of the table of tracks near each position.
 TRACK_COLUMNS: Final[dict[str, str]] = {
@@ -62,13 +69,14 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
     "probability": "of this track given the whole log; the rows of an epoch and antenna add up to 1",
     "chainage_m": "distance in plan along the track from its first point, of the nearest point to the position",
     "kilometrage_m": "the line's own marking there, where the map has one",
-    "offset_m": "distance in plan from the position to the track",
+    "offset_m": "distance in plan from the position, which lies on the route, to the track",
+    "unconstrained_offset_m": "offset in plan of the 3-D position without the map from the track; positive right of it",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Alternative:
-    """A stretch of the log on which a track beside the route is possible."""
+    """A stretch of the log on which another track is possible."""
 
     track: str
     instead_of: str
@@ -101,12 +109,12 @@ class RouteOfLog:
     """Route of a log through a network, with the probability of every track near it."""
 
     network: Network
-    tracks: tuple[int, ...]  #: Of the route, in order.
+    tracks: tuple[int, ...]  #: Tracks of the route, in order.
     #: Tracks of the most probable sequence that no route joins to those: the train turned back over them.
     left_out: tuple[int, ...]
     log: PlanLog  #: Positions that were matched, in the frame of the network.
     matched: Matched
-    time: np.datetime64  #: Of the frame's epoch.
+    time: np.datetime64  #: Coordinates at the frame's epoch.
     reading: TrackReading
 
     @cached_property
@@ -117,14 +125,18 @@ class RouteOfLog:
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
         """Return whether the train is, with more than a risk, on another track than where it was placed on the route.
 
-        By the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside another has
-        its own probability. At the positions matched before and after each time: the track between two that are known
-        may be another.
+        A track that the map lacks counts beyond `_UNMAPPED_LIMIT`: up to there it is in the levels (`with_unmapped`).
+        Computed from the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside
+        another has its own probability. At the positions matched before and after each time: the track between two that
+        are known may be another.
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
-        shares = (self._share_at(np.clip(k, 0, last), chainage_m) for k in (np.maximum(after - 1, 0), after))
-        return np.asarray(np.fmin(*shares) < 1.0 - risk)
+        known = (
+            self._share_at(k, chainage_m) + np.minimum(self.unmapped[k], _UNMAPPED_LIMIT)
+            for k in (np.clip(after - 1, 0, last), np.clip(after, 0, last))
+        )
+        return np.asarray(np.fmin(*known) < 1.0 - risk)
 
     def _share_at(self, epoch: Indices, chainage_m: Floats) -> Floats:
         """Probability of the tracks of the route near chainages, at matched positions; of all without a chainage."""
@@ -142,13 +154,26 @@ class RouteOfLog:
         """Probability of a track that the map does not have, shape (n,)."""
         return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
 
+    def with_unmapped(self, config: Config) -> Config:
+        """Return the settings with the probability of a track that the map lacks as the prior of a wrong map.
+
+        It is the largest of the log, at most `_UNMAPPED_LIMIT`: where it is more there is no level.
+        """
+        share = float(np.clip(self.unmapped.max(), 0.0, _UNMAPPED_LIMIT))
+        limits, risk, araim = config.tracking, config.risk, config.araim
+        return config.replaced(
+            tracking=limits.replaced(level_map_prior=max(limits.level_map_prior, share)),
+            risk=risk.replaced(map_prior=max(risk.map_prior, share)),
+            araim=araim.replaced(map_prior=max(araim.map_prior, share)),
+        )
+
     @cached_property
     def _on_route(self) -> Floats:
         return np.isin(self.matched.candidates.track, self.tracks).astype(np.float64)
 
     @cached_property
     def alternatives(self) -> tuple[Alternative, ...]:
-        """Stretches on which a track beside the route has a probability of at least 1 %, the most probable first."""
+        """Stretches on which another track has a probability of at least 1 %, the most probable first."""
         names = (*self.network.names, NONE)
         beside = np.where(self._on_route > 0.0, -1, self.matched.candidates.track)
         found = []
@@ -184,11 +209,11 @@ class RouteOfLog:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The route and what may be instead of it, one sentence each."""
+        """Notes on the route and its alternatives, one sentence each."""
         low = float(self.probability.min())
         first = (
             f"route found from the log: {', '.join(self.names)}; chainage rises in this order; its probability is "
-            f"{self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv has every track near)"
+            f"{self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv has all nearby tracks)"
         )
         if self.left_out:
             beside = ", ".join(self.network.names[k] for k in self.left_out)
@@ -212,7 +237,7 @@ class RouteOfLog:
     def on_tracks(self, table: pl.DataFrame, line: Track) -> tuple[pl.DataFrame, pl.DataFrame]:
         """Return a table of positions with `ON_TRACK_COLUMNS`, and every track near each position (`TRACK_COLUMNS`).
 
-        `line` is the route, whose sections are its tracks. There are no rows of tracks where there is no position.
+        `line` is the route, whose sections are its tracks. Epochs without a position have no rows of tracks.
         """
         chainage = table["chainage_m"].to_numpy()
         ecef = table.select("x_m", "y_m", "z_m").to_numpy()
@@ -231,6 +256,8 @@ class RouteOfLog:
             pl.Series("track", names[number].tolist(), dtype=pl.String),
             pl.Series("track_chainage_m", along, nan_to_null=True),
             pl.Series("track_probability", share, nan_to_null=True),
+            pl.Series("unmapped_probability", np.where(known, self.unmapped[epoch], np.nan), nan_to_null=True),
+            *self._unconstrained(epoch, number),
         )
         candidates, probability = self.matched.candidates.track[epoch], self.matched.probabilities[epoch]
         beside = np.where(self._on_route[epoch] > 0.0, -1, candidates)
@@ -251,10 +278,27 @@ class RouteOfLog:
                 pl.Series("chainage_m", at, nan_to_null=True),
                 pl.Series("kilometrage_m", self.network.kilometrage_on(track, at), nan_to_null=True),
                 pl.Series("offset_m", offset, nan_to_null=True),
+                self._unconstrained(epoch[row], track)[0],
             )
         )
         order = np.lexsort((-long["probability"].to_numpy(), row))
         return positions, long[order]
+
+    def _unconstrained(self, epoch: Indices, track: Indices) -> tuple[pl.Series, pl.Series]:
+        """Return offset and height of matched positions from tracks near them, shape (n,); null without one."""
+        near = self.matched.candidates
+        same = (near.track[epoch] == track[:, None]) & (track >= 0)[:, None]
+        column = same.argmax(axis=1)
+        offset, up = (np.full(len(track), np.nan) for _ in range(2))
+        rows = np.flatnonzero(same.any(axis=1))
+        offset[rows] = near.offset_m[epoch[rows], column[rows]]
+        _, _, height = self.network.course_on(track[rows], near.chainage_m[epoch[rows], column[rows]])
+        if self.log.height_m is not None:
+            up[rows] = self.log.height_m[epoch[rows]] - height - (self.log.antenna_up_m or 0.0)
+        return (
+            pl.Series("unconstrained_offset_m", offset, nan_to_null=True),
+            pl.Series("unconstrained_up_m", up, nan_to_null=True),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,9 +309,9 @@ class LogPositions:
     parts: Callable[[], Iterable[Observations]]  #: The pieces of the log in order of time.
     navigation: Navigation
     config: Config
-    time: np.datetime64 | None  #: Of the epoch of frames; None without a navigation record.
+    time: np.datetime64 | None  #: Epoch of frames; None without a navigation record.
     reading: TrackReading
-    antenna_up_m: float = 0.0  #: Height of the antenna above the rails, where the vehicle is known [m].
+    antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
 
     @cached_property
     def positions(self) -> PositionLog:
@@ -288,22 +332,18 @@ class LogPositions:
         )  # fmt: skip
 
     def route(self, network: Network) -> RouteOfLog:
-        """Find the route of the log through a network; MismatchError where there is none, or no position."""
+        """Find the route of the log through a network; MismatchError where there is no route, or no position."""
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
         own = self.positions
-        of_antenna = plan_log(self.path, own.time, own.ecef_m, own.sigma_m)
-        on_rails = replace(of_antenna, height_m=np.asarray(of_antenna.height_m) - self.antenna_up_m)
-        positions, _ = on_rails.transform_to(network, **self.reading.motion)
+        of_antenna = plan_log(self.path, own.time, own.ecef_m, own.sigma_m, antenna_up_m=self.antenna_up_m)
+        positions, _ = of_antenna.transform_to(network, **self.reading.motion)
         matched = match(network, positions)
         used = np.flatnonzero(np.isfinite(matched.probability))
         positions, matched = positions.take(used), matched.take(used)
         tracks, left_out = find_route(network, matched)
         if not tracks:
-            raise MismatchError(
-                f"{self.path}: no position lies near a track of the network; is it the map of this region, and its CRS "
-                "right?"
-            )
+            raise MismatchError(f"{self.path}: no position lies on a track of the network{_beside(network, matched)}")
         return RouteOfLog(
             network=network,
             tracks=tuple(tracks),
@@ -313,3 +353,15 @@ class LogPositions:
             time=self.time,
             reading=self.reading,
         )
+
+
+def _beside(network: Network, matched: Matched) -> str:
+    """Return how the positions lie to the tracks that they are near but not on, the end of a sentence."""
+    track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
+    near = track >= 0
+    if not near.any():
+        return "; is it the map of this region, and its CRS right?"
+    most = int(np.bincount(track[near]).argmax())
+    away = float(np.median(offset[track == most]))
+    side = "right" if away > 0.0 else "left"
+    return f": they lie {abs(away):.1f} m {side} of {network.names[most]}; the map lacks their track, or is displaced"

@@ -22,12 +22,12 @@ from railfix.pipeline.sensor_epochs import SensorLimits, ranging_lever_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Places are averaged over cells of this length [s].
+#: Positions are averaged over cells of this length [s].
 _CELL_S: Final = 4.0
 #: A train that moves, for signs of speeds [m/s].
 _MOVING_MPS: Final = 1.0
-#: Cells that are needed for a statement, and the least root mean square of what is compared: changes of a force [m/s2]
-#: and of a speed [m/s], a rate [rad/s].
+#: Number of cells required for a statement, and the least root mean square of compared quantities: changes of a force
+#: [m/s2] and of a speed [m/s], a rate [rad/s].
 _LEAST_CELLS: Final = 15
 _LEAST_FORCE_MPS2: Final = 0.08
 _LEAST_SPEED_MPS: Final = 1.0
@@ -35,17 +35,17 @@ _LEAST_RATE_RADPS: Final = 0.003
 #: A slope of measured over expected values below this is a reversed sign, above that a rate in degrees.
 _REVERSED: Final = -0.3
 _IN_DEGREES: Final = 10.0
-#: Lags that are tried, and the least that is reported [s]; what is left unexplained at no lag is more by this factor.
+#: Lags that are tried, and the least that is reported [s]; the residual without a lag must be larger by this factor.
 _LONGEST_LAG_S: Final = 20.0
 _LEAST_LAG_S: Final = 2.0
 _LESS_ALIKE: Final = 2.0
-#: Share of gravity that a force at rest may differ from it by.
+#: Fraction of gravity by which a force at rest may differ from it.
 _GRAVITY_SHARE: Final = 0.12
 
 
 @dataclass(frozen=True)
 class PositionMotion:
-    """Motion of an antenna by its places, M cells of time; NaN where a neighbour is missing."""
+    """Motion of an antenna by its positions, M cells of time; NaN where a neighbour is missing."""
 
     time: Datetimes  #: Shape (M,).
     #: Toward rising chainage; the gradient is that of the line, as climb over horizontal length, and the heading, too,
@@ -120,7 +120,7 @@ def sign_notes(
 def _of_speeds(
     name: str, time: Datetimes, forward: Floats, speeds: Callable[[Datetimes], Floats], directed: str | None
 ) -> Iterator[str]:
-    """Check the time tags of a sensor of speeds, and its sign; `directed` names what has the sign."""
+    """Check the time tags of a sensor of speeds, and its sign; `directed` names the sensor with a sign."""
     lag = _lag_s(time, np.abs(forward), lambda at: np.abs(speeds(at)), _LEAST_SPEED_MPS)
     if lag:
         yield _late(name, lag, time[0])
@@ -159,7 +159,7 @@ def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
 
 
 def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
-    """Return the means of samples over two cells about instants; NaN where the samples do not reach so far."""
+    """Return the means of samples over two cells about instants; NaN outside the time of the samples."""
     half = timedelta(np.array([_CELL_S]))
     begin, end = middle - half, middle + half
     first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
@@ -169,7 +169,7 @@ def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
 
 
 def _centre(values: Floats) -> Floats:
-    """Return values less their mean: an offset of the unit on the body has no part in what it is compared by."""
+    """Return values less their mean: an offset of the unit on the body has no effect on the comparison."""
     known = np.isfinite(values)
     return values - (values[known].mean() if known.any() else 0.0)
 
@@ -207,29 +207,29 @@ _NEAR_S: Final = 1.5
 #: Scale and lag that are reported.
 _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
-#: No worn wheel differs by so much.
+#: A larger difference is no worn wheel.
 _OTHER_TEETH: Final = 0.1
-#: Ranges are compared with places by satellites that are so near in time [s], from a moving train, to a unit no further
-#: away [m] and seen along the track by this share; so many are needed on a side.
+#: Ranges are compared with satellite positions within this time [s], from a moving train, to a unit within this
+#: distance [m] and seen along the track with at least this cosine; this many are required on each side.
 _BETWEEN_S: Final = 3.0
 _MOVED_M: Final = 1.0
 _FAR_M: Final = 500.0
 _AHEAD: Final = 0.7
 _LEAST_RANGES: Final = 10
-#: Difference between ranges and satellites that is reported: twice what codes are off by for minutes [m].
+#: Difference between ranges and satellites that is reported: twice the error of codes over minutes [m].
 _RANGE_M: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorChecks:
-    """Positions and speeds of one antenna by satellites, to compare the sensors on board with."""
+    """Positions and speeds of one antenna by satellites, for the comparison with the sensors on board."""
 
-    #: By Dopplers (`doppler_speeds`), and of single epochs that passed every check; of each chunk.
+    #: By Dopplers (`doppler_speeds`), and of single epochs that passed every check; per chunk.
     speeds: list[pl.DataFrame] = field(default_factory=list)
     places: list[pl.DataFrame] = field(default_factory=list)
 
     def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
-        """Take the rows of a chunk; two places a second are kept."""
+        """Add the rows of a chunk; two positions per second are kept."""
         passed = positions.filter(pl.col("status") == "ok").select("time_gpst", "chainage_m")
         self.places.append(passed.unique(pl.col("time_gpst").dt.truncate("500ms"), keep="first", maintain_order=True))
         self.speeds.append(doppler_speeds(train))
@@ -262,9 +262,9 @@ class SensorChecks:
 def range_notes(
     ranging: StationRanges, units: GroundUnits, places: pl.DataFrame, trajectory: Trajectory, limits: SensorLimits
 ) -> Iterator[str]:
-    """Yield sentences on ranges that are moved along the track, or too long, against the places by satellites.
+    """Yield sentences on ranges that are displaced along the track, or too long, compared with satellite positions.
 
-    `places` has ``time_gpst`` and ``chainage_m`` of an antenna, `limits` the place of the vehicle's ranging unit.
+    `places` has ``time_gpst`` and ``chainage_m`` of an antenna, `limits` the position of the vehicle's ranging unit.
     """
     of_unit = {str(name): k for k, name in enumerate(units.name)}
     unit = np.array([of_unit.get(str(name), -1) for name in ranging.station], dtype=np.intp)
@@ -289,7 +289,7 @@ def range_notes(
     sides = [longer[(distance < _FAR_M) & (side * ahead > _AHEAD)] for side in (1.0, -1.0)]
     seen = [float(np.median(side)) for side in sides if len(side) >= _LEAST_RANGES]
     if not seen:
-        yield "ranging: too few ranges beside places by satellites; the places of its units are not checked"
+        yield "ranging: too few ranges with satellite positions; the positions of its units are not checked"
         return
     if len(seen) == 2:
         moved, excess = (seen[1] - seen[0]) / 2.0, (seen[1] + seen[0]) / 2.0
@@ -299,8 +299,8 @@ def range_notes(
         fits = limits.range_ahead_m + trajectory.front_sign * moved
         which = "ahead of" if moved > 0 else "behind"
         yield (
-            f"ranging: places by the ranges are {abs(moved):.1f} m {which} those by satellites in rising chainage; "
-            f"sensors.range_ahead_m = {fits:.1f} would fit, or the units' surveyed places are displaced"
+            f"ranging: positions by the ranges are {abs(moved):.1f} m {which} those by satellites in rising chainage; "
+            f"sensors.range_ahead_m = {fits:.1f} would fit, or the units' surveyed positions are displaced"
         )
     if abs(excess) > _RANGE_M:
         which = "long" if excess > 0 else "short"

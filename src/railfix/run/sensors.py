@@ -21,7 +21,7 @@ from railfix.run.convert import sensor_table
 from railfix.track import Track
 from railfix.track.track import section_spans
 
-#: Columns of each table beside ``time_gpst``, as `railfix simulate` writes them; those in brackets may be absent.
+#: Columns of each table besides ``time_gpst``, as `railfix simulate` writes them; those in brackets may be absent.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "tachometer": ("pulse", "[direction]"),
     "inertial": (
@@ -38,7 +38,7 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
 
 #: Class of the samples of each sensor.
 _CLASSES: Final = {name: type(samples) for name, samples in SensorSamples().tables.items()}
-#: Sensors that may have nothing to say for a while, and say so by rows with the time alone.
+#: Sensors that may be silent for some time, which rows with the time alone report.
 _SILENT: Final = ("tachometer", "ranging", "balises")
 #: Tables without a time, and columns of names.
 _TIMELESS: Final = ("ranging_units", "list of balises")
@@ -55,7 +55,7 @@ def read_sensors(
 ) -> SensorSamples:
     """Read the tables of the sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
 
-    InputFileError: a file is no such table, or its times fall.
+    InputFileError: a file is no such table, or its times are not in order.
     """
     paths = {
         "tachometer": tachometer, "inertial": inertial, "radar": radar, "ranging": ranging, "balises": balises
@@ -117,8 +117,8 @@ def read_units(path: Path) -> GroundUnits:
 def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> ListedBalises:
     """Read balises, or virtual ones, along a line: ``balise,chainage_m`` and, where there are such, ``track,sigma_m``.
 
-    A chainage beside the name of a track counts from the beginning of that track; balises of tracks that are not
-    part of the line, or beyond its ends, are left out.
+    With the name of a track, a chainage counts from the beginning of that track; balises of tracks that are not part of
+    the line, or beyond its ends, are left out.
 
     InputFileError: no such table, a name twice, or none on the line.
     """
@@ -158,7 +158,7 @@ def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
 def load_balises(
     readings: Path | str | None, places: Path | None, virtual: Path | None, track: Track, config: Config
 ) -> ListedBalises | None:
-    """Read the places of the balises that the train reads, a table or a stream, and of virtual ones; None without.
+    """Read the positions of the balises that the train reads, a table or a stream, and of virtual ones; None without.
 
     InputFileError: see `read_listed_balises`. SettingsError: readings without a list, or a list without; virtual
     balises without levels of the filter.
@@ -195,7 +195,7 @@ def _names_of_columns(kind: str) -> list[str]:
 
 
 def _column(path: Path, table: pl.DataFrame, name: str) -> NDArray[Any]:
-    """A column of a table of a sensor; 0 in place of an empty whole number, NaN of another or of an absent column."""
+    """A column of a sensor table; an empty whole number is 0, other missing values are NaN."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     if name == "balise":
@@ -263,7 +263,7 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
 
 
 def _numbers(path: Path, column: pl.Series, *, may_be_empty: pl.Series) -> pl.Series:
-    """Return a column as numbers; those of pulses and directions are whole."""
+    """Return a column as numbers; pulses and directions are whole numbers."""
     numbers = column.cast(pl.Int64 if column.name in ("pulse", "direction") else pl.Float64, strict=False)
     wrong = numbers.is_null() & (column.is_not_null() | ~may_be_empty)
     if wrong.any():

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 #: Shortest track of a run [m].
 _SHORTEST_M: Final = 1.0
-#: Track of a run that is not that of its files as they are, in the folder of results.
+#: Track of a run that differs from its files, in the folder of results.
 TRACK_FILE: Final = "track.csv"
 
 
@@ -55,7 +55,7 @@ class OpenedLine:
     frame: FrameShift | None = None
     #: The route through a network of tracks that was found from the log; None where the files are one route.
     route: RouteOfLog | None = None
-    #: Whether the track is that of its files as they are: no route of a network, no heights of a second source, and not
+    #: Whether the track is unchanged from its files: no route of a network, no heights of a second source, and not
     #: moved to another frame.
     from_file: bool = True
     preparing: tuple[str, ...] = ()  #: Notes on the cache of prepared lines.
@@ -120,8 +120,8 @@ def open_line(
 ) -> OpenedLine:
     """Read the track and the vehicle, and compute the path of each antenna.
 
-    With a time `at` the track is moved to the frame of the satellites then (`railfix.track.frames`); without it the
-    coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a network: `log`
+    With a time `at` the track is transformed to the frame of the satellites then (`railfix.track.frames`); without it
+    the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a network: `log`
     gives the route through it, and the heights of a map without where `heights` is `OF_LOG`.
     """
     prepared = PreparedLines(use=reading.cache == "use")
@@ -148,7 +148,7 @@ def open_line(
 
 
 def _check_extent(files: tuple[Path, ...], track: Track) -> None:
-    """Raise MismatchError where no place on Earth has the heights of a track, or it is no line."""
+    """Raise MismatchError where the heights of a track are impossible, or it is no line."""
     if (length := float(track.chainage_m[-1] - track.chainage_m[0])) < _SHORTEST_M:
         raise MismatchError(f"{', '.join(map(str, files))}: is {length:g} m long; give the track of a line")
     low, high = float(np.nanmin(track.height_m)), float(np.nanmax(track.height_m))
@@ -201,7 +201,7 @@ def _paths(
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
-                f"the chainage of {reading.reference} was asked for, which only a vehicle file can give; name one"
+                f"the chainage of {reading.reference} was requested, which needs a vehicle file; name one"
             )
         return None, dict.fromkeys(antennas, Trajectory.from_antenna_path(track))
     body = read_vehicle(vehicle)
@@ -228,7 +228,7 @@ class Log:
     start: datetime | None = None
     end: datetime | None = None
     share: float = 0.0  #: Part of the files that has been read, 0 to 1.
-    problems: list[str] = field(default_factory=list)  #: Sentences on what was broken and passed over.
+    problems: list[str] = field(default_factory=list)  #: Sentences on broken and skipped parts.
     skipped: Counter[str] = field(default_factory=Counter)  #: Skipped items, counted by kind.
 
     def parts(self) -> Generator[Observations]:
@@ -264,10 +264,10 @@ SAME_INSTANT_NS: Final = 20_000_000
 
 
 def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
-    """Yield chunks of observations that cover the same span of time for every antenna seen so far.
+    """Yield chunks of observations that cover the same span of time for every antenna so far.
 
-    Each antenna keeps its own epochs, none where it has none in the span. A chunk ends where the first of the current
-    parts ends; what the others have beyond waits for the next chunk. Epochs that belong together but are tagged a
+    Each antenna keeps its own epochs, possibly none in the span. A chunk ends where the first of the current
+    parts ends; later epochs of the other parts wait for the next chunk. Epochs that belong together but are tagged a
     little apart (`SAME_INSTANT_NS`) stay in one chunk.
     """
     live = dict(logs)
@@ -304,7 +304,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
 
 
 def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """Yield items of which the next one is made by a thread of its own while one is in use."""
+    """Yield items while a separate thread makes the next one."""
     with ThreadPoolExecutor(max_workers=1) as reader:
         coming = reader.submit(next, items, None)
         while (item := coming.result()) is not None:

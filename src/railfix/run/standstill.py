@@ -1,4 +1,4 @@
-"""Codes and carrier phases of an antenna at rest, with those of a base station subtracted where there is one."""
+"""Codes and carrier phases of an antenna at rest, less those of a base station where given."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, standstill_fix
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: Satellites in fewer than this share of the epochs are left out, so that the mean is over the same ones.
+#: Satellites in fewer than this fraction of the epochs are left out, so that the mean is over the same ones.
 _SHARE: Final = 0.9
-#: Residual standard deviation of satellite and atmosphere errors beside a base station [m]; it is at most 10 km away.
+#: Residual standard deviation of satellite and atmospheric errors with a base station [m]; it is at most 10 km away.
 _BESIDE_BASE_M: Final = 0.05
-#: Largest difference of the median places of the thirds of the log [m].
+#: Largest difference of the median positions of the thirds of the log [m].
 _AT_REST_M: Final = 8.0
 #: Change of a double difference from epoch to epoch that is a slip [wavelengths].
 _SLIP: Final = 0.25
-#: Share of the epochs over which a double difference must be unbroken.
+#: Fraction of the epochs over which a double difference must be unbroken.
 _UNBROKEN: Final = 0.5
-#: Bit of the loss-of-lock indicator: a slip since the epoch before; and that half a cycle is unknown.
+#: Bit of the loss-of-lock indicator: a slip since the previous epoch; and that half a cycle is unknown.
 _LOST, _HALF_CYCLE = 1, 2
 
 
@@ -52,7 +52,7 @@ class StandstillCodes:
     phases: StandstillPhases | None = None  #: None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
-        """Return the mean place over some epochs."""
+        """Return the mean position over some epochs."""
         seconds = float((self.time[epochs][-1] - self.time[epochs][0]) / np.timedelta64(1, "s"))
         return standstill_fix(
             self.azimuth_deg,
@@ -74,10 +74,11 @@ def standstill_codes(
     base: tuple[Observations, Floats] | None = None,
     origin_ecef_m: Floats | None = None,
 ) -> StandstillCodes:
-    """Return codes, and beside a base station phases, of an antenna at rest about an origin, by default its mean place.
+    """Return codes, and with a base station phases, of an antenna at rest about an origin, by default its mean
+    position.
 
-    `base` are the observations of a base station and its place, ECEF, shape (3,) [m].
-    MismatchError: the antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
+    `base` are the observations of a base station and its position, ECEF, shape (3,) [m].
+    MismatchError: the antenna moves, its log has no position, or it shares no epoch or satellite with the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
     seen = ranges_without_map(obs, received, config, book)
@@ -85,7 +86,7 @@ def standstill_codes(
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
         raise MismatchError("the log has no positions; are the navigation files of its day?")
-    # thirds of the log, as a train that comes back is at its first place in the end
+    # thirds of the log, as a train that returns is at its first position in the end
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
     level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
     moved = float(np.linalg.norm(level, axis=1).max())
@@ -130,7 +131,9 @@ def standstill_codes(
 
 
 def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
-    """Return observed minus computed codes at a place, the Earth's rotation in transit included; NaN where unused."""
+    """Return observed minus computed codes at a position, with the Earth's rotation during transit; NaN
+    where unused.
+    """
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
     return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)
@@ -161,7 +164,7 @@ class StandstillPhases:
     """Carrier phases of an antenna at rest less those of a base station, T epochs, M satellites."""
 
     difference_m: Floats  #: Less those computed for the origin; NaN where one of the receivers has none; shape (T, M).
-    lost: Masks  #: Whether one of them reports a slip since the epoch before, shape (T, M).
+    lost: Masks  #: Whether one of them reports a slip since the previous epoch, shape (T, M).
     toward: Floats  #: Unit vectors to the satellites, east, north, up; shape (T, M, 3).
     elevation_deg: Floats  #: Shape (T, M).
     wavelength_m: Floats  #: Shape (M,).
@@ -212,7 +215,7 @@ def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
     return slice(int(known[bounds[longest]]), int(known[bounds[longest + 1] - 1]) + 1)
 
 
-#: Log, corrected ranges, place, and the epochs and channels to take of it.
+#: Log, corrected ranges, position, and the epochs and channels to use.
 _Side = tuple[Observations, RangesWithoutMap, Floats, Indices, Indices]
 
 

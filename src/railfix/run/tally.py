@@ -63,7 +63,7 @@ class MapOffsetFound:
     def text(self) -> str:
         """Offset with its likely cause, one clause."""
         across, up = abs(self.across_m) / self.across_sigma_m, abs(self.up_m) / self.up_sigma_m
-        causes = "heights without the geoid, or in another height system" if up > across else "another track beside it"
+        causes = "heights without the geoid, or in another height system" if up > across else "a parallel track"
         side, above = "right" if self.across_m > 0 else "left", "above" if self.up_m > 0 else "below"
         return (
             f"over the minutes before {str(self.time)[:19]} the 3-D positions lie {abs(self.across_m):.1f} m "
@@ -77,7 +77,7 @@ class AntennaTally:
     """Counts of one antenna."""
 
     min_satellites: int = 3  #: Satellites that an epoch needs.
-    judged: dict[str, bool] = field(default_factory=dict)  #: By verdict of a screen, whether it has judged anything.
+    judged: dict[str, bool] = field(default_factory=dict)  #: By verdict of a screen, whether it has checked anything.
     #: Epochs; those with at least one pseudorange; those with coordinates.
     epochs: int = 0
     observed: int = 0
@@ -87,10 +87,10 @@ class AntennaTally:
     used: int = 0
 
     status: Counter[str] = field(default_factory=Counter)
-    status_positioned: Counter[str] = field(default_factory=Counter)  #: Of the epochs with coordinates.
+    status_positioned: Counter[str] = field(default_factory=Counter)  #: Values of the epochs with coordinates.
     #: Epochs with too few satellites by the reason that, in the order of the reasons, left too few, and by a reason
     #: without which alone there would be enough. `not_observed`: too few were observed; `used`: enough were used, but
-    #: their clocks left no range for the place.
+    #: their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
     short_only: Counter[str] = field(default_factory=Counter)
     #: Rejected observations by the first reason that applied, and those that one reason alone rejected.
@@ -154,7 +154,7 @@ class AntennaTally:
             self.without_budget += int(np.count_nonzero(result.protection.level.cause == Cause.BUDGET))
 
     def add_conventional(self, result: AntennaResult) -> None:
-        """Count the valid conventional positions: ranges that contradict each other place an antenna anywhere."""
+        """Count the valid conventional positions: ranges that contradict each other give arbitrary positions."""
         offset = result.conventional_offset_m[result.conventional_status == PointStatus.VALID]
         self.conventional += len(offset)
         if len(offset):
@@ -231,7 +231,7 @@ class AntennaTally:
 
     @property
     def never_recorded(self) -> dict[str, int]:
-        """Satellites seen for which no record was ever usable, with their observations."""
+        """Satellites seen for which no record was usable, with their observations."""
         return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
 
     def as_dict(self) -> dict[str, Any]:
@@ -267,8 +267,8 @@ class Tally:
 
     min_satellites: int = 3  #: Satellites that an epoch needs.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
-    notes: dict[str, None] = field(default_factory=dict)  #: As keys, in the order in which they came.
-    #: First epoch of each chunk, its epochs of all antennas, and the time since the chunk before [s].
+    notes: dict[str, None] = field(default_factory=dict)  #: Used as keys, in the order of arrival.
+    #: First epoch of each chunk, its epochs of all antennas, and the time since the previous chunk [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
     order: AntennaOrder | None = None  #: Test of the order of two antennas.
 
@@ -292,7 +292,7 @@ class Tally:
         return tuple(self.notes) if order is None else (*self.notes, order)
 
     def took(self, times: Iterable[Datetimes], spent_s: float) -> None:
-        """Note how long the positions of one more chunk took: its time tags by antenna, and the time [s]."""
+        """Record the processing time of the positions of one more chunk: its time tags by antenna, and the time [s]."""
         some = [part for part in times if len(part)]
         if some:
             self.chunks.append((min(part[0] for part in some), sum(map(len, some)), spent_s))
@@ -320,14 +320,14 @@ def _count_left_out(
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRows:
-    """What is made of each chunk of results."""
+    """Processing of each chunk of results."""
 
     folder: OutputFolder
     line: OpenedLine
-    observations: bool  #: Whether rows of observations are wanted.
-    checks: SensorChecks | None  #: Takes those of the first antenna, where there are sensors.
-    replays: Mapping[str, Replays]  #: Keeps what the filter was given, by antenna; empty where nothing is smoothed.
-    passings: bool = False  #: Whether rows of balises and virtual ones are wanted.
+    observations: bool  #: Whether rows of observations are requested.
+    checks: SensorChecks | None  #: Collects those of the first antenna, where there are sensors.
+    replays: Mapping[str, Replays]  #: Keeps the filter's input, by antenna; empty where nothing is smoothed.
+    passings: bool = False  #: Whether rows of balises and virtual ones are requested.
     #: Balises so far that were missed, or read where they are not.
     balise_notes: list[str] = field(default_factory=list)
 
@@ -363,13 +363,13 @@ _MOST_NOTES: Final = 20
 
 
 def shorten_notes(notes: list[str]) -> list[str]:
-    """Return the first notes, and how many there are beside."""
+    """Return the first notes, and the number of the others."""
     more = len(notes) - _MOST_NOTES
     return notes if more <= 0 else [*notes[:_MOST_NOTES], f"{more} more notes on balises; see the table of passings"]
 
 
 class Replays:
-    """What the filter was given, chunk by chunk, in a file that ends with the process."""
+    """Input of the filter, chunk by chunk, in a file that is deleted with the process."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run
@@ -384,7 +384,7 @@ class Replays:
         pickle.dump(chunk, self._file, protocol=pickle.HIGHEST_PROTOCOL)
 
     def backward(self) -> Iterator[Replay]:
-        """Yield what was kept, the last first."""
+        """Yield the stored input, the last first."""
         for start in reversed(self._starts):
             self._file.seek(start)
             yield from reversed(pickle.load(self._file))

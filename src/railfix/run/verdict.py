@@ -24,7 +24,7 @@ _PROMISED: Final = ("tracking", "coasting")
 
 @dataclass(frozen=True, kw_only=True)
 class PositionFigures:
-    """Figures of one kind of positions of an antenna; None where there are none."""
+    """Figures of one kind of positions of an antenna; None where none exist."""
 
     epochs: int  #: All epochs for the filter along the track, those with observations for single epochs.
     positions: int  #: Epochs with a position.
@@ -50,7 +50,7 @@ class AntennaVerdict:
 
     @property
     def leading(self) -> PositionFigures:
-        """Return the figures that stand first: those of the filter, or of single epochs without it."""
+        """Return the leading figures: those of the filter, or of single epochs without it."""
         return self.filter or self.single_epochs
 
     @property
@@ -146,7 +146,7 @@ def _describe(antenna: AntennaVerdict) -> str:
 
 
 def _describe_checks(figures: Sequence[PositionFigures]) -> str:
-    """Return how many single epochs passed every check, and what most of the others are."""
+    """Return how many single epochs passed every check, and the most frequent status of the others."""
     passed, epochs = sum(of.passed for of in figures), sum(of.epochs for of in figures)
     failed = _count_statuses(figures)
     del failed[Status.OK.text]

@@ -34,9 +34,9 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 
-#: A train that has moved less stands on the same track [m]: creep of wheels, slack of couplings.
+#: A train that has moved less is on the same track [m]: creep of wheels, slack of couplings.
 _SAME_PLACE_M: Final = 1.0
-#: What the distance moved may be wrong by: share, and constant part [m].
+#: Error of the distance moved: fraction, and constant part [m].
 _ODOMETER_SHARE: Final = 0.05
 _ODOMETER_M: Final = 10.0
 _NOTED_MISFIT: Final = 2.5  #: Distances from the most likely track in standard deviations that are noted.
@@ -44,7 +44,7 @@ _NOTED_MISFIT: Final = 2.5  #: Distances from the most likely track in standard 
 _LEAST_UNMAPPED: Final = 1e-9
 
 
-#: Weights of mapped tracks by name; and probability of one that the map lacks.
+#: Weights of mapped tracks by name; and probability of a track missing from the map.
 TrackPrior = tuple[dict[str, float], float]
 
 
@@ -57,12 +57,12 @@ def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path)
 def prior_of_last_place(
     path: Path, network: Network, *, moved_m: float, missed_move: float, unmapped: float
 ) -> TrackPrior:
-    """Return the prior of tracks from the last place (`write_last_place`) and the distance moved since [m].
+    """Return the prior of tracks from the last position (`write_last_place`) and the distance moved since [m].
 
     `missed_move` is the probability that the train was moved unnoticed, anywhere; `unmapped` the prior of a track that
-    the map lacks, for a train that was moved. InputFileError: the file is not a last place on this network.
+    the map lacks, for a train that was moved. InputFileError: the file is not a last position on this network.
     """
-    record = read_json_object(path, what="the last place of a train")
+    record = read_json_object(path, what="the last position of a train")
     stated = record.get("probability")
     stated = stated if isinstance(stated, dict) else {}
     if not stated or not all(isinstance(v, int | float) and 0.0 <= v <= 1.0 for v in stated.values()):
@@ -72,7 +72,7 @@ def prior_of_last_place(
     missing = [name for name in shares if name not in network.names]
     if missing or abs(sum(shares.values()) + off_map - 1.0) > 1e-6:
         fault = f"track {missing[0]!r} is not in the map" if missing else "its probabilities do not add up to 1"
-        raise InputFileError(path, f"{fault}; give the last place on the tracks of this map")
+        raise InputFileError(path, f"{fault}; give the last position on the tracks of this map")
     weights = dict.fromkeys(network.names, 0.0)
     for name, share in shares.items():
         if share > 0.0:
@@ -87,7 +87,7 @@ def prior_of_last_place(
 
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
-    """Return tracks that a train from anywhere on a track can stand on after a distance, turns included."""
+    """Return tracks that a train from anywhere on a track can have reached after a distance, turns included."""
     ends: nx.Graph[int] = nx.Graph()
     for k, length in enumerate(network.length_m.tolist()):
         ends.add_edge(2 * k, 2 * k + 1, weight=length)
@@ -119,15 +119,15 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     return weights
 
 
-#: Tracks within this of the train are hypotheses [m]; their points within the other are used.
+#: Tracks within this distance of the train are hypotheses [m]; their points within the other distance are used.
 _NEAR_M: Final = 60.0
 _POINTS_M: Final = 400.0
 _MOST_TRACKS: Final = 64
 
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
-    """Tracks of a network near a place in its frame, east and north of it; MismatchError without one within 60 m."""
-    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
+    """Tracks of a network near a position in its frame, east and north of it; MismatchError without one within 60 m."""
+    latitude, longitude, height = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
     near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=_MOST_TRACKS)
     numbers = sorted(int(t) for t in near.track[0] if t >= 0)
     if not numbers:
@@ -136,7 +136,9 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
     ground = ecef_from_geodetic(latitude, longitude, 0.0)
     radius = float(np.linalg.norm(origin_ecef_m)) / float(np.linalg.norm(ground))
     tracks = []
+    at = {int(t): near.chainage_m[0, [j]] for j, t in enumerate(near.track[0]) if t >= 0}
     for k in numbers:
+        _, _, above = network.course_on(np.array([k]), at[k])
         rows = slice(network.first_point[k], network.first_point[k + 1])
         points = (network.points_m[rows] - ground) @ axes.T * radius
         close = np.flatnonzero(np.hypot(*points.T) < _POINTS_M)
@@ -144,7 +146,8 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
         part = points[max(first - 1, 0) : last + 2]
         part = part[np.concatenate([[True], np.linalg.norm(np.diff(part, axis=0), axis=1) > 1e-3])]
         if len(part) > 1:
-            tracks.append(YardTrack(name=network.names[k], points_m=part))
+            up = float(above[0]) - height
+            tracks.append(YardTrack(name=network.names[k], points_m=part, up_m=up, sigma_up_m=network.sigma_height_m))
     return tracks
 
 
@@ -207,7 +210,7 @@ def decide_track(
         if name and track == "undecided":
             track, decided = name, float(look)
     if not posteriors:
-        raise MismatchError("the satellites are too few for a place")
+        raise MismatchError("too few satellites for a position")
     end = min(codes.time[-1] for codes in antennas)
     return TrackDecision(
         seconds=np.array(seconds), posteriors=tuple(posteriors), track=track, decided_s=decided, end=end
@@ -227,10 +230,10 @@ class WhichTrackInputs(InputFiles):
 
 
 class WhichTrackOptions(Settings):
-    """Options of `railfix which-track`, which say what each is; `same_frame` is also of the train's place."""
+    """Options of `railfix which-track`, described in their fields; `same_frame` applies to the train's position too."""
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)
-    base_place: str | None = option("Place of the base station: latitude, longitude, height.", None, metavar="L,L,H")
+    base_place: str | None = option("Position of the base station: latitude, longitude, height.", None, metavar="L,L,H")
     risk: float = option("Bound of the probability of a wrong track.", 1e-3, metavar="P", gt=0, lt=0.5)
     least_s: float = option("Time at rest before the first decision.", 60.0, name="--least", metavar="S", ge=0)
     prior: str | None = option(
@@ -245,7 +248,7 @@ class WhichTrackOptions(Settings):
     start: datetime | None = option("First epoch of the standstill, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
     same_frame: Literal["no", "yes"] = option(
-        "The place of the base station is in the frame of the map, not in that of the satellites.",
+        "The position of the base station is in the frame of the map, not in that of the satellites.",
         "no",
         name="--same-frame",
     )
@@ -255,7 +258,7 @@ class WhichTrackOptions(Settings):
 
 
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
-    """Read logs and map, and decide on which track the train stands."""
+    """Read logs and map, and decide which track the train stands on."""
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):
         raise SettingsError("a base station needs both --base and --base-place")
@@ -266,7 +269,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     if inputs.rear and not options.spacing > 0.0:
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front one")
     if (inputs.last is None) != (options.moved is None):
-        raise SettingsError("the last place needs --last and --moved, the distance moved since (0: none)")
+        raise SettingsError("the last position needs --last and --moved, the distance moved since (0: none)")
     navigation = read_navigation(inputs.nav, **options.logs.arguments)
     base = None
     if options.base_place is not None:
@@ -312,7 +315,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     best = int(np.argmax(last.probability))
     if last.misfit_sigmas[best] > _NOTED_MISFIT:
         notes.append(
-            f"the codes' place lies {last.misfit_sigmas[best]:.1f} standard deviations from {last.names[best]}, the "
+            f"the code position lies {last.misfit_sigmas[best]:.1f} standard deviations from {last.names[best]}, the "
             "most likely track; beyond 4 nothing is decided: is the map displaced, or a track missing?"
         )
     return replace(decision, notes=tuple(notes))
@@ -322,12 +325,12 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
     log = Log(paths=paths, chunk_epochs=3000, start=options.start, end=options.end, reading=options.logs)
     parts = list(log.parts())
     if not parts:
-        raise InputFileError(paths[0], "there is no epoch in the time asked for")
+        raise InputFileError(paths[0], "there is no epoch in the requested time")
     return concatenate(parts)
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:
-    """Return the weights of all tracks: the product of what the interlocking and the last place state."""
+    """Return the weights of all tracks: the product of those of the interlocking and of the last position."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
         weights, unmapped = prior_of_last_place(

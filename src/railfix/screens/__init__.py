@@ -1,7 +1,7 @@
 """Screens: one file each, with its limits, metric, verdict, reason, columns and picture.
 
-A screen measures one quantity in physical units and returns which observations fail. It never puts an
-observation back that another one rejected, and it only judges: the pipeline acts. `SCREENS` lists them.
+A screen measures one quantity in physical units and returns which observations fail. It never re-admits an observation
+that another screen rejected; it returns verdicts, which the pipeline applies. `SCREENS` lists them.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Pseudorange difference of two antennas against their spacing (P1 2.3(3), figure 5, table 6: 5 m).
 
-The same satellite is further from the rear antenna by ``L (cos el cos(az - heading) cos gradient + sin el sin
+The range of a satellite from the rear antenna is longer by ``L (cos el cos(az - heading) cos gradient + sin el sin
 gradient)``. A difference that does not fit has multipath in one of the two, which one is unknown.
 
-Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median share no clock: the screen is inactive, as in P1 6.
-Otherwise the clock difference is the median over the satellites of a constellation; with range rates given, the
+Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median have separate clocks: the screen is not run, as in P1
+6. Otherwise the clock difference is the median over the satellites of a constellation; with range rates given, the
 satellites' motion between the two instants is removed (1 ms is up to 0.8 m).
 
 Gradient, sway and map leave the elevation uncertain by 3 deg and the azimuth relative to the car body by 3.5 deg (P1).
@@ -55,7 +55,7 @@ SEPARATE_CLOCKS_M: Final = 100.0
 class AntennaPairLimits(Settings):
     """Limits of the screen by two antennas."""
 
-    #: Largest difference from what is expected; P1 table 6: 5.
+    #: Largest difference from the expected one; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Error of the satellite's direction from the car body; P1 2.3(3): 3 and 3.5.
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
@@ -74,19 +74,21 @@ class AntennaPairScreened(Screened):
     """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m]."""
 
     expected_m: Floats  #: Pseudorange of the rear antenna less that of the front one, from the spacing; shape (P, C).
-    #: Clock of the rear receiver less that of the front one, as taken out; 0 where common; shape (P, C).
+    #: Clock of the rear receiver less that of the front one, as eliminated; 0 where common; shape (P, C).
     clock_m: Floats
     clocks: str  #: How the clocks were treated, in words.
     zone: Callable[[], Floats]  #: Returns `ambiguity_m`.
 
     @cached_property
     def ambiguity_m(self) -> Floats:
-        """What the errors of the angles explain; within it nothing is rejected, whatever the limit; shape (P, C)."""
+        """Difference explained by errors of the angles; within it nothing is rejected, whatever the limit; shape (P,
+        C).
+        """
         return self.zone()
 
 
 class Spacing(NamedTuple):
-    """Line from the rear to the front antenna, shape (P,) or scalar each; NaN where unknown: not judged."""
+    """Line from the rear to the front antenna, shape (P,) or scalar each; NaN where unknown: not tested."""
 
     heading_deg: ArrayLike
     gradient_permille: ArrayLike
@@ -127,14 +129,14 @@ def expected_difference_m(
     gradient_permille: ArrayLike,
     spacing_m: ArrayLike,
 ) -> Floats:
-    """Return the pseudorange of the rear antenna less that of the front one, clocks alike, shape (P, C) [m].
+    """Return the pseudorange of the rear antenna less that of the front one, with equal clocks, shape (P, C) [m].
 
     Parameters
     ----------
     elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
     heading_deg, gradient_permille, spacing_m : array_like, shape (P,) or scalar
-        From the rear to the front antenna. For a train that faces falling chainage the heading is that
-        of the line turned by 180 deg, and the gradient has the other sign.
+        From the rear to the front antenna. For a train that faces falling chainage the heading is that of the line
+        turned by 180 deg, and the gradient changes sign.
     """
     elevation, azimuth = np.radians(elevation_deg), np.radians(azimuth_deg)
     heading, spacing = (np.asarray(value, dtype=np.float64)[..., None] for value in (heading_deg, spacing_m))
@@ -153,8 +155,8 @@ def ambiguity_m(
 ) -> Floats:
     """Return the largest change of the expected difference that the errors of the angles explain [m].
 
-    Of all directions within the errors the one that differs most: 1.1 m at most at 18.2 m spacing (P1
-    2.3(3)), for a low satellite abeam.
+    The direction within the errors that differs most: 1.1 m at most at 18.2 m spacing (P1 2.3(3)), for a low satellite
+    abeam.
 
     Parameters
     ----------
@@ -164,7 +166,7 @@ def ambiguity_m(
     elevation_error_deg, azimuth_error_deg : float [deg]
     """
     angles = np.broadcast_arrays(np.radians(elevation_deg), np.radians(relative_azimuth_deg))
-    shape = angles[0].shape  # rows of one element each where they are no table; a table may have no channel
+    shape = angles[0].shape  # rows of one element each where no table is given; a table may have no channel
     rows = (math.prod(shape[:-1]), shape[-1]) if len(shape) > 1 else (-1, 1)
     elevation, azimuth = (np.ascontiguousarray(a.reshape(rows)) for a in angles)
     errors = np.radians(elevation_error_deg), np.radians(azimuth_error_deg)

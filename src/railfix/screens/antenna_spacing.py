@@ -27,13 +27,13 @@ class AntennaSpacingLimits(Settings):
 
     #: Largest difference from the spacing; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Places by the filter differ by more than the limit where both were predicted: by so many of their standard
-    #: deviations too. The same of their speeds.
+    #: Filter positions that differ by more than the limit where both were predicted: also by this many of their
+    #: standard deviations. Limits of their speeds.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
-    #: Largest difference of the two speeds by the filter. Antennas of one vehicle have one speed, but for a few cm/s
-    #: where the track curves or its cant changes; a lesser difference of single epochs moves no place by a metre.
+    #: Largest difference of the two speeds by the filter. Antennas of one vehicle have equal speeds, up to a few cm/s
+    #: where the track curves or its cant changes; a smaller difference of single epochs moves no position by a metre.
     filter_speed_mps: float = Field(default=1.5, gt=0.0)
-    #: Time for which neither place is trusted: a wrong speed leaves a wrong place behind, which codes take back within
+    #: Time for which neither position is trusted: a wrong speed results in a wrong position, which codes correct within
     #: some 20 s.
     filter_held_s: float = Field(default=20.0, ge=0.0, allow_inf_nan=False)
 
@@ -51,13 +51,13 @@ def antenna_spacing_screen(
     Parameters
     ----------
     chainage_front_m, chainage_rear_m : array_like, shape (P,) [m]
-        Of the same instants, counted along one line; NaN where there is no position: not judged.
+        Of the same instants, counted along one line; NaN without a position: not tested.
     spacing_m : array_like, shape (P,) or scalar [m]
         Front less rear along the track as the chainages count it, not negative: the antennas' distance
         where each chainage is the one abeam its antenna, 0 where both are that of one reference point.
     facing : array_like of int, shape (P,) or scalar
         1 where the vehicle's front looks to rising chainage, -1 to falling, 0 where that is unknown:
-        then the order of the two is not judged.
+        then the order of the two is not tested.
 
     Returns
     -------
@@ -103,7 +103,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict of pairs by the filter: places or speeds beyond limit and noise."""
+        """Return metric and verdict of pairs by the filter: positions or speeds beyond limit and noise."""
         found = self.judge(front.chainage_m, rear.chainage_m, pair, limits)
         apart = np.abs(found.metric) > limits.filter_sigmas * np.hypot(front.sigma_m, rear.sigma_m)
         difference = np.abs(front.speed_mps - rear.speed_mps)

@@ -1,4 +1,4 @@
-"""Base classes of the screens: what a screen receives, what it returns, and the hooks that a screen may override.
+"""Base classes of the screens: inputs and results of a screen, and the methods that a screen may override.
 
 A screen is one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
 `railfix.screens.registry` or one entry point of an installed package (docs/screens.md shows an example).
@@ -28,7 +28,7 @@ from railfix.ranges.corrected import AntennaRanges
 from railfix.track.trajectory import Trajectory
 
 Limits = TypeVar("Limits", bound=Settings)
-#: Sigmas of its own added to that of a suspected range at least: it keeps a fifth of its weight at most.
+#: Least number of sigmas added to the sigma of a suspected range: at most a fifth of its weight remains.
 LEAST_SUSPICION: Final = 2.0
 
 
@@ -36,9 +36,9 @@ LEAST_SUSPICION: Final = 2.0
 class Screened:
     """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions."""
 
-    metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot judge.
+    metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot be run.
     reject: Masks  #: True = rejected. Where the metric is NaN the screen does not reject.
-    #: What the metric is compared with, in its unit; broadcasts to it; NaN where nothing is compared.
+    #: Limit that the metric is compared with, in its unit; broadcasts to it; NaN where nothing is compared.
     limit: Floats | float = float("nan")
 
 
@@ -49,7 +49,7 @@ class Verdict:
     name: str  #: Key in `AntennaResult.screens`: the screen's own name, or one a verdict where it has several.
     reason: Reason  #: Given to the rejected observations.
     screened: Screened  #: Shapes (T, K).
-    #: Size of the measured error: what fails is weighted down by it. None: rejected; shape (T, K).
+    #: Size of the measured error: suspected ranges are weighted down by it. None: rejected; shape (T, K).
     error_m: Floats | None = None
 
 
@@ -107,13 +107,13 @@ class ObservationPicture(NamedTuple):
     title: str
     label: str
     metric: str  #: Column of the observations.
-    reason: Reason  #: Of the rejected observations.
+    reason: Reason  #: Reason of the rejected observations.
     limit: str  #: Field of the screen's limits (no picture where it is None), or column of the observations.
     sides: Literal["both", "above", "below"] = "both"
 
 
 class RunTables(Protocol):
-    """Result tables of one antenna as arrays, for the pictures."""
+    """Result tables of one antenna as arrays, for the charts."""
 
     def channels(self, column: str) -> Floats:
         """Return the column of the observations, shape (T, M); NaN where not observed."""
@@ -126,24 +126,24 @@ class RunTables(Protocol):
 
 
 class Screen(ABC, Generic[Limits]):
-    """One screen; derive from the subclass for what it judges."""
+    """One screen; derive from the subclass for its kind of verdict."""
 
     name: ClassVar[str]  #: In `Config.screens`, and of its group of settings.
     limits: Limits  #: Default limits; their type has the fields of the group of settings.
-    needs: ClassVar[str]  #: Data without which it cannot judge, for the note.
+    needs: ClassVar[str]  #: Data without which it cannot be run, for the note.
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
     observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
-        """Return whether the screen can judge nothing in this run."""
+        """Return whether the screen cannot be run at all in this run."""
         return False
 
     def notes(self, limits: Limits, setup: ScreenSetup) -> tuple[str, ...]:
-        """Return sentences on a screen that was asked for and cannot judge, or not fully."""
+        """Return sentences on a screen that was requested and cannot be run, or not fully."""
         return (f"screen {self.name} was not run: it needs {self.needs}",) if self.unable(limits, setup) else ()
 
     def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield name and data of each picture of the screen: `observation_pictures`, or what an override yields."""
+        """Yield name and data of each picture of the screen: `observation_pictures`, or an override of it."""
         for name, title, label, metric, reason, where, sides in self.observation_pictures:
             limit = getattr(limits, where) if hasattr(limits, where) else tables.channels(where)
             if limit is not None:
@@ -162,7 +162,7 @@ class ObservationScreen(Screen[Limits]):
         Parameters
         ----------
         state : object
-            Returned with the chunk before; None at the start. Screens without memory return None.
+            Returned with the previous chunk; None at the start. Screens without memory return None.
         """
 
 
@@ -173,7 +173,7 @@ class PairedEpochs:
     #: Epochs of each antenna that belong together, shape (P,).
     front_epoch: Indices
     rear_epoch: Indices
-    #: Approximate places of the antennas on their trajectories, shape (P, 3).
+    #: Approximate positions of the antennas on their trajectories, shape (P, 3).
     front_ecef_m: Floats
     rear_ecef_m: Floats
     #: Chainage of the front antenna less that of the rear one: negative if facing falling chainage; shape (P,).
@@ -183,10 +183,10 @@ class PairedEpochs:
 class _OfTwoAntennas(Screen[Limits]):
     """A screen that needs two antennas of one vehicle."""
 
-    needs = "two antennas and a vehicle file, which places them on one vehicle"
+    needs = "two antennas and a vehicle file, which gives their spacing"
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
-        """Return whether there are no two antennas with a known spacing."""
+        """Return whether two antennas with a known spacing are missing."""
         return setup.antennas < 2 or not setup.spacing_known
 
 
@@ -201,7 +201,7 @@ class PairScreen(_OfTwoAntennas[Limits]):
 
 
 class FilteredMotion(NamedTuple):
-    """Places [m] and speeds [m/s] of one antenna by the filter along the track, NaN without one, shape (T,)."""
+    """Positions [m] and speeds [m/s] of one antenna by the filter along the track, NaN where missing, shape (T,)."""
 
     chainage_m: Floats
     sigma_m: Floats
@@ -226,14 +226,14 @@ class PositionScreen(_OfTwoAntennas[Limits]):
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: Limits
     ) -> Screened:
-        """Return the same for the P pairs of places and speeds by the filter along the track."""
+        """Return the verdict for the P pairs of positions and speeds by the filter along the track."""
 
 
 def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
     """Return the epochs of two receivers that belong together, by rising time tags that differ by `tolerance_s` at
     most.
 
-    Each epoch is in one pair at most: with the nearest of the other that has it nearest too.
+    Each epoch is in one pair at most: two epochs are paired if each is the nearest to the other.
     """
     within_ns = round(tolerance_s * 1e9)
     to_rear = nearest_rows(time_rear, time_front, within_ns=within_ns)
@@ -278,7 +278,7 @@ def pair_antennas(
     *,
     tolerance_s: float,
 ) -> PairedEpochs:
-    """Return the epochs of two antennas matched by their time tags, with the places of both on the line.
+    """Return the epochs of two antennas matched by their time tags, with both positions on the line.
 
     `front_arc_m`: approximate arc lengths of the front antenna, shape (T,).
     """

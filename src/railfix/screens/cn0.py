@@ -1,7 +1,7 @@
-"""Signal strength against what an open sky gives at the elevation, and an absolute floor (P1 2.3(1)).
+"""C/N0 against its open-sky mean at the elevation, and an absolute floor (P1 2.3(1)).
 
 P1 measures the mean over elevation for the antenna and receiver on a day of open sky (`railfix.ranges.cn0_curve`), and
-rejects what lies 10 dB-Hz below it; and, for all satellites alike, what lies below 30 dB-Hz (table 6).
+rejects observations 10 dB-Hz below it; and, for all satellites, observations below 30 dB-Hz (table 6).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Cn0Screened(Screened):
     """Verdict on signal strength: the metric is C/N0, the limit the higher of floor and curve [dB-Hz]."""
 
     floor: Screened  #: The metric is C/N0 [dB-Hz].
-    curve: Screened  #: The metric is the mean at the elevation less C/N0 [dB]; NaN where there is no curve.
+    curve: Screened  #: The metric is the mean at the elevation less C/N0 [dB]; NaN without a curve.
 
 
 def cn0_screen(
@@ -61,7 +61,7 @@ def cn0_screen(
     Parameters
     ----------
     cn0_dbhz : array_like, shape (T, M) [dB-Hz]
-        NaN where the log has none: not judged.
+        NaN where the log has none: not tested.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
     curve : Cn0Curve, optional
@@ -118,7 +118,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
         return setup.cn0_curve is None and limits.floor_dbhz is None
 
     def notes(self, limits: Cn0Limits, setup: ScreenSetup) -> tuple[str, ...]:
-        """Return a note where there is no curve."""
+        """Return a note where the curve is missing."""
         if setup.cn0_curve is not None or limits.floor_dbhz is None:
             return super().notes(limits, setup)
         return (f"screen cn0: no curve over elevation (cn0_curve), only the floor of {limits.floor_dbhz:g} dB-Hz used",)

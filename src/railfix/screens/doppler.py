@@ -6,9 +6,9 @@ constellation removes it, and the interval is corrected by it beforehand (4 ms t
 
 P1 ran at 0.1 s. Over longer intervals the limit grows with the noise that two codes do not share, ``sqrt(1 - exp(-dt /
 correlation_s))``, the change of acceleration, ``jerk dt^3 / 12``, and the noise of the Doppler, ``sigma dt``. Its mode
-is "fixed", P1's; "receiver", `factor` times the scale of the receiver's own changes (median over the satellites,
-averaged over the epochs), or "sigma", `factor` times the sigma of each code, which forgives weak satellites most (urban
-recordings at 1 Hz: a quarter of the bad codes found at the same loss); neither is below P1's.
+is "fixed" (P1's), "receiver", `factor` times the scale of the receiver's own changes (median over the satellites,
+averaged over the epochs), or "sigma", `factor` times the sigma of each code, which is widest for weak satellites (urban
+recordings at 1 Hz: a quarter of the bad codes found at the same loss); no mode is below P1's.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ class DopplerLimits(Settings):
     doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
     #: Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Over a longer interval the screen cannot judge.
+    #: Over a longer interval the screen is not run.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
     #: How long a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back, which is
     #: exactly P1's test.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
-    least_satellites: int = Field(default=3, ge=3)  #: Satellites of one clock needed to take its step out.
+    least_satellites: int = Field(default=3, ge=3)  #: Number of satellites of one clock required to eliminate its step.
     #: Treatment of a suspected satellite: its sigma grows by the size of the jump
     #: (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. Where few satellites are left, the geometry
     #: without one turns a few metres into a hundred; a weight does not.
@@ -95,11 +95,11 @@ def _jerk_m(interval: Floats, limits: DopplerLimits) -> Floats:
 
 
 def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimits) -> Floats:
-    """Limit of mode "sigma", shape (T, M) [m], from sigmas of the codes with the epoch before, shape (T + 1, M)."""
+    """Limit of mode "sigma", shape (T, M) [m], from sigmas of the codes with the previous epoch, shape (T + 1, M)."""
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
     noise = (sigma_m[1:] ** 2 + sigma_m[:-1] ** 2) * fresh + (limits.doppler_sigma_mps * interval) ** 2
-    # a NaN stays one: without its sigma a satellite is not judged
+    # a NaN stays NaN: without its sigma a satellite is not tested
     return np.asarray(np.maximum(limits.step_m, limits.factor * np.sqrt(noise)) + _jerk_m(interval, limits))
 
 
@@ -108,15 +108,15 @@ def receiver_limit_m(
 ) -> tuple[Floats, float, float]:
     """Limit of mode "receiver", shape (T,) [m], and the sum of the logarithms of the scales and their number so far.
 
-    The scale is that of changes at the short interval: what an epoch shows is divided by the growth of the noise. Of a
-    dozen satellites it comes out a tenth to a seventh too small (their own median is taken out; logarithms are
-    averaged, so that an epoch full of multipath does not carry it).
+    The scale is that of changes at the short interval: the changes of an epoch are divided by the growth of the noise.
+    For a dozen satellites it is a tenth to a seventh too small (their own median is subtracted; logarithms are
+    averaged, so that an epoch full of multipath does not dominate).
     """
     growth = _growth(interval_s, limits)
     shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
     counts = (np.isfinite(metric_m).sum(axis=1) >= _LEAST_CHANGES) & np.isfinite(shown)
     logs = np.where(counts, np.log(np.maximum(np.where(counts, shown, 1.0), _FINEST_M)), 0.0)
-    # running sums, one after the other from the carried ones: a cut does not show
+    # running sums, continued from those of the state: chunk boundaries have no effect
     sums = np.concatenate([[sum_log], logs]).cumsum()[1:]
     weights = np.concatenate([[weight], counts]).cumsum()[1:]
     prior = limits.prior_epochs
@@ -141,7 +141,7 @@ class DopplerState:
     """The last epoch seen, and the satellites under suspicion then; shapes (M,)."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
-    #: Channels; those of the next chunk may be others.
+    #: Channels; the next chunk may have others.
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
     signal: Strings = field(default_factory=lambda: np.empty(0, dtype="<U2"))
     #: NaN where absent.
@@ -160,7 +160,7 @@ class DopplerState:
 
 
 class DopplerChannels(NamedTuple):
-    """Channels, shape (M,) each; the carrier [Hz] is NaN where unknown: not judged."""
+    """Channels, shape (M,) each; the carrier [Hz] is NaN where unknown: not tested."""
 
     satellite: Strings
     signal: Strings
@@ -185,9 +185,9 @@ def doppler_screen(
 
     A single difference does not show which of its two epochs is faulty. A satellite that jumps beyond the
     limit is suspected and rejected, and its jumps are summed to a level. When the level is back within the
-    limit, the satellite is used again at once (its jump back is beyond the limit, and not rejected). When
-    `hold_s` has passed without that, the new level is taken as correct. So a passing reflection costs its own
-    epochs, and the end of a reflection present from the first epoch on costs `hold_s` of good ones.
+    limit, the satellite is used again at once (its jump back is beyond the limit, and not rejected). When `hold_s` has
+    passed without that, the new offset is accepted. So a passing reflection costs its own epochs, and the end of a
+    reflection present from the first epoch on costs `hold_s` of good ones.
 
     Parameters
     ----------
@@ -197,9 +197,9 @@ def doppler_screen(
     break_before : array_like of bool, shape (T,), optional
         Nothing is differenced across the step into these epochs.
     code_sigma_m : array_like, shape (T, M) [m], optional
-        Noise of the codes, asked for by mode "sigma"; NaN there: not judged.
+        Noise of the codes, requested by mode "sigma"; NaN there: not tested.
     state : DopplerState, optional
-        Left by the chunk before.
+        Left by the previous chunk.
 
     Returns
     -------
@@ -271,7 +271,7 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 
 
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
-    """Return the change of the codes against the Dopplers, the clock taken out, shape (T, M) [m]."""
+    """Return the change of the codes against the Dopplers, the clock eliminated, shape (T, M) [m]."""
     raw = change - rate * interval[:, None]
     # the receiver clock's step is not elapsed time
     passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT

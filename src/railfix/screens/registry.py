@@ -16,7 +16,7 @@ _NAMES: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna
 
 
 def in_order(screens: Iterable[Screen[Any]]) -> tuple[Screen[Any], ...]:
-    """Return screens in the order in which they judge: of one antenna, of two, RAIM, of positions."""
+    """Return screens in the order in which they are run: of one antenna, of two, RAIM, of positions."""
     return tuple(sorted(screens, key=_rank))
 
 
@@ -26,7 +26,9 @@ def _rank(screen: Screen[Any]) -> int:
 
 
 def _find_installed() -> list[Screen[Any]]:
-    """Load the screens of installed packages; SettingsError where one is no screen, or has the name of another one."""
+    """Load the screens of installed packages; SettingsError where an entry point is no screen, or has the name of
+    another one.
+    """
     found: list[Screen[Any]] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         package = entry.dist.name if entry.dist else "?"
@@ -44,7 +46,7 @@ def _find_installed() -> list[Screen[Any]]:
     return found
 
 
-#: All screens, in the order in which they judge.
+#: All screens, in the order in which they are run.
 SCREENS: Final[tuple[Screen[Any], ...]] = in_order(
     (*(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES), *_find_installed())
 )

@@ -47,7 +47,7 @@ PATTERN: Final = (
     (35.0, np.inf, 0.0),
     (226.0, np.inf, 0.0),
 )
-#: Gradient at places of the pattern: place [m], gradient [permille]; linear between.
+#: Gradient at points of the pattern: chainage [m], gradient [permille]; linear between.
 GRADIENT: Final = (
     (0.0, 0.0), (60.0, 0.0), (100.0, -4.0), (180.0, -4.0), (240.0, 10.0), (380.0, 10.0), (450.0, 2.5),
     (560.0, 2.5), (620.0, -6.0), (700.0, -6.0), (756.0, 0.0),
@@ -59,7 +59,7 @@ class Alignment(Knots):
     """A line of given elements."""
 
     settings: LineSettings
-    file: FileLine | None = None  #: The curve through the points of a track file, in place of the integrated one.
+    file: FileLine | None = None  #: The curve through the points of a track file, which replaces the integrated one.
 
     @property
     def length_m(self) -> float:
@@ -93,7 +93,9 @@ class Alignment(Knots):
         return CubicHermiteSpline(chainage, place, tangent, axis=0)
 
     def at(self, chainage_m: ArrayLike) -> Floats:
-        """Return the points of the curve, shape (..., 3) ECEF [m]; beyond the ends its first and last pieces go on."""
+        """Return the points of the curve, shape (..., 3) ECEF [m]; beyond the ends its first and last pieces
+        continue.
+        """
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64)))
 
     def tangent_at(self, chainage_m: ArrayLike) -> Floats:
@@ -175,7 +177,7 @@ def build_alignment(settings: LineSettings) -> Alignment:
 
 
 def _pattern_knots(length_m: float) -> Knots:
-    """The pattern of the simulated test line, repeated and every second time mirrored, to the length asked for."""
+    """The pattern of the simulated test line, repeated with every second copy mirrored, to the requested length."""
     repeats = int(np.ceil(length_m / PATTERN_LENGTH_M - 1e-12))
     lengths, radii, cants = (np.array(column) for column in zip(*PATTERN, strict=True))
     side = np.repeat(np.where(np.arange(repeats) % 2 == 0, 1.0, -1.0), len(lengths))

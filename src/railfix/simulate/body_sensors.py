@@ -84,7 +84,7 @@ def pulse_times_s(
     *,
     tooth_errors: Floats | None = None,
 ) -> Floats:
-    """Compute pulse times [s after the start]; `phase` in [0, 1), `tooth_errors` are shares of the spacing."""
+    """Compute pulse times [s after the start]; `phase` in [0, 1), `tooth_errors` are fractions of the spacing."""
     # The motion's own corners are nodes too, so that without slips nothing is approximate.
     corner = motion.time_s[(motion.time_s > 0.0) & (motion.time_s < duration_s)]
     node = np.unique(np.concatenate([np.arange(0.0, duration_s, _STEP_S), corner, [duration_s]]))
@@ -233,7 +233,7 @@ def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.Dat
 
 
 def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Floats) -> Floats | float:
-    """Return the vibration of the six axes at times, shape (n, 6); 0 where there is none."""
+    """Return the vibration of the six axes at times, shape (n, 6); 0 without any."""
     sigmas = np.repeat([settings.vibration_sigma_mps2, settings.vibration_sigma_radps], 3)
     if not sigmas.any():
         return 0.0

@@ -83,7 +83,7 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     """Indices of a satellite in force from `first` to `last`, by transmission; none where a moment is not served."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
-    # Of records sent at one time the one for later.
+    # Of records sent at one time the record for the later time.
     rows = rows[np.append(np.diff(records.transmitted[rows]) > np.timedelta64(0, "ns"), True)]
     sent = records.transmitted[rows]
     begin, end = (int(np.searchsorted(sent, time, side="right")) for time in (first, last))
@@ -123,7 +123,7 @@ class _Orbit:
 def simulate_navigation(scenario: Scenario) -> Navigation:
     """Return the broadcast records for the whole of a run, as `railfix.io.write_navigation` writes them.
 
-    All values are rounded to the digits of the file, so that file and arrays are the same satellites. Where the
+    All values are rounded to the digits of the file, so that file and arrays describe the same satellites. Where the
     scenario names a navigation file, its records; errors as `navigation_of_file`.
     """
     if scenario.sky.nav is not None:
@@ -183,7 +183,7 @@ def _orbits(system: str, scenario: Scenario, rng: np.random.Generator) -> list[_
 
 
 def _slot_name(system: str, k: int) -> str:
-    """BeiDou's satellites stand where the real ones of their kind do: C01 to C05 are read as GEO."""
+    """BeiDou's satellites have the positions of real ones of their kind: C01 to C05 are read as GEO."""
     if system == "C":
         return f"C{k + 19 if k < 19 else k + 22:02d}"
     return f"{system}{k + 1:02d}"
@@ -205,7 +205,7 @@ def _figure_of_eight(
 
 
 def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Return the records of one satellite: the one before the run, the one in force, and those that follow."""
+    """Return the records of one satellite: the one before the run, the current one, and the following ones."""
     every, shift = _ISSUE_S[system], BDT_MINUS_GPST_S if system == "C" else 0.0
     mu, rotation = GM[system], ROTATION[system]
     start_sow = float(to_week(scenario.start)[1])
@@ -270,7 +270,7 @@ _FLIGHT_S: Final = 0.08
 
 @dataclass(frozen=True, kw_only=True)
 class Links:
-    """Signals received at T instants: of one satellite, shapes (T,), or of S satellites, shapes (T, S)."""
+    """Signals received at T instants: from one satellite, shapes (T,), or from S satellites, shapes (T, S)."""
 
     #: Geometric distance in the frame of reception, the Earth's rotation included; shape (T,) or (T, S).
     range_m: Floats
@@ -289,7 +289,7 @@ def record_state(
 
 
 def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
-    """Return the row of the satellite's newest record transmitted by each time (its first where there is none)."""
+    """Return the row of the satellite's newest record transmitted by each time (its first where none has been)."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.argsort(records.transmitted[rows], kind="stable")]
     return np.asarray(rows[np.maximum(np.searchsorted(records.transmitted[rows], time, side="right") - 1, 0)])
@@ -308,7 +308,7 @@ def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats
 
 
 def _solve_light_time(state: Callable[[Floats], Floats], flight_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Iterate from a first flight time; `state` gives place and clock, shape (..., 4), by flight times (...)."""
+    """Iterate from a first flight time; `state` returns position and clock, shape (..., 4), by flight times (...)."""
     x, y, z = (receiver_ecef_m[..., axis] for axis in range(3))
     for _ in range(3):
         place = state(flight_s)

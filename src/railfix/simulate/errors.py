@@ -19,6 +19,8 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
+from railfix.ranges.atmosphere import rtca_mapping, thin_shell_obliquity
+from railfix.ranges.sbas.ionosphere import EARTH_RADIUS_KM, pierce_point
 from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 
@@ -42,7 +44,7 @@ class Interpolated:
         self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return the four nodes about each time, shape (T, C), and the share of the cell, shape (T, 1)."""
+        """Return the four nodes about each time, shape (T, C), and the fraction of the cell, shape (T, 1)."""
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
@@ -153,41 +155,14 @@ class RandomFunction:
         return self.amplitude * total
 
 
-#: Radius of the Earth and height of the layer that the residual ionosphere lies in [km] (DO-229D, A.4.4.10).
-_EARTH_KM: Final = 6378.1363
-_LAYER_KM: Final = 350.0
 #: Spacing of the nodes between which the axes of an orbit are interpolated [s]; they turn by half a degree.
 _AXES_S: Final = 60.0
 #: Streams of random numbers: clock, three axes, group delay, ionosphere, troposphere.
 _CLOCK, _AXIS, _DELAY, _IONOSPHERE, _TROPOSPHERE = 10, 11, 14, 15, 16
 
 
-def ionosphere_mapping(elevation_deg: Floats) -> Floats:
-    """Return the slant over vertical delay of a thin layer 350 km up (DO-229D, A.4.4.10.4)."""
-    return 1.0 / np.sqrt(1.0 - (_EARTH_KM / (_EARTH_KM + _LAYER_KM) * np.cos(np.radians(elevation_deg))) ** 2)
-
-
-def troposphere_mapping(elevation_deg: Floats) -> Floats:
-    """Return the slant over zenith delay (DO-229D, A.4.2.4)."""
-    return 1.001 / np.sqrt(0.002001 + np.sin(np.radians(elevation_deg)) ** 2)
-
-
-def pierce_point_km(
-    latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats, origin_deg: Floats
-) -> Floats:
-    """North and east of where a signal passes the layer (DO-229D, A.4.4.10.1), shape (..., 2) [km]."""
-    elevation, azimuth = np.radians(elevation_deg), np.radians(azimuth_deg)
-    latitude = np.radians(latitude_deg)
-    psi = np.pi / 2.0 - elevation - np.arcsin(_EARTH_KM / (_EARTH_KM + _LAYER_KM) * np.cos(elevation))
-    below = np.arcsin(np.sin(latitude) * np.cos(psi) + np.cos(latitude) * np.sin(psi) * np.cos(azimuth))
-    turn = np.arcsin(np.sin(psi) * np.sin(azimuth) / np.cos(below))
-    east = (np.radians(longitude_deg - origin_deg[1]) + turn + np.pi) % (2.0 * np.pi) - np.pi
-    north = below - np.radians(origin_deg[0])
-    return _EARTH_KM * np.stack([north, east * np.cos(np.radians(origin_deg[0]))], axis=-1)
-
-
 class CommonErrors:
-    """Errors of satellites and the atmosphere as functions of time since `start` and place."""
+    """Errors of satellites and the atmosphere as functions of time since `start` and position."""
 
     def __init__(
         self,
@@ -290,7 +265,7 @@ class CommonErrors:
         if self._orbits:
             added += np.einsum("tsi,tsi->ts", self.orbit_error_m(time_s), sight)
         if self._settings.troposphere.zenith_sigma_m > 0.0:
-            added += self._zenith.at(time_s) * troposphere_mapping(elevation_deg)
+            added += self._zenith.at(time_s) * rtca_mapping(elevation_deg)
         return added
 
     def ionosphere_m(
@@ -302,10 +277,13 @@ class CommonErrors:
         if atmosphere.vertical_sigma_m > 0.0:
             vertical += self._vertical.at(time_s)
         if atmosphere.gradient_mm_per_km > 0.0:
-            apart = pierce_point_km(latitude_deg, longitude_deg, elevation_deg, azimuth_deg, self._origin_deg)
+            pierced = pierce_point(latitude_deg[:, 0], longitude_deg[:, 0], elevation_deg, azimuth_deg)
+            north, east = pierced[0] - self._origin_deg[0], (pierced[1] - self._origin_deg[1] + 180.0) % 360.0 - 180.0
+            east *= np.cos(np.radians(self._origin_deg[0]))
             direction = np.radians(atmosphere.gradient_azimuth_deg)
-            vertical += 1e-3 * atmosphere.gradient_mm_per_km * (apart @ [np.cos(direction), np.sin(direction)])
-        return np.asarray(vertical * ionosphere_mapping(elevation_deg))
+            apart_km = EARTH_RADIUS_KM * np.radians(north * np.cos(direction) + east * np.sin(direction))
+            vertical += 1e-3 * atmosphere.gradient_mm_per_km * apart_km
+        return np.asarray(vertical * thin_shell_obliquity(elevation_deg))
 
     def group_delay_m(self, satellites: Sequence[str], signals: Sequence[str]) -> Floats:
         """Return the constant error of each channel's code, shape (M,) [m]."""

@@ -42,13 +42,13 @@ LONGEST_LINE_M: Final = 1e7  #: Longest line, and longest element of one [m].
 class Element(ScenarioSettings):
     """Horizontal alignment element."""
 
-    #: A transition is a clothoid from the element before to the one after; cant rises with its curvature.
+    #: A transition is a clothoid from the previous element to the next; cant rises with its curvature.
     kind: Literal["straight", "transition", "curve"]
 
     length_m: float = Field(gt=0.0, le=LONGEST_LINE_M)
-    #: Of a curve, positive to the right; infinite for the others.
+    #: Radius of a curve, positive to the right; infinite for the others.
     radius_m: float = Field(default=math.inf, allow_inf_nan=True)
-    cant_m: float = Field(default=0.0, ge=0.0, le=0.3)  #: Of a curve: outer rail above inner rail.
+    cant_m: float = Field(default=0.0, ge=0.0, le=0.3)  #: Cant of a curve: outer rail above inner rail.
 
     @model_validator(mode="after")
     def _curves_alone_bend(self) -> Element:
@@ -87,7 +87,7 @@ class Terrain(ScenarioSettings):
 class GeneratedLine(ScenarioSettings):
     """Commercial line generated from a seed."""
 
-    seed: Seed = 1  #: Of the line alone, so that several runs share it.
+    seed: Seed = 1  #: Seed of the line alone, so that several runs share it.
     #: The cant is the equilibrium cant at this speed, up to `largest_cant_m`, in steps of 5 mm.
     speed_mps: Positive = 110.0 / 3.6
 
@@ -107,7 +107,7 @@ class GeneratedLine(ScenarioSettings):
 class LineFile(ScenarioSettings):
     """Track file used as the line."""
 
-    path: str  #: As `railfix.track.read_track` reads it; in a scenario file relative to that file.
+    path: str  #: As read by `railfix.track.read_track`; in a scenario file relative to that file.
     #: Part of the file's chainage that is used.
     from_m: NotNegative = 0.0
     to_m: float = Field(default=math.inf, allow_inf_nan=True)
@@ -153,7 +153,7 @@ class LineSettings(ScenarioSettings):
     curve_spacing_m: Positive = 2.32
 
     elements: tuple[Element, ...] = ()
-    gradients: tuple[Gradient, ...] = ()  #: Level where there is none.
+    gradients: tuple[Gradient, ...] = ()  #: Level where absent.
     #: The pattern, 756 m long, is repeated (every second time mirrored) and cut off here; a generated line ends here.
     #: Elements have their own sum, and a file its own length (NaN here).
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
@@ -188,7 +188,7 @@ _CONTACT_M: Final = 1.137
 #: A generated line turns back when its direction differs from the first by this [rad],
 _FAR_RAD: Final = np.radians(50.0)
 _HIGH_M: Final = 150.0  #: and when it has climbed or fallen by this [m].
-_CANT_STEP_M: Final = 0.005  #: Cant comes in steps [m]; transitions in whole metres.
+_CANT_STEP_M: Final = 0.005  #: Cant is rounded to steps [m]; transitions to whole metres.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,7 +284,7 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
 
 
 def _cut(elements: list[Element], length_m: float) -> list[Element]:
-    """Return the elements up to the length: the last curve that does not fit gives way to a straight."""
+    """Return the elements up to the length: a last curve that does not fit is replaced by a straight."""
     while elements and sum(item.length_m for item in elements) > length_m:
         # Straight, transition, curve, transition: all four go.
         del elements[-4:]

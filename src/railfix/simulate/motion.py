@@ -35,7 +35,7 @@ class Motion:
     """Pieces of constant jerk (without a limit of the jerk: of constant acceleration); the last one continues."""
 
     time_s: Floats  #: Start of each piece, rising from 0; shape (P,).
-    #: At the start of the piece; signs are those of rising chainage; shape (P,).
+    #: Values at the start of the piece; signs are those of rising chainage; shape (P,).
     chainage_m: Floats
     speed_mps: Floats
     acceleration_mps2: Floats
@@ -104,15 +104,15 @@ def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> F
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 
 
-_STEP_M: Final = 2.0  #: Spacing of the places at which a run curve looks at the limits [m].
-_RAIL_HEAD_M: Final = 0.070  #: Contact points of the wheels lie further apart than the gauge [m].
+_STEP_M: Final = 2.0  #: Spacing of the positions at which a run curve evaluates the limits [m].
+_RAIL_HEAD_M: Final = 0.070  #: Contact points of the wheels are this much farther apart than the gauge [m].
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
     """Return the motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or such are given.
 
-    Its duration is the scenario's unless given; 0: one way, to the last stop and its stand. SettingsError: when the
-    train has no room on the line.
+    Its duration is the scenario's unless given; 0: one way, to the last stop and its standstill. SettingsError: when
+    the train has no room on the line.
     """
     settings = scenario.run
     scenario.check_room(line.length_m)
@@ -133,7 +133,7 @@ def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSetti
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
     cruise_s = max(0.0, (length - top**2 / (2.0 * up) - top**2 / (2.0 * down)) / top)
-    # One leg: accelerate, cruise, brake, stand; in the units of its own direction.
+    # One leg: accelerate, cruise, brake, stand; in the coordinates of its own direction.
     steps = np.array([top / up, cruise_s, top / down, settings.stand_s])
     offsets = np.array([0.0, top**2 / (2.0 * up), length - top**2 / (2.0 * down), length])
     speeds, accelerations = np.array([0.0, top, top, 0.0]), np.array([up, 0.0, -down, 0.0])
@@ -187,14 +187,14 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
     way = np.linspace(0.0, abs(last_m - first_m), cells + 1)
     sign = 1.0 if last_m > first_m else -1.0
     square = _limits(line, settings, first_m + sign * way, contact_m) ** 2
-    # A limit holds in the cells on both sides of its place.
+    # A limit applies to the cells on both sides of its position.
     square = np.minimum(square, np.minimum(np.append(square[1:], np.inf), np.append(np.inf, square[:-1])))
     square[[0, -1]] = 0.0
     up, down = 2.0 * settings.acceleration_mps2 * way, 2.0 * settings.deceleration_mps2 * way
     square = np.minimum(square, np.minimum.accumulate(square - up) + up)
     square = np.maximum(np.minimum(square, np.minimum.accumulate((square + down)[::-1])[::-1] - down), 0.0)
     square[[0, -1]] = 0.0
-    # Cells of one acceleration are one piece.
+    # Cells of one acceleration form one piece.
     acceleration = np.diff(square) / (2.0 * np.diff(way))
     change = np.flatnonzero(np.abs(np.diff(acceleration)) > 1e-6) + 1
     corner = np.concatenate([[0], change, [cells]])
@@ -212,7 +212,7 @@ def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, 
 
 
 def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_m: float) -> Floats:
-    """Return the highest speed at places [m/s]: cruising, limits of the line, and curves."""
+    """Return the highest speed at positions [m/s]: cruising, limits of the line, and curves."""
     limit = np.full(chainage_m.shape, settings.cruise_mps)
     for part in settings.limits:
         inside = (chainage_m >= part.from_m) & (chainage_m <= part.to_m)
@@ -246,8 +246,8 @@ def antenna_truth(
     """True position of an antenna at n positions of the vehicle's middle, midway between the bogies' chainages.
 
     `offset_m`: along, across to the right, above the rail tops. Sway is the lean to the right beyond that of the cant,
-    pitch that beyond the gradient, about the point between the bogies at the rail tops, positive where the front rises;
-    each of shape (n,) or one number [rad].
+    pitch the rotation beyond the gradient, about the point between the bogies at the rail tops, positive where the
+    front rises; each of shape (n,) or one number [rad].
     """
     middle = np.asarray(middle_m, dtype=np.float64)
     half = np.full(middle.shape, vehicle.bogie_distance_m / 2.0)

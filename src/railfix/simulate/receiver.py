@@ -15,18 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Masks
+from railfix.core.arrays import Bytes, Floats, Masks
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.gnss.navigation import KeplerRecords
 from railfix.gnss.observations import ObservationHeader
-from railfix.simulate.constellation import newest_record
 from railfix.simulate.errors import ClockWalk, CommonErrors, satellite_key
 from railfix.simulate.scenario import ANTENNAS, ReceiverSettings, Scenario
 from railfix.simulate.settings import InterSystemSettings, NoiseSettings, TrackingSettings
 
 
 class CarriedNoise:
-    """Correlated noise of a receiver's channels, the same whatever the chunks; `key` is the seed of the receiver."""
+    """Correlated noise of a receiver's channels, independent of the chunks; `key` is the seed of the receiver."""
 
     def __init__(self, settings: NoiseSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
         self._settings = settings
@@ -41,7 +39,7 @@ class CarriedNoise:
         return np.asarray(np.sqrt(1.0 - share) * white + np.sqrt(share) * self._code.next(len(white)))
 
     def cn0_db(self, epochs: int) -> Floats | float:
-        """Return the variation of C/N0 [dB] over the next epochs, shape (T, M); 0 where there is none."""
+        """Return the variation of C/N0 [dB] over the next epochs, shape (T, M); 0 without any."""
         sigma = self._settings.cn0_wander_sigma_db
         return 0.0 if sigma == 0.0 else sigma * self._cn0.next(epochs)
 
@@ -62,7 +60,7 @@ class _FirstOrder:
 
 class CodeSmoothing:
     """Filter of first order on code errors, restarted after loss of lock: ``y[k] = y[k-1] + (1 - exp(-interval / time))
-    (x[k] - y[k-1])``; a time of 0 is no filter.
+    (x[k] - y[k-1])``; a time of 0 means no filter.
     """
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
@@ -155,47 +153,6 @@ def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
     return np.where(losses == 0, 0.0, cycles)
 
 
-_HUMIDITY: Final = 0.7
-
-
-def ionosphere_m(
-    coefficients: Floats,
-    second_of_day_s: Floats,
-    latitude_deg: Floats,
-    longitude_deg: Floats,
-    elevation_deg: Floats,
-    azimuth_deg: Floats,
-    *,
-    frequency_hz: float | Floats,
-) -> Floats:
-    """Return Klobuchar's delay [m] at a frequency, all arguments of one shape; angles inside in semicircles."""
-    elevation, azimuth = elevation_deg / 180.0, np.radians(azimuth_deg)
-    psi = 0.0137 / (elevation + 0.11) - 0.022
-    phi = np.clip(latitude_deg / 180.0 + psi * np.cos(azimuth), -0.416, 0.416)
-    lam = longitude_deg / 180.0 + psi * np.sin(azimuth) / np.cos(phi * np.pi)
-    magnetic = phi + 0.064 * np.cos((lam - 1.617) * np.pi)
-    local = (43_200.0 * lam + second_of_day_s) % 86_400.0
-    slant = 1.0 + 16.0 * (0.53 - elevation) ** 3
-    powers = magnetic[..., None] ** np.arange(4)
-    amplitude = np.maximum(powers @ coefficients[:4], 0.0)
-    period = np.maximum(powers @ coefficients[4:], 72_000.0)
-    x = 2.0 * np.pi * (local - 50_400.0) / period
-    bulge = np.where(np.abs(x) < 1.57, amplitude * (1.0 - x**2 / 2.0 + x**4 / 24.0), 0.0)
-    return SPEED_OF_LIGHT * slant * (5e-9 + bulge) * (FREQUENCY_L1 / frequency_hz) ** 2
-
-
-def troposphere_m(latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
-    """Return Saastamoinen's delay [m], all arguments of one shape."""
-    height = np.maximum(height_m, 0.0)
-    pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
-    temperature = 15.0 - 6.5e-3 * height + 273.16
-    vapour = 6.108 * _HUMIDITY * np.exp((17.15 * temperature - 4684.0) / (temperature - 38.45))
-    sine = np.sin(np.radians(elevation_deg))
-    dry = 0.0022768 * pressure / (1.0 - 0.00266 * np.cos(2.0 * np.radians(latitude_deg)) - 0.00028 * height / 1e3)
-    wet = 0.002277 * (1255.0 / temperature + 0.05) * vapour
-    return np.asarray((dry + wet) / sine)
-
-
 #: Signals of each constellation, the first one first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
 #: Two of each satellite with `ReceiverSettings.second` "L5".
@@ -256,26 +213,6 @@ class Receiver:
     def white(self, epochs: int) -> Floats:
         """Return the white noise of code, phase, Doppler and C/N0 for the next epochs, shape (T, M, 4)."""
         return self._rng.standard_normal((epochs, len(self.names), 4))
-
-
-def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Datetimes) -> Floats:
-    """Group delay of a signal's code against the broadcast clock, shape (T,) [s].
-
-    GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2), TGD on L5, whose ISC LNAV lacks.
-    Galileo I/NAV: BGD E5b/E1 likewise, on E5a that of both BGDs (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I,
-    which the clock refers to; TGD_B1Cp on B1C, TGD_B2ap on B2a.
-    """
-    row = newest_record(records, satellite, time)
-    letter = satellite[0]
-    frequency = CARRIER_FREQUENCY[letter]
-    if letter == "C":
-        of_band = {"1": records.group_delay_1_s, "2": records.group_delay_1_s, "5": records.group_delay_2_s}
-        return of_band[signal[0]][row] if signal[0] in of_band else np.zeros(len(row))
-    delay = records.group_delay_2_s if letter == "E" else records.group_delay_1_s
-    if signal[0] == "5":
-        scale = (frequency["1"] / frequency["5"]) ** 2
-        return np.asarray(delay[row] - (records.group_delay_1_s[row] * (1.0 - scale) if letter == "E" else 0.0))
-    return np.asarray(delay[row] * (frequency["1"] / frequency[signal[0]]) ** 2)
 
 
 _WALK = 5  #: Stream of random numbers of the walks.

@@ -25,7 +25,7 @@ from railfix.simulate.sensor_tables import COLUMNS, sensor_tables
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 
-#: Groups of settings of which the README names only what is not at its default.
+#: Groups of settings for which the README lists only those that are not at their default.
 _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_error.")
 
 
@@ -72,14 +72,14 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
     off = ", with an error (line.map_error)" if error.plan_sigma_m or error.height_sigma_m else ""
     what = {
         "front": "RINEX 3.04 observations of the front roof antenna",
-        "rear": "the same of the rear antenna",
+        "rear": "observations of the rear antenna",
         "nav": "RINEX 3.04 broadcast records",
         "track": f"track map, {len(simulation.line.track())} points; ellipsoidal heights{off}",
         "vehicle": "bogie distance, gauge, antennas",
         "truth": "ground truth: chainage of the centreline point abeam each antenna, its position (ECEF), speed, "
         "acceleration, kind of section",
         **{
-            station.name: "the same of a reference station; its position is in the header"
+            station.name: "observations of a reference station; its position is in the header"
             for station in simulation.scenario.stations
         },
         "sbas": "SBAS messages as RTKLIB logs them: time of week of the complete reception, PRN, type, message",
@@ -119,7 +119,7 @@ def _list_effects(scenario: Scenario) -> str:
         ))  # fmt: skip
         place = {"ahead": ranging.along_m, "right": right, "above": above}
         given = " ".join(f"--set sensors.range_{name}_m={metres:g}" for name, metres in place.items() if metres)
-        parts.append(f"The place of the vehicle's ranging unit, for `railfix run`: `{given}`.")
+        parts.append(f"The position of the vehicle's ranging unit, for `railfix run`: `{given}`.")
     balises = None if scenario.sensors is None else scenario.sensors.balises
     if balises is not None and balises.along_m:
         parts.append(f"The balises' reader, for `railfix run`: `--set sensors.balise.ahead_m={balises.along_m:g}`.")
@@ -129,7 +129,7 @@ def _list_effects(scenario: Scenario) -> str:
 
 
 def _settings(scenario: Scenario) -> dict[str, Any]:
-    """Return settings by their names; of the longer groups what is not at its default."""
+    """Return settings by their names; of the longer groups only those that are not at their default."""
     usual = Scenario(sensors=None).describe()
     table = {}
     for name, value in scenario.describe().items():
@@ -139,18 +139,18 @@ def _settings(scenario: Scenario) -> dict[str, Any]:
     return table
 
 
-#: Decimals of metres, metres a second and metres a second squared in the truth.
+#: Decimals of metres, metres per second and metres per second squared in the truth.
 TRUTH_DECIMALS: Final = 4
 _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",)
 
 
 def truth_table(simulation: Simulation) -> pl.DataFrame:
-    """Return the ground truth of the antennas at the epochs of their receivers, one row an epoch and antenna.
+    """Return the ground truth of the antennas at the epochs of their receivers, one row per epoch and antenna.
 
     `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point abeam the antenna, on the track map's chainage),
     `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage), `acceleration_mps2` (along the
-    line, positive toward rising chainage), `environment` (kind of section, "open" outside all). The position is
-    that of the true instant, which is the tag less the receiver clock's bias.
+    line, positive toward rising chainage), `environment` (kind of section, "open" outside all). The position is that of
+    the true instant, which is the tag less the receiver clock's bias.
     """
     line, time = simulation.line, simulation.time()
     tags = seconds(time - simulation.scenario.start)
@@ -285,7 +285,7 @@ def _parquet(table: pl.DataFrame) -> bytes:
 
 
 def vehicle_table(vehicle: VehicleSettings) -> dict[str, Any]:
-    """Return the vehicle as the vehicle file holds it, see `railfix.track.vehicle.read_vehicle`."""
+    """Return the vehicle as in a vehicle file, see `railfix.track.vehicle.read_vehicle`."""
     antennas = {
         name: dict(zip(("along_m", "across_m", "up_m"), getattr(vehicle, name), strict=True)) for name in ANTENNAS
     }

@@ -10,13 +10,13 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import FREQUENCY_L1
-from railfix.core.timescale import seconds, timedelta
+from railfix.core.timescale import timedelta
+from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.ranges.sbas.ionosphere import BANDS, COLUMNS, POINT_OF_BIT
 from railfix.ranges.sbas.messages import DATA_BITS, PREAMBLES, with_parity
 from railfix.ranges.sbas.standard import DO_NOT_USE, NOT_MONITORED
 from railfix.simulate.constellation import newest_record
 from railfix.simulate.errors import fault_m
-from railfix.simulate.receiver import ionosphere_m
 from railfix.simulate.settings import SbasSettings
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def grid_mask(second: int, band: int, bits: Collection[int], iodi: int = 0, band
 def grid_delay(
     second: int, band: int, block: int, delay: Sequence[float], givei: Sequence[int], iodi: int = 0
 ) -> Bytes:
-    """Type 26; delays in metres, 63.875 says do not use; points left over are not monitored."""
+    """Type 26; delays in metres, 63.875 means do not use; remaining points are not monitored."""
     raw = [round(v / STEP_M) for v in delay] + [0] * (15 - len(delay))
     grades = list(givei) + [NO_DELAY] * (15 - len(givei))
     pairs = [field for v, g in zip(raw, grades, strict=True) for field in ((v, 9), (g, 4))]
@@ -134,7 +134,7 @@ def grid_delay(
 
 #: Slots of one message of types 2 to 5; satellites of one of type 25; points of one of type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-_MIXED: Final = 6  #: Slots of type 24, which takes the place of the last fast message where no more are left.
+_MIXED: Final = 6  #: Slots of type 24, which replaces the last fast message where no more remain.
 #: Largest correction, orbit correction and delay that the fields hold [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
 FAST_PERIOD_S: Final = 6  #: Seconds from one fast correction of a satellite to the next.
@@ -148,7 +148,8 @@ class Service:
         self._simulation, self._settings = simulation, settings
         scenario = simulation.scenario
         names = {str(name) for name in simulation.navigation.kepler.satellite}
-        # All of the mask, not only what the train sees; each satellite's errors are its own, so they are the same.
+        # All satellites of the mask, not only those in view of the train; each satellite's errors are its own, so they
+        # are the same.
         self.satellites = sorted((name for name in names if self.slot(name)), key=self.slot)
         self._errors, self._start = simulation.compute_errors(self.satellites), scenario.start
         self._group_delay_m = self._errors.group_delay_m(self.satellites, ["1C"] * len(self.satellites))
@@ -216,13 +217,10 @@ class Service:
         at = self._instant(second)
         latitude, longitude = (np.array([point[k] for point in points]) for k in (1, 2))
         time = self._start + timedelta(at)
-        day_s = float(seconds(time - time.astype("datetime64[D]"))[0])
-        zenith = np.full(len(points), 90.0)
-        model = ionosphere_m(
-            self._simulation.navigation.klobuchar["G"], np.full(len(points), day_s), latitude, longitude, zenith,
-            np.zeros(len(points)), frequency_hz=FREQUENCY_L1,
-        )  # fmt: skip
-        places = latitude[:, None], longitude[:, None], zenith[:, None], np.zeros((len(points), 1))
+        zenith, north = np.full((len(points), 1), 90.0), np.zeros((len(points), 1))
+        coefficients, l1 = self._simulation.navigation.klobuchar["G"], np.array(FREQUENCY_L1)
+        model = klobuchar_delay_m(time, latitude, longitude, zenith, north, coefficients, l1)[:, 0]
+        places = latitude[:, None], longitude[:, None], zenith, north
         error = self._errors.ionosphere_m(np.repeat(at, len(points)), *places)[:, 0]
         total = self._simulation.scenario.sky.ionosphere_scale * model + error
         total = total + self._settings.delay_sigma_m * self._rng[_DELAY].standard_normal(len(points))

@@ -13,10 +13,12 @@ from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
 from railfix.core.files import FilePath, write_whole
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
+from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.ranges.sbas import SbasMessages
 from railfix.ranges.sbas.dfmc import AUGMENTED, FIRST, SLOT_OF
 from railfix.ranges.sbas.messages import PREAMBLES, message_type
-from railfix.simulate.receiver import group_delay_s, list_signals
+from railfix.simulate.constellation import newest_record
+from railfix.simulate.receiver import list_signals
 from railfix.simulate.sbas_service import CLOCK, FAST_PERIOD_S, Field, Service, pack_message
 from railfix.simulate.settings import SbasSettings
 
@@ -90,7 +92,7 @@ def parameters(
 
 #: Factor of the covariance that is sent: 1.03 to 1.06 times the indicator's sigma along a line of sight.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
-_LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field holds [m].
+_LARGEST_M: Final = 63.9  #: Largest correction of a clock that the field can represent [m].
 _GROWTH_MPS: Final = 0.002  #: Growth of the corrections' errors until the next ones [m/s].
 
 
@@ -114,7 +116,7 @@ class SimulatedDfmc(Service):
         for signals, added in zip((first, other), delay_m, strict=True):
             for k, (name, signal) in enumerate(zip(names, signals, strict=True)):
                 if name[0] == "G":
-                    added[k] += SPEED_OF_LIGHT * group_delay_s(kepler, name, signal, time)[0]
+                    added[k] += SPEED_OF_LIGHT * group_delay_s(kepler, signal)[newest_record(kepler, name, time)[0]]
         clock = self._errors.clock_error_m(at)[0] - (ratio * delay_m[0] - delay_m[1]) / (ratio - 1.0)
         clock = clock + self._settings.clock_sigma_m * self._rng[CLOCK].standard_normal(len(names))
         return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
@@ -154,16 +156,16 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
     """Return messages from `lead_s` before the run to its end, one a second.
 
     Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
-    long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` puts
-    into clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
-    On L5: integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
+    long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` adds
+    to clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected. On L5:
+    integrity (types 35, 36) every 6 s, between them mask, degradation and corrections of GPS, Galileo, BeiDou.
     """
     service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario
     fast, slow = service.fast_messages(), service.slow_messages()
     first = -int(np.ceil(settings.lead_s))
     sent, bits, turn = [], [], 0
-    # The preamble goes by the second of the day, the frame of six seconds too.
+    # The preamble depends on the second of the day, like the frame of six seconds.
     day = int(seconds(scenario.start - scenario.start.astype("datetime64[D]")))
     for second in range(first, int(np.ceil(scenario.duration_s))):
         place = (day + second) % FAST_PERIOD_S

@@ -71,7 +71,7 @@ class RunSettings(ScenarioSettings):
     #: Curves are run at the speed whose equilibrium cant is the curve's cant and this; None: curves do not limit.
     cant_deficiency_m: Positive | None = None
     jerk_mps3: Positive | None = None  #: Largest jerk; None: accelerations begin and end at once.
-    #: Of the first leg. The vehicle's front points to rising chainage either way.
+    #: Direction of the first leg. The vehicle's front points to rising chainage in either direction of running.
     direction: Literal["rising", "falling"] = "rising"
     at_end: Literal["return", "stand"] = "return"  #: After the last stop.
 
@@ -87,9 +87,8 @@ class RunSettings(ScenarioSettings):
 class VehicleSettings(ScenarioSettings):
     """The vehicle, in metres; antennas as (along, across to the right, above the rail tops).
 
-    The origin lies midway between the bogie centres at the height of the rail tops; the front points
-    in the direction of rising chainage. Cant is measured between the wheels' contact points,
-    70 mm wider than the gauge.
+    The origin is midway between the bogie centres at the height of the rail tops; the front points in the direction of
+    rising chainage. Cant is measured between the wheels' contact points, 70 mm wider than the gauge.
     """
 
     name: str = "simulated test car"
@@ -97,7 +96,7 @@ class VehicleSettings(ScenarioSettings):
     gauge_m: Positive = 1.067
     front: Three = (9.1, 0.25, 3.95)
     rear: Three = (-9.1, 0.25, 3.95)
-    length_m: Positive = 23.2  #: Over the ends, which are at the same distance from the middle between the bogies.
+    length_m: Positive = 23.2  #: Distance over the ends, which are equally far from the middle between the bogies.
     #: Roll of the body about its forward axis at 20 m/s and more, in proportion to the speed below that. Not in the
     #: vehicle's file, as it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0
@@ -116,10 +115,10 @@ class SkySettings(ScenarioSettings):
     #: Letters out of G (30 satellites in 6 planes), J (3 inclined, 1 over the equator), E (24 in 3 planes), C (24 in 3
     #: planes and 3 inclined geosynchronous; no GEO); or those of the file.
     systems: str = "GJE"
-    #: A RINEX navigation file in place of the simulated satellites; in a scenario file relative to that file.
+    #: A RINEX navigation file instead of the simulated satellites; in a scenario file relative to that file.
     nav: str | None = None
     cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Elevation below which no signal is tracked.
-    #: Satellites whose newer records say unhealthy, while the record before the run says healthy.
+    #: Satellites whose newer records are unhealthy, while the record before the run is healthy.
     unhealthy: tuple[str, ...] = ("G02",)
     #: Only that many, the highest of each epoch, are tracked.
     satellites_at_most: Annotated[int, Field(ge=1)] | None = None
@@ -149,7 +148,7 @@ class ReceiverSettings(ScenarioSettings):
     """
 
     signals_per_satellite: Literal[1, 2] = 1  #: 1 gives four observables a satellite, 2 gives eight.
-    #: Second signals: L2C, E5b, B3I; or L5, E5a and B2a, with B1C in place of B1I and B-CNAV1 in place of D1.
+    #: Second signals: L2C, E5b, B3I; or L5, E5a and B2a, with B1C instead of B1I and B-CNAV1 instead of D1.
     second: Literal["L2", "L5"] = "L2"
     #: 0 switches that noise off.
     code_sigma_m: NotNegative = 0.5
@@ -163,7 +162,7 @@ class ReceiverSettings(ScenarioSettings):
     cn0_rise_db: Finite = CN0_RISE_DB
     cn0_satellite_sigma_db: NotNegative = 0.0  #: Constant difference of each satellite's C/N0.
     clocks: Literal["separate", "common"] = "separate"  #: Whether the two receivers run on one clock by hardware.
-    #: Of the front receiver at the start [s], and [s/s]; a separate rear clock has other values of this size.
+    #: Clock of the front receiver at the start [s], and [s/s]; a separate rear clock has other values of this size.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
     clock_drift: Finite = 2.0e-7
     #: "millisecond" puts a clock that is over half a millisecond off back by a whole one.
@@ -176,9 +175,10 @@ class ReceiverSettings(ScenarioSettings):
 
 
 class ReferenceStation(ScenarioSettings):
-    """Receiver that stands beside the line under an open sky; its clock and noise are its own."""
+    """Receiver near the line under an open sky, with its own clock and noise."""
 
-    name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")  #: Of its log; small letters, digits and hyphens.
+    #: Name of its log; small letters, digits and hyphens.
+    name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")
     #: Position: along the line, to the right of the track's axis, above the rails.
     chainage_m: Finite = 0.0
     lateral_m: Finite = 50.0
@@ -206,7 +206,7 @@ class Scenario(ScenarioSettings):
     #: Seed of the structures along the line, so that runs of other seeds pass the same structures.
     place_seed: Seed = 1
     sensors: SensorSettings | None = None  #: Sensors on board besides the receivers.
-    #: Reference stations whose observations are written beside the train's.
+    #: Reference stations whose observations are written in addition to the train's.
     stations: tuple[ReferenceStation, ...] = ()
     sbas: SbasSettings | None = None  #: SBAS that corrects the simulated errors, and that the train receives.
     #: Further disturbances of the signals, from Python only; not in `describe` nor in scenario files.
@@ -237,7 +237,7 @@ class Scenario(ScenarioSettings):
         return self
 
     def check_room(self, length_m: float) -> None:
-        """Raise SettingsError where the vehicle or a station would stand beyond an end of a line of this length."""
+        """Raise SettingsError where the vehicle or a station would be beyond an end of a line of this length."""
         if problem := self._room_problem(length_m):
             raise SettingsError(problem)
 
@@ -279,7 +279,7 @@ class Scenario(ScenarioSettings):
         return np.timedelta64(round(1e7 / self.rate_hz) * 100, "ns")
 
     def describe(self) -> dict[str, Any]:
-        """Return all settings as plain values, by their dotted names; those of a list by their number, from 1."""
+        """Return all settings as plain values, by their dotted names; elements of a list by their number, from 1."""
         return _flatten("", self.model_dump() | {"start": str(self.start)})
 
 

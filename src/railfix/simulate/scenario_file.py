@@ -1,7 +1,7 @@
-"""Scenario files: TOML of one run, the settings of `Scenario` by their names, or a recipe that lists several.
+"""Scenario files: TOML of one run, the settings of `Scenario` by their names, or a recipe of several runs.
 
-``duration_s = "run"`` lasts until the train stands at its last stop. A recipe names a base, another file beside it or a
-shipped one, and for each run what differs::
+``duration_s = "run"`` lasts until the train stands at its last stop. A recipe names a base, another file in its folder
+or a shipped one, and for each run the differences::
 
     description = "two runs"
     base = "p1-commercial"
@@ -48,12 +48,12 @@ class Recipe:
 
     path: Path
     description: str
-    names: tuple[str, ...]  #: Of the runs; one empty name where the file is a single run.
+    names: tuple[str, ...]  #: Names of the runs; one empty name where the file is a single run.
     tables: tuple[Mapping[str, Any], ...]  #: Settings of each run, paths in them absolute.
 
     def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
-        """Scenario of a run, counted from 0, with settings that override those of the file, in tables as the file has
-        them.
+        """Return the scenario of a run (from 0); `changes` has settings that replace those of the file, in the same
+        tables.
 
         SettingsError: when a setting is misspelt, of the wrong kind, or out of range. InputFileError: when the track
         file of a line whose run gives the duration cannot be read.
@@ -113,7 +113,7 @@ def load_recipe(name: FilePath) -> Recipe:
         raise SettingsError(f"{path}: unknown key {unknown[0]} in a recipe; known are description, base, parts, runs")
     runs = table.get("runs")
     if not isinstance(runs, list) or not runs or not all(isinstance(run, dict) for run in runs):
-        raise SettingsError(f"{path}: a recipe lists its runs as [[runs]], each with a name and what differs")
+        raise SettingsError(f"{path}: a recipe lists its runs as [[runs]], each with a name and its differences")
     base: Mapping[str, Any] = {}
     if "base" in table:
         beside = path.parent / str(table["base"])
@@ -157,7 +157,7 @@ def load_scenario(name: FilePath) -> Scenario:
 
 
 def scenario_table(scenario: Scenario) -> dict[str, Any]:
-    """Return all settings of a scenario as a scenario file holds them, for `railfix.core.settings.write_toml`.
+    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings.write_toml`.
 
     None is the word "none"; `multipath` is not in it.
     """

@@ -1,4 +1,4 @@
-"""Settings of the simulator's errors and sensors, none by default, and the types that all settings share."""
+"""Settings of the simulator's errors and sensors, none by default, and common types of settings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from railfix.core.timescale import gps_time
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]  #: A probability or a share of a total.
+Share = Annotated[float, Field(ge=0.0, le=1.0)]  #: A probability or a fraction.
 #: Three components, forward, right and down.
 Three = tuple[Finite, Finite, Finite]
 Seed = Annotated[int, Field(ge=0)]
@@ -80,7 +80,7 @@ GpsTime = Annotated[np.datetime64, PlainValidator(_gps_time), PlainSerializer(_t
 
 
 class ScenarioSettings(Settings):
-    """Base of the simulator's settings: the word "none" stands for None, which TOML does not have."""
+    """Base of the simulator's settings: the word "none" represents None, which TOML lacks."""
 
     @model_validator(mode="before")
     @classmethod
@@ -161,14 +161,14 @@ class InterSystemSettings(ScenarioSettings):
 
     offset_m: Finite = 0.0  #: At the start of the run.
     drift_mps: Finite = 0.0
-    #: Bias of the rear receiver less that of the front receiver, whether their clock is common or not.
+    #: Bias of the rear receiver less that of the front receiver, for common and separate clocks.
     rear_difference_m: Finite = 0.0
 
 
 class NoiseSettings(ScenarioSettings):
     """Time-correlated receiver noise; the sigmas are those of `ReceiverSettings`."""
 
-    code_correlated_share: Share = 0.0  #: Share of the code noise's variance, in [0, 1], that is correlated in time.
+    code_correlated_share: Share = 0.0  #: Fraction of the code noise's variance, in [0, 1], that is correlated in time.
     #: Its correlation time: a code loop of noise bandwidth B has 1 / (4 B), 1 s at 0.25 Hz.
     code_correlation_time_s: Positive = 1.0
     #: Gauss-Markov variation of C/N0, independent for each channel.
@@ -200,7 +200,7 @@ class ErrorSettings(ScenarioSettings):
     ionosphere: IonosphereErrorSettings = IonosphereErrorSettings()
     troposphere: TroposphereErrorSettings = TroposphereErrorSettings()
     faults: tuple[SatelliteFault, ...] = ()
-    #: Of both receivers; one walk where `ReceiverSettings.clocks` is "common".
+    #: Clock of both receivers; one random walk where `ReceiverSettings.clocks` is "common".
     clock: ClockWalkSettings = ClockWalkSettings()
     intersystem: dict[System, InterSystemSettings] = Field(default_factory=dict)  #: By the letter of the constellation.
     noise: NoiseSettings = NoiseSettings()
@@ -233,12 +233,12 @@ class TachometerSettings(ScenarioSettings):
     pulses_per_turn: int = Field(default=60, gt=0)
     wheel_diameter_m: Positive = 0.86  #: Nominal.
     diameter_error_m: Finite = 0.0  #: True minus nominal.
-    resolution_s: NotNegative = 0.0  #: Of the pulses' times; 0: a nanosecond.
+    resolution_s: NotNegative = 0.0  #: Noise of the pulses' times; 0: a nanosecond.
     jitter_s: NotNegative = 0.0  #: Standard deviation of a pulse's time.
     lowest_mps: NotNegative = 0.0  #: No pulses come below this speed of the wheel.
-    #: Standard deviation of each tooth's place as a share of the spacing of the teeth; the same every turn.
+    #: Standard deviation of each tooth's position as a fraction of the spacing of the teeth; the same every turn.
     tooth_sigma: float = Field(default=0.0, ge=0.0, le=0.2)
-    #: Probability that a pulse is not seen, and that it is followed by a second one before the next tooth.
+    #: Probability that a pulse is not detected, and that it is followed by a second one before the next tooth.
     lost_chance: Share = 0.0
     doubled_chance: Share = 0.0
     slips: tuple[SlipInterval, ...] = ()  #: In order, without overlap.
@@ -255,7 +255,7 @@ class TachometerSettings(ScenarioSettings):
     @model_validator(mode="after")
     def _small_error(self) -> TachometerSettings:
         if not abs(self.diameter_error_m) < 0.5 * self.wheel_diameter_m:
-            raise ValueError(f"diameter_error_m must be small beside the diameter, got {self.diameter_error_m}")
+            raise ValueError(f"diameter_error_m must be small compared with the diameter, got {self.diameter_error_m}")
         return self
 
 
@@ -321,7 +321,7 @@ class RadarSettings(ScenarioSettings):
 
 
 class GroundUnit(ScenarioSettings):
-    """Ranging unit beside the track."""
+    """Ranging unit near the track."""
 
     name: str = Field(min_length=1)
     #: Position: along the line, to the right of the track's axis, above the rails.
@@ -332,7 +332,7 @@ class GroundUnit(ScenarioSettings):
 
 
 class RangingSettings(ScenarioSettings):
-    """Two-way ranging to units beside the track (P2, table 3: every 200 ms, about 100 m; 3.3: sigma 0.19 to 0.24 m)."""
+    """Two-way ranging to units near the track (P2, table 3: every 200 ms, about 100 m; 3.3: sigma 0.19 to 0.24 m)."""
 
     units: tuple[GroundUnit, ...] = ()
     interval_s: Positive = 0.2
@@ -345,7 +345,7 @@ class RangingSettings(ScenarioSettings):
     #: Error that depends on the position alone, independent from cell to cell of this length along the line.
     multipath_sigma_m: NotNegative = 0.0
     multipath_cell_m: Positive = 0.25
-    #: Share of the cells where an echo hides the direct path, and the mean of its exponential excess.
+    #: Fraction of the cells in which an echo hides the direct path, and the mean of its exponential excess.
     echo_chance: Share = 0.0
     echo_delay_m: NotNegative = 0.8
     lost_chance: Share = 0.0  #: Probability that an answer is lost.
@@ -370,13 +370,13 @@ class BaliseSettings(ScenarioSettings):
     """Balises and their reader on the vehicle."""
 
     balises: tuple[Balise, ...] = ()
-    #: Others are so far apart from each other and the beginning of the line, named B001 and on; 0 for none.
+    #: Other balises have this spacing from each other and the beginning of the line, named B001 and on; 0 for none.
     spacing_m: NotNegative = 0.0
-    along_m: Finite = 0.0  #: Place of the reader along the body, as the antennas'.
+    along_m: Finite = 0.0  #: Position of the reader along the body, like the antennas'.
     noise_sigma_m: NotNegative = 0.0  #: Error of a reading along the line.
     missed: tuple[str, ...] = ()  #: Balises that are not read.
     wrong: dict[str, str] = Field(default_factory=dict)  #: Balises that are read with another identity.
-    #: The same by chance, the identity being that of another balise.
+    #: Probability of a reading with the identity of another balise.
     missed_chance: Share = 0.0
     wrong_chance: Share = 0.0
 
@@ -396,7 +396,7 @@ class SbasSettings(ScenarioSettings):
 
     band: Literal["L1", "L5"] = "L1"  #: L5 needs receivers with ``signals_per_satellite = 2, second = "L5"``.
     prn: Annotated[int, Field(ge=120, le=158)] = 137
-    latency_s: NotNegative = 4.0  #: Corrections are those of so much before the first bit of their message.
+    latency_s: NotNegative = 4.0  #: Corrections are computed for this time before the first bit of their message.
     #: Indicators of the accuracy of all satellites and grid points, as sent.
     udrei: Annotated[int, Field(ge=0, le=13)] = 5
     givei: Annotated[int, Field(ge=0, le=14)] = 9
@@ -405,11 +405,11 @@ class SbasSettings(ScenarioSettings):
     clock_sigma_m: NotNegative = 0.0
     orbit_sigma_m: NotNegative = 0.0
     delay_sigma_m: NotNegative = 0.0
-    #: Grid points so far from the line's first point, in latitude and longitude, are in the mask.
+    #: Grid points within this distance from the line's first point, in latitude and longitude, are in the mask.
     grid_radius_deg: Positive = 25.0
     #: A fault larger than this sets the satellite to "do not use" after this time.
     alert_m: Positive = 10.0
     alert_s: NotNegative = 6.0
     lost_chance: Share = 0.0  #: Probability that a message is not received.
-    #: The messages begin so long before the run, so that all corrections are there at its start.
+    #: The messages begin this long before the run, so that all corrections are available at its start.
     lead_s: NotNegative = 300.0

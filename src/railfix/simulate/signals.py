@@ -15,20 +15,22 @@ from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
+from railfix.gnss.orbits.prepared_records import group_delay_s
+from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.simulate.alignment import Alignment, build_alignment
-from railfix.simulate.constellation import SatelliteTable, links, simulate_navigation
+from railfix.simulate.constellation import SatelliteTable, links, newest_record, simulate_navigation
 from railfix.simulate.environment import Environment
 from railfix.simulate.environment.settings import CN0_SECOND_DB, Disturbances, SightGeometry
 from railfix.simulate.errors import CommonErrors, fault_m
 from railfix.simulate.motion import AntennaTruth, BodyMotion, Motion, antenna_truth, build_motion
-from railfix.simulate.receiver import Receiver, ReceiverClocks, group_delay_s, ionosphere_m, list_signals, troposphere_m
+from railfix.simulate.receiver import Receiver, ReceiverClocks, list_signals
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 CN0_STEP_DBHZ: Final = 0.25  #: Receivers report C/N0 in steps [dB-Hz].
 CHUNK_EPOCHS: Final = 2000  #: Epochs of one chunk.
 _LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites above the cutoff are searched [s].
 _RATE_S: Final = 0.005  #: Half the interval of the difference that gives range rates [s].
-#: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise no longer falls [dB-Hz].
+#: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise is constant [dB-Hz].
 _SIGMA_AT_DBHZ: Final = 45.0
 _BEST_DBHZ: Final = 50.0
 
@@ -85,7 +87,7 @@ class Simulation:
         return self.compute_errors(self.satellites)
 
     def compute_errors(self, satellites: Sequence[str]) -> CommonErrors:
-        """Return the errors of satellites and atmosphere; those of a satellite do not depend on the others."""
+        """Return satellite and atmospheric errors; errors of a satellite are independent of the others."""
         scenario = self.scenario
         return CommonErrors(
             scenario.errors,
@@ -110,7 +112,7 @@ class Simulation:
         return self.body_truth(getattr(self.scenario.vehicle, antenna), seconds_s)
 
     def _station_truth(self, name: str, count: int) -> AntennaTruth:
-        """Position of a reference station, the same at all of so many instants."""
+        """Position of a reference station, repeated for a number of instants."""
         station = next(item for item in self.scenario.stations if item.name == name)
         at = np.full(count, station.chainage_m)
         place = self.line.point_beside(at, station.lateral_m, station.height_m)
@@ -138,7 +140,7 @@ class Simulation:
         return tuple((name, signal) for name in names for signal in list_signals(name[0], scenario.receiver))
 
     def header(self, antenna: str) -> ObservationHeader:
-        """Header of a receiver's log; the approximate position is rounded to 100 m, that of the station is exact."""
+        """Header of a receiver's log; the approximate position is rounded to 100 m, a station's is exact."""
         place = self.truth(antenna, np.zeros(1))[0].ecef_m[0]
         return ObservationHeader(
             version=3.04,
@@ -152,7 +154,7 @@ class Simulation:
         )
 
     def pieces(self, antenna: str, *, chunk_epochs: int = CHUNK_EPOCHS) -> Iterator[Piece]:
-        """Yield the truth and observations of one antenna, piece by piece; any cutting gives the same numbers."""
+        """Yield the truth and observations of one antenna, piece by piece; results do not depend on the pieces."""
         receiver = Receiver(
             self.scenario,
             antenna,
@@ -187,18 +189,12 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
     found = simulation.satellite_table.links(time, late_s, antenna_ecef_m)
     sky = found.satellite_ecef_m
     elevation, azimuth = elevation_azimuth(sky, antenna_ecef_m)
-    latitude, longitude, height = (part[:, None] for part in geodetic_from_ecef(antenna_ecef_m))
+    latitude, longitude, height = geodetic_from_ecef(antenna_ecef_m)
     # Far below the horizon nothing is tracked; the formulas only have to stay finite there.
     raised = np.maximum(elevation, 1.0)
-    troposphere = troposphere_m(latitude, height, raised)
-    ionosphere = ionosphere_m(
-        navigation.klobuchar["G"],
-        seconds(time - time.astype("datetime64[D]"))[:, None],
-        latitude,
-        longitude,
-        raised,
-        azimuth,
-        frequency_hz=FREQUENCY_L1,
+    troposphere = saastamoinen_delay_m(latitude, height, raised)
+    ionosphere = klobuchar_delay_m(
+        time, latitude, longitude, raised, azimuth, navigation.klobuchar["G"], np.array(FREQUENCY_L1)
     )
     distance = found.range_m - SPEED_OF_LIGHT * found.clock_s
     errors = simulation.common_errors
@@ -208,7 +204,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
         sight = sky - antenna_ecef_m[:, None, :]
         sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
         path_error = errors.path_m(when, sight, raised)
-        ionosphere_error = errors.ionosphere_m(when, latitude, longitude, raised, azimuth)
+        ionosphere_error = errors.ionosphere_m(when, latitude[:, None], longitude[:, None], raised, azimuth)
     return _Instant(
         elevation_deg=elevation,
         azimuth_deg=azimuth,
@@ -265,8 +261,9 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     extra = fault + receiver.offset_m + receiver.offset_drift_mps * tags[:, None]
     extra_rate = fault_rate + receiver.offset_drift_mps
     path = now.path_m[:, column] + clock[:, None] + extra
+    kepler = simulation.navigation.kepler
     delay = SPEED_OF_LIGHT * np.stack(
-        [group_delay_s(simulation.navigation.kepler, n, g, time) for n, g in simulation.channels], axis=1
+        [group_delay_s(kepler, g)[newest_record(kepler, n, time)] for n, g in simulation.channels], axis=1
     )
     code = path + ionosphere + delay + receiver.group_delay_error_m
     error = now.path_error_m[:, column] + scale * now.ionosphere_error_m[:, column]

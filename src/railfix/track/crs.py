@@ -52,10 +52,10 @@ class HeldFrame:
     itrf: str  #: Name of the realisation.
     epoch: float  #: [year].
     plate: str  #: Plate of the ITRF2020 model that carries most of the country.
-    #: What the country moves against that plate, at the least and the most [mm a year].
+    #: Least and largest motion of the country relative to that plate [mm per year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""  #: What else is left out.
-    #: Another plate, and two places (latitude, longitude) of a line to the right of which it carries the country.
+    but: str = ""  #: Other neglected motions.
+    #: Another plate, and two points (latitude, longitude) of a line to the right of which it carries the country.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
 
     @property
@@ -64,7 +64,7 @@ class HeldFrame:
         return _ITRF[self.itrf]
 
     def plate_at(self, latitude_deg: float, longitude_deg: float) -> str:
-        """Return the plate that carries a place of the country."""
+        """Return the plate that carries a point of the country."""
         if self.border is None:
             return self.plate
         other, (south, west), (north, east) = self.border
@@ -72,14 +72,14 @@ class HeldFrame:
         return other if cross < 0.0 else self.plate
 
     def describe_rest(self, years: float) -> str:
-        """Return what is left out after some years, in words."""
+        """Return the neglected motion after some years, in words."""
         low, high = (abs(years) * rate / 1000.0 for rate in self.rest_mm)
         but = f", {self.but}" if self.but else ""
         return f"its motion against that plate, {low:.2f} to {high:.2f} m, is left out{but}"
 
 
 _ANDES: Final = "as are earthquakes, metres in Chile since 2010"
-#: National frames that are a realisation of the ITRF held at an epoch, where PROJ has no motion for them.
+#: National frames that are a realisation of the ITRF fixed at an epoch, where PROJ has no motion for them.
 HELD: Final = {
     "JGD2011": HeldFrame(
         "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "and the epoch 1997.0 of western Japan, of which --map-epoch is asked"
@@ -135,7 +135,7 @@ HELD: Final = {
     "Mexico ITRF2008": HeldFrame("ITRF2008", 2010.0, "NOAM", (0.0, 50.0)),
     "RGSPM06": HeldFrame("ITRF2000", 2006.0, "NOAM"),
 }
-#: Frames whose coordinates are those of another one: its three-dimensional code, and how well.
+#: Frames with the coordinates of another frame: its three-dimensional code, and the agreement.
 SAME: Final = {
     "NAD83(CSRS)": (
         "EPSG:8254",
@@ -152,19 +152,19 @@ SAME: Final = {
 TRANSIT: Final = "WGS 84 (Transit)"  #: The first realisation of WGS 84, 0.8 m from the later ones.
 #: ITRF2020, three-dimensional geographic: the frame in which positions are computed.
 WORKING_FRAME: Final = "EPSG:9989"
-#: Frames that maps of a region are usually in: name, three-dimensional code. The first of a place is the likelier one.
+#: Frames that maps of a region are usually in: name, three-dimensional code. The first of a point is the likelier one.
 REGIONAL: Final = {
     "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
     "NZGD2000": "EPSG:4959", "SIRGAS 2000": "EPSG:4989", "Hartebeesthoek94": "EPSG:4941",
 }  # fmt: skip
 MARGIN_DEG: Final = 0.5  #: Margin about the area of use of a CRS [deg].
-#: Largest scale of a grid that is the one of a line, less 1: grids of countries have up to 0.005.
+#: Largest scale of a grid for a single line, less 1: national grids have up to 0.005.
 LARGEST_SCALE: Final = 0.01
 MODERN_M: Final = 0.5  #: Accuracy [m] worse than which a transformation of PROJ is between datums of another age.
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
-#: Operations of a worse accuracy are not used [m]; 999 in the EPSG dataset is none.
+#: Operations with a worse accuracy are not used [m]; 999 in the EPSG dataset means unknown.
 WORST_M: Final = 100.0
 #: Parts of the name of an operation of PROJ that change no datum.
 _NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
@@ -192,7 +192,7 @@ def _system(crs: str) -> CRS:
 
 
 def find_crs(crs: str, *, path: FilePath = "") -> CRS:
-    """Return the system of a name, asked for in a file; SettingsError when PROJ does not know it."""
+    """Return the system of a name that a file requests; SettingsError when PROJ does not know it."""
     try:
         return _system(crs)
     except CRSError:
@@ -203,7 +203,7 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 
 
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
-    """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
+    """The CRS given for a file, or the one that the file names; SettingsError when they contradict each other."""
     if given is None or named is None:
         used = given or named
         if used is not None:
@@ -216,7 +216,7 @@ def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | No
 
 
 def unit_of_grid(crs: str, *, path: str) -> float:
-    """Return the metres of the unit of a projected CRS; SettingsError when it is none."""
+    """Return the metres of the unit of a projected CRS; SettingsError when it has none."""
     system = find_crs(crs, path=path)
     if not system.is_projected and not (system.is_compound and system.sub_crs_list[0].is_projected):
         raise SettingsError(f"{path}: {crs} is {system.name}, no grid; a design is in one, such as EPSG:25832 (--crs)")
@@ -241,7 +241,7 @@ def get_geodetic_frame(crs: str) -> CRS:
     geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
-    # a CRS without names, such as +proj=utm +zone=32 +datum=WGS84, is that of its datum
+    # a CRS without names, such as +proj=utm +zone=32 +datum=WGS84, is identified by its datum
     authority = geodetic.to_authority() if geodetic.name == "unknown" else None
     return geodetic if authority is None else CRS.from_authority(*authority)
 
@@ -260,7 +260,9 @@ def find_operation(crs: str) -> Transformer | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Operations:
-    """What PROJ knows between two systems over a box: usable operations, best first, and those that lack grids."""
+    """Operations of PROJ between two systems over a box: usable operations, best first, and operations with missing
+    grids.
+    """
 
     usable: tuple[Transformer, ...]
     lacking: tuple[Any, ...] = ()
@@ -335,7 +337,7 @@ def contains(area: Any, box: Box) -> bool:
 
 
 def is_in_area(crs: CRS, latitude_deg: Floats, longitude_deg: Floats, *, margin_deg: float) -> Masks:
-    """Return which points lie in the area of use of a CRS, with a margin; all where it has none."""
+    """Return which points lie in the area of use of a CRS, with a margin; all points for a CRS without an area."""
     area = crs.area_of_use
     if area is None:
         return np.ones(len(latitude_deg), dtype=bool)
@@ -347,6 +349,6 @@ def _in_bounds(bounds: Box, latitude_deg: Floats, longitude_deg: Floats, margin_
     south, north, west, east = bounds
     inside = (latitude_deg >= south - margin_deg) & (latitude_deg <= north + margin_deg)
     width = (east - west) % 360.0 if east - west < 360.0 else 360.0
-    with np.errstate(invalid="ignore"):  # outside a grid there is no longitude
+    with np.errstate(invalid="ignore"):  # outside a grid the longitude is undefined
         from_west = (longitude_deg - west + margin_deg) % 360.0
     return np.asarray(inside & (from_west <= width + 2.0 * margin_deg))

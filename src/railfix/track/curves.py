@@ -1,9 +1,9 @@
 """Curve of a centreline between its points: arcs and clothoids in plan, parabolas in height, ramps of the cant.
 
-Between two points the curve is a cubic over their chord, given by its directions at both. The direction at a point is
-the mean of those that the chords on either side have there with a curvature that is linear between points: that of the
-map's radii, else of the circle through each point and its neighbours. Arcs, clothoids and parabolas are followed within
-millimetres so; every point lies on the curve, and chainages stay those of the chords.
+Between two points the curve is a cubic over their chord, given by its directions at both ends. The direction at a point
+is the mean of the directions that the chords on either side have there for a curvature that is linear between points:
+the map's radii, or the circle through each point and its neighbours. Arcs, clothoids and parabolas are thus followed
+within millimetres; every point lies on the curve, and chainages stay those of the chords.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Curvatures of the map are used where they move the middle of a chord by no more than this beside those of the points
-#: and their neighbours [m]; elsewhere the radius is of another place, or of the other side.
+#: Curvatures of the map are used where they move the middle of a chord by no more than this from the curvatures of the
+#: points and their neighbours [m]; elsewhere the radius belongs to another point, or to the other side.
 _AGREES_M: Final = 0.03
 _CORNER_RAD: Final = 0.25  #: Points at which the line turns by more than this are corners, which no curve rounds [rad].
-#: Ends of ramps are looked for between points, not at them: in this share of the gap from either, and where the values
-#: of the two lines differ by this much over it.
+#: Ends of ramps are searched for between points, not at them: at least this fraction of the gap from either, and where
+#: the values of the two lines differ by this much over it.
 _BREAK_SHARE: Final = 1e-3
 _LEAST_BREAK: Final = 1e-4
 _CHORD_M: Final = 2e-3  #: Chords of the points of `curved_line` leave the curve by no more than this [m].
@@ -34,7 +34,7 @@ _CHORD_M: Final = 2e-3  #: Chords of the points of `curved_line` leave the curve
 class CentreCurve:
     """Curve through the V points of a track."""
 
-    chainage_m: Floats  #: Of the points, shape (V,).
+    chainage_m: Floats  #: Values of the points, shape (V,).
     points_m: Floats  #: ECEF, shape (V, 3).
     #: Slopes against the chord at the start and the end of each segment, to the right and upward, (V - 1, 2) [rad].
     to_right: Floats
@@ -68,7 +68,7 @@ class CentreCurve:
         return np.asarray(self.length_m[segment] * share * (1.0 - share) * (first * (1.0 - share) - last * share))
 
     def chords_m(self, within_m: float) -> Floats:
-        """Return chainages, those of the points among them, whose chords stay within a distance of the curve."""
+        """Return chainages, including those of the points, whose chords stay within a distance of the curve."""
         # a cubic leaves its chord by an eighth of the change of direction, and more where its slopes differ in size
         turn = np.abs(self.to_right).sum(axis=1) + np.abs(self.to_top).sum(axis=1)
         pieces = np.maximum(np.ceil(np.sqrt(self.length_m * turn / (6.0 * within_m))), 1.0).astype(np.int64)
@@ -99,7 +99,7 @@ def centre_curve(track: Track) -> CentreCurve:
 
 
 def _to_ends(inner: Floats) -> Floats:
-    """Return values of the inner points with those of their neighbours at both ends, shape (V,)."""
+    """Return values of the inner points, extended by those of their neighbours at both ends, shape (V,)."""
     return np.concatenate([inner[:1], inner, inner[-1:]]) if len(inner) else np.zeros(2)
 
 
@@ -116,8 +116,8 @@ def _with_radii(track: Track, of_points: Floats) -> Floats:
 
 
 def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -> Floats:
-    """Return the slopes against the chord at both ends of each segment, shape (V - 1, 2): those of a curvature that is
-    linear between the points (V,), brought together at each inner point, at which the chords turn (V - 2,).
+    """Return the slopes against the chord at both ends of each segment, shape (V - 1, 2), for a curvature that is
+    linear between the points (V,), made equal at each inner point, at which the chords turn (V - 2,).
     """
     first, last = curvature[:-1], curvature[1:]
     start, end = -length_m * (2.0 * first + last) / 6.0, length_m * (first + 2.0 * last) / 6.0
@@ -129,9 +129,9 @@ def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -
 
 
 def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Return places and values of a function that is linear in pieces, with the ends of pieces between the points.
+    """Return chainages and values of a piecewise linear function, with the ends of pieces between the points.
 
-    Where the lines through the two points before and the two after a gap meet in it, the end of a ramp lies there.
+    Where the lines through the two points before and the two after a gap intersect in it, a ramp ends there.
     """
     if len(place_m) < 4:
         return place_m, values

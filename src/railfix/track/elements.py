@@ -1,6 +1,6 @@
 """Elements of an alignment in plan, profile and cant, as design files (IFC, LandXML) have them, and their segments.
 
-The direction is the integral of the curvature in closed form, the place that of the direction by Gauss-Legendre
+The direction is the integral of the curvature in closed form, the position that of the direction by Gauss-Legendre
 quadrature. Lengths are those of the plan, directions counter-clockwise from the x axis (easting), curvature positive to
 the left, as in IFC 4.3 and LandXML.
 """
@@ -25,7 +25,7 @@ from railfix.track.heights import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 from railfix.track.transitions import OrdinateElement
 
-#: Share of the change of curvature or cant at a share t of the element, and its integral from 0 (IFC 4.3.2).
+#: Fraction of the change of curvature or cant at a fraction t of the element, and its integral from 0 (IFC 4.3.2).
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     "linear": (lambda t: t, lambda t: t**2 / 2.0),
     "bloss": (lambda t: 3.0 * t**2 - 2.0 * t**3, lambda t: t**3 - t**4 / 2.0),
@@ -49,7 +49,7 @@ _PIECE_RAD: Final = 0.5  #: Longest piece of one quadrature [rad of direction]; 
 _CHORD_M: Final = 0.01
 _LONGEST_M: Final = 25.0
 _CLOTHOID_POINTS: Final = 2001  #: Points of a clothoid of the profile, between which it is linear within 1 um.
-_JOINT_M: Final = 0.01  #: Elements that begin further than this from the end of the one before are reported [m].
+_JOINT_M: Final = 0.01  #: Elements that begin farther than this from the end of the previous one are reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,8 +66,8 @@ class PlanElement:
 
     length_m: float
     law: str = "linear"  #: Key of `LAWS`.
-    #: Of a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
-    #: rail rises. The law is of the path of the centre of gravity; the track lies beside it by so much.
+    #: For a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
+    #: rail rises. The law describes the path of the centre of gravity, from which the track has this distance.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
@@ -104,7 +104,7 @@ Plan = PlanElement | OrdinateElement
 
 @dataclass(frozen=True)
 class Stations:
-    """Kilometrage of an alignment: places in plan with the station just before and just after each, rising [m]."""
+    """Kilometrage of an alignment: distances in plan with the station just before and just after each, rising [m]."""
 
     rows: tuple[tuple[float, float, float], ...]
     last_sign: float = 1.0  #: 1 where stations rise after the last row, -1 where they fall.
@@ -112,12 +112,12 @@ class Stations:
 
     @property
     def places_m(self) -> Floats:
-        """Places in plan of points on both sides of each jump."""
+        """Distances in plan of points on both sides of each jump."""
         place = np.array([row[0] for row in self.rows[1:]])
         return np.concatenate([place - self.jump_m, place + self.jump_m])
 
     def at(self, place_m: Floats) -> Floats:
-        """Return the stations at places in plan."""
+        """Return the stations at distances in plan."""
         place, _, ahead = np.array(self.rows).T
         row = np.clip(np.searchsorted(place, place_m, side="right") - 1, 0, len(place) - 1)
         signs = [*(np.sign(b[1] - a[2]) or 1.0 for a, b in pairwise(self.rows)), self.last_sign]
@@ -128,7 +128,7 @@ class Stations:
 class ProfileElement:
     """One element of the profile: gradient, circular arc, parabola or clothoid."""
 
-    #: Place and length in plan.
+    #: Distance and length in plan.
     start_m: float
     length_m: float
     height_m: float  #: At the start.
@@ -137,10 +137,10 @@ class ProfileElement:
     last: float
     #: ``"circle"``, ``"clothoid"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
     arc: str = "parabola"
-    bend: float = 0.0  #: Of a clothoid: curvature at the start, positive in a sag [1/m].
+    bend: float = 0.0  #: For a clothoid: curvature at the start, positive in a sag [1/m].
 
     def height_at(self, place_m: Floats) -> Floats:
-        """Return the height [m] at places in plan."""
+        """Return the height [m] at distances in plan."""
         way = place_m - self.start_m
         if self.arc == "parabola" or self.first == self.last:
             bend = (self.last - self.first) * way**2 / (2.0 * self.length_m)
@@ -153,7 +153,7 @@ class ProfileElement:
         return np.asarray(self.height_m - radius * (np.sqrt(1.0 - sine**2) - np.sqrt(1.0 - _sine(self.first) ** 2)))
 
     def gradient_at(self, place_m: Floats) -> Floats:
-        """Return the gradient [m/m] at places in plan."""
+        """Return the gradient [m/m] at distances in plan."""
         share = (place_m - self.start_m) / self.length_m
         if self.arc == "parabola" or self.first == self.last:
             return np.asarray(self.first + (self.last - self.first) * share)
@@ -165,7 +165,9 @@ class ProfileElement:
 
     @cached_property
     def _clothoid(self) -> tuple[Floats, Floats, Floats]:
-        """Places, heights over the start and gradients of a clothoid: its angle turns by a square of its length."""
+        """Distances, heights over the start and gradients of a clothoid, whose angle grows with the square of its
+        length.
+        """
         start, turn = np.arctan(self.first), np.arctan(self.last) - np.arctan(self.first)
         length = self.length_m
         for _ in range(20):  # the length along the curve whose projection is that in plan
@@ -240,7 +242,9 @@ def plan_starts(plan: Sequence[Plan]) -> Floats:
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return the rows and number of each element that places lie in: the last that begins before, else the first."""
+    """Return the rows and number of each element that contains the distances: the last that begins before, otherwise
+    the first.
+    """
     if not len(starts):
         return []
     index = np.maximum(np.searchsorted(starts, place_m, side="right") - 1, 0)
@@ -253,7 +257,7 @@ def alignment_points(
     cant: Sequence[CantElement],
     at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Points of an alignment such that chords stay within 1 cm of its arcs, and some places more; notes on joints that
+    """Points of an alignment such that chords stay within 1 cm of its arcs, and additional points; notes on joints that
     do not meet.
     """
     starts = plan_starts(plan)
@@ -346,7 +350,7 @@ def segment_of_design(
 
 
 def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
-    """Reject a profile that leaves out more of the plan than `_PROFILE_BEYOND_M`; note what it leaves out."""
+    """Reject a profile that leaves out more of the plan than `_PROFILE_BEYOND_M`; note the part left out."""
     length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
     high = max(element.start_m + element.length_m for element in profile)
     left_out = max(low, 0.0) + max(length - high, 0.0)
@@ -357,7 +361,7 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
 
 
 def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> None:
-    """Reject an alignment whose length on the map is not that of its design: its grid is another one."""
+    """Reject an alignment whose length on the map differs from its design length: its grid is another one."""
     designed = sum(element.length_m for element in plan)
     geod = CRS.from_user_input(place.frame).get_geod()
     found = float(geod.line_length(place.longitude_deg, place.latitude_deg)) if geod is not None else designed
@@ -381,7 +385,7 @@ def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
 
 
 def is_within(crs: str, xy: Floats) -> bool:
-    """Return whether coordinates lie in the area of use of a CRS; True where it has none."""
+    """Return whether coordinates lie in the area of use of a CRS; True for a CRS without an area."""
     system = CRS.from_user_input(crs)
     if system.area_of_use is None:
         return True

@@ -2,7 +2,7 @@
 
 Broadcast orbits (WGS 84) agree with ITRF2020 at the epoch of observation to centimetres. Maps are in a frame that moves
 with its plate, or in the ITRF at the epoch of their survey. PROJ transforms with coordinate epoch; where it cannot, the
-motion of the plate is used (Altamimi et al. 2023, doi:10.1029/2023GL106373), and said.
+motion of the plate is used (Altamimi et al. 2023, doi:10.1029/2023GL106373), with a note.
 """
 
 from __future__ import annotations
@@ -69,12 +69,12 @@ def decimal_year(time: np.datetime64 | Datetimes) -> float:
 
 
 class MapMotion(TypedDict, total=False):
-    """What moves coordinates of a map to the frame of the satellites, beside PROJ."""
+    """Transformation of map coordinates to the frame of the satellites, in addition to PROJ."""
 
     epoch: float | None  #: Epoch of the map's coordinates, where its frame is an ITRF [year].
     plate: str | None  #: Plate that moves coordinates of an ITRF from `epoch` to the time of the log: one of `PLATES`.
     #: Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
-    #: deformation included; `epoch` is that of the file then, from which on the plate moves them.
+    #: deformation included; `epoch` is that of the file, from which on the plate moves them.
     parameters: FilePath | None
 
 
@@ -135,7 +135,7 @@ def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
 def in_map_frame(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Move positions, or NaN, from the frame of the satellites to that of a map: `points_at` taken off."""
+    """Transform positions, or NaN, from the frame of the satellites to that of a map: `points_at` subtracted."""
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
         raise MismatchError("there is no position to move to the frame of the map")
@@ -180,7 +180,7 @@ def _from_held(
 
 
 def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
-    """A note on the realisation that is taken for an ensemble, or for a frame that has the coordinates of another."""
+    """A note on the realisation that represents an ensemble, or a frame with the coordinates of another."""
     if frame.name in SAME and not operation.description.startswith(frame.name):
         code, how_well = SAME[frame.name]
         return (f"map: {frame.name} is taken as {CRS.from_user_input(code).name}; {how_well}",)

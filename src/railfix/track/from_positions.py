@@ -23,10 +23,11 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 #: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 _TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
-#: Positions beside those before and after, within a time [s], by more than a distance [m] and this many medians of such
-#: distances are outliers; they are looked for anew without them, in some rounds, where there are enough positions.
-_NEAR_S: Final = 2.5
+#: Positions that deviate laterally from their neighbours by more than a distance [m], this many medians of such
+#: distances and a curve of this radius [m] are outliers; the search is repeated without them, in some rounds, where
+#: there are enough positions.
 _BESIDE_M: Final = 5.0
+_LEAST_RADIUS_M: Final = 150.0
 _BESIDE_MEDIANS: Final = 6.0
 _ROUNDS: Final = 20
 _ENOUGH: Final = 10
@@ -43,11 +44,11 @@ class ThinningLimits(Settings):
     #: Below this horizontal speed over `_STANDING_WINDOW_S` the antenna is stationary and its positions are noise or
     #: drift. Requires times; 0 keeps all.
     standing_mps: float = Field(default=0.2, ge=0)
-    #: Neighbouring points further apart, joined by a straight line, are reported.
+    #: Neighbouring points farther apart, joined by a straight line, are reported.
     jump_m: float = Field(default=50.0, gt=0)
-    gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points further apart do not form a line: an error.
+    gap_m: float = Field(default=2000.0, gt=0)  #: Neighbouring points farther apart do not form a line: an error.
     #: Positions that the vehicle could reach from the others only faster than this are wrong and dropped; without
-    #: times, those further than `gap_m` from the others.
+    #: times, positions farther than `gap_m` from the others.
     speed_mps: float = Field(default=150.0, gt=0)
 
 
@@ -57,7 +58,7 @@ class Thinned:
 
     kept: Indices  #: Rows that became points of the map, in order; shape (V,).
     dropped: dict[str, int]  #: Number of rows by reason.
-    jumps: Indices  #: Points whose successor is further away than `ThinningLimits.jump_m`, shape (j,).
+    jumps: Indices  #: Points whose successor is farther away than `ThinningLimits.jump_m`, shape (j,).
     jump_m: Floats  #: Distance to the successor, shape (j,).
     #: Points at which the path turns by more than 120 degrees: reversals, or wrong positions; shape (t,).
     turns: Indices
@@ -113,7 +114,7 @@ def thin(
             "without a position": int((~finite).sum()),
             "of insufficient quality": int((finite & ~good).sum()),
             "out of reach of the others": out_of_reach,
-            "beside those before and after": wrong,
+            "off the line of their neighbours": wrong,
             "standing still": int(stands.sum()),
             "nearer than the spacing": len(moving) - len(kept),
         },
@@ -154,8 +155,8 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 
 
 def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
-    """Flag positions beside the line between those before and after them, no more than `_NEAR_S` away: by more than
-    `_BESIDE_M` and `_BESIDE_MEDIANS` medians of all such distances, the farthest first.
+    """Flag positions off the line between their neighbours by more than `_BESIDE_M`, `_BESIDE_MEDIANS` medians of all
+    such distances, and what a curve of `_LEAST_RADIUS_M` needs, the farthest first.
     """
     wrong = np.zeros(len(time), dtype=np.bool_)
     if len(time) < _ENOUGH or np.isnat(time).any():
@@ -169,8 +170,8 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
         before, after = t[1:-1] - t[:-2], t[2:] - t[1:-1]
         share = (before / np.maximum(before + after, 1e-9))[:, None]
         off = np.linalg.norm(points[1:-1] - points[:-2] * (1.0 - share) - points[2:] * share, axis=1)
-        off[np.maximum(before, after) > _NEAR_S] = 0.0
-        limit = max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(off)))
+        of_curve = ((points[2:] - points[:-2]) ** 2).sum(axis=1) / (8.0 * _LEAST_RADIUS_M)
+        limit = np.maximum(of_curve, max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(off))))
         around = np.pad(off, 1)
         farthest = (off > limit) & (off >= around[:-2]) & (off > around[2:])
         if not farthest.any():
@@ -315,8 +316,8 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
     return usable
 
 
-#: Standard deviations of positions by their quality number (RTKLIB), plan and height [m]; a fix keeps what P1 states
-#: of a surveyed map. 2: float, 3: SBAS, 4: differential, 5: single point without corrections.
+#: Standard deviations of positions by their quality number (RTKLIB), plan and height [m]; a fix has that of P1 for a
+#: surveyed map. 2: float, 3: SBAS, 4: differential, 5: single point without corrections.
 SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (SIGMA_PLAN_M, SIGMA_HEIGHT_M), 2: (0.5, 1.0), 3: (1.5, 3.0), 4: (1.0, 2.0), 5: (3.0, 6.0)}
 )
@@ -358,7 +359,9 @@ def from_position_log(
     back = np.flatnonzero(np.diff(log.time[timed]) < np.timedelta64(0, "ns"))
     if len(back):
         line = int(log.line[timed[back[0] + 1]])
-        raise InputFileError(log.path, "the time is before that of the position above; sort them by time", line=line)
+        raise InputFileError(
+            log.path, "the time is before that of the preceding position; sort them by time", line=line
+        )
     thinned = thin(log.time, log.ecef_m, usable=usable, limits=limits)
     plan, height, accuracy = _accuracy(log, thinned.kept)
     try:

@@ -1,7 +1,7 @@
 """Coordinates of a map in degrees of a modern frame, the operation that led there, and its accuracy, in one value.
 
 Operations are those of PROJ (https://proj.org) whose area of use contains the map and whose grids are installed; a
-ballpark operation, which leaves the datum as it is, is never one of them.
+ballpark operation, which does not change the datum, is never used.
 """
 
 from __future__ import annotations
@@ -37,19 +37,20 @@ from railfix.track.crs import (
     rank_operation,
 )
 
-#: Projections of web maps and of the world, whose scale is none of a survey.
+#: Projections of web maps and of the world, whose scale is unsuitable for a survey.
 _UNEVEN: Final = (
     "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
 )  # fmt: skip
 _CELL_DEG: Final = 0.25  #: Maps within one cell of this size have one operation [deg].
 #: Accuracies better than this are within the accuracy of a map [m].
 NEGLIGIBLE_M: Final = 0.1
-_BETTER: Final = 0.9  #: An operation that lacks its grid is named where its accuracy is less than this of the one used.
+#: An operation with a missing grid is reported where its accuracy is better than this fraction of that of the one used.
+_BETTER: Final = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
 class Georeference:
-    """Coordinates of n points of a map in a modern frame, and how they came there."""
+    """Coordinates of n points of a map in a modern frame, and their transformation."""
 
     latitude_deg: Floats  #: Shape (n,).
     longitude_deg: Floats  #: Shape (n,).
@@ -66,10 +67,10 @@ class Georeference:
 
 @dataclass(frozen=True, kw_only=True)
 class EllipsoidalHeights:
-    """Ellipsoidal heights of n points of a map, and how they came there."""
+    """Ellipsoidal heights of n points of a map, and their transformation."""
 
     height_m: Floats  #: Shape (n,).
-    datum: str  #: That of the file: ``"ellipsoidal"`` or ``"orthometric"``.
+    datum: str  #: CRS of the file: ``"ellipsoidal"`` or ``"orthometric"``.
     geoid: str = ""  #: Geoid model or operation used; empty where none was needed.
     accuracy_m: float = 0.0  #: Standard deviation of the model [m]; NaN where it is unknown.
     notes: tuple[str, ...] = ()
@@ -87,7 +88,7 @@ def _box(latitude_deg: Floats, longitude_deg: Floats) -> Box:
 
 
 def _cells(box: Box) -> Box:
-    """Return a box widened to whole cells, so that the parts of one map have one operation."""
+    """Return a box widened to whole cells, so that the parts of one map share one operation."""
     south, north, west, east = box
     low = [float(np.floor(v / _CELL_DEG) * _CELL_DEG) for v in (south, west)]
     high = [float(np.ceil(v / _CELL_DEG) * _CELL_DEG) for v in (north, east)]
@@ -137,8 +138,8 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 
 
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
-    """Return the coordinates of places in a CRS, such as that of a raster: `georeference` reversed. Modern frames count
-    as one here: they are within 2 m of each other.
+    """Return the coordinates of positions in a CRS, such as that of a raster: `georeference` reversed. Modern frames
+    count as one here: they are within 2 m of each other.
     """
     if not find_crs(crs).is_bound and kind_of_frame(crs) != "older datum":
         conversion, unit, origin = _to_datum(crs)
@@ -151,7 +152,7 @@ def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]
 
 
 def _find_chosen(crs: str, box: Box, *, path: str) -> _Chosen:
-    """Return the operation of a map over a box; SettingsError where there is none."""
+    """Return the operation of a map over a box; SettingsError where none exists."""
     chosen = _choose_operation(crs, _cells(box))
     if isinstance(chosen, str):
         chosen = _choose_operation(crs, box)
@@ -207,7 +208,7 @@ def _choose_operation(crs: str, box: Box) -> _Chosen | str:
 
 def _targets(crs: str, box: Box) -> Iterable[str]:
     """Return the modern frames that a map may be transformed to: those of its region, then WGS 84."""
-    if get_geodetic_frame(crs).name == TRANSIT:  # of which the way to a realisation of the ITRF is known
+    if get_geodetic_frame(crs).name == TRANSIT:  # the frames with a known transformation to a realisation of the ITRF
         return ("EPSG:7902",)
     if find_crs(crs).is_bound:  # +towgs84
         return ("EPSG:4326",)
@@ -216,9 +217,9 @@ def _targets(crs: str, box: Box) -> Iterable[str]:
 
 
 def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
-    """Return the accuracy of the first of some operations [m]: as PROJ states it, or what the others leave of it.
+    """Return the accuracy of the first of some operations [m]: as stated by PROJ, or the remainder of the others.
 
-    Where an operation lies further from the first than its own accuracy, the first may be off by the rest.
+    Where an operation lies farther from the first than its own accuracy, the first may be off by the remainder.
     """
     stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
     conversion, unit, origin = _to_datum(crs)
@@ -259,7 +260,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> Box:
-    """South, north, west and east of the area of use of a CRS's frame, with the margin; nothing lies in it without."""
+    """South, north, west and east of the area of use of a CRS's frame, with the margin; an empty area without one."""
     area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)
@@ -267,7 +268,7 @@ def _bounds(crs: str) -> Box:
 
 
 def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
-    """Reject points of a grid whose unit of length there is not that of the ground: they are of another grid."""
+    """Reject points of a grid whose unit of length there differs from that of the ground: they are of another grid."""
     system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
     if len(xy) < 2 or method in _UNEVEN:

@@ -31,19 +31,19 @@ RASTERS: Final = (
 HeightSource = FilePath | PositionLog  #: A file, or positions in memory.
 _SPACING_M: Final = 50.0  #: Largest distance of the points that heights are put on [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Cells of a raster read at a time.
-_NEAR_M: Final = 15.0  #: Positions further than this from the line in plan are of another line [m].
-_REACH_M: Final = 200.0  #: Points further than this from a height along the line have none [m].
+_NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan are of another line [m].
+_REACH_M: Final = 200.0  #: Points farther than this from a height along the line have none [m].
 #: Standard deviation of the weights of positions along the line [m]: of fixed ones, and of single ones, whose errors
 #: last for hundreds of metres; a vertical curve of 2 km radius is then off by up to 5 m.
 _KERNEL_M: Final = 15.0
 _LARGEST_KERNEL_M: Final = 150.0
-#: Positions whose heights are this many median deviations off count no more (Cleveland 1979, robust locally weighted
-#: regression, doi:10.1080/01621459.1979.10481038), and how often they are weighed again.
+#: Positions whose heights are this many median deviations off have zero weight (Cleveland 1979, robust locally weighted
+#: regression, doi:10.1080/01621459.1979.10481038), and number of iterations.
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
 def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
-    """Raise SettingsError with all options that a raster needs besides; InputFileError where it is none."""
+    """Raise SettingsError with all further options that a raster needs; InputFileError where it is none."""
     with _open_raster(path) as (_, crs):
         own = crs.is_compound
     asked = []
@@ -105,7 +105,7 @@ def _dense(track: Track) -> Track:
 
 @contextmanager
 def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
-    """Yield a raster and its CRS; InputFileError where there is none."""
+    """Yield a raster and its CRS; InputFileError where it names none."""
     try:
         import rasterio
     except ImportError:
@@ -208,7 +208,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
     place, height, sigma = place[order], height[near][order], sigma[near][order]
     target = track.chainage_m
     fitted = _smooth(target, place, height, sigma, reach_m=reach_m)
-    # errors of neighbouring positions are common to them: the standard deviation is that of one position
+    # neighbouring positions have common errors: the standard deviation is that of one position
     spread = float(np.median(sigma)) if sigma_m is None else sigma_m
     if np.isnan(fitted).any():
         first = float(target[np.isnan(fitted)][0])
@@ -245,7 +245,7 @@ def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, rea
 
 
 def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, kernel_m: float) -> Floats:
-    """Return the heights of weighted straight lines about each target; NaN beside all positions."""
+    """Return the heights of weighted straight lines about each target; NaN where no position is near."""
     fitted = np.full(len(target), np.nan)
     bounds = np.searchsorted(place, [target - 3.0 * kernel_m, target + 3.0 * kernel_m]).T
     for k, (low, high) in enumerate(bounds.tolist()):

@@ -170,7 +170,7 @@ def heights_of_file(heights_m: Floats, place: Georeference, reading: MapReading,
 def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | CRS | None]:
-    """Height datum and geoid asked for, or those of a compound CRS; SettingsError when they contradict each other."""
+    """Height datum and requested geoid, or those of a compound CRS; SettingsError when they contradict each other."""
     vertical = get_vertical_datum(crs)
     if vertical is None:
         return height_datum, geoid
@@ -187,7 +187,7 @@ def own_height_datum(
 
 
 def _is_geoid_of(geoid: str, vertical: CRS) -> bool:
-    """Return whether a geoid given by name is that of a height datum; a grid file may always be."""
+    """Return whether a geoid given by name belongs to a height datum; a grid file is always accepted."""
     key = geoid.strip().lower()
     if key in JAPAN_MODELS:
         return vertical.name.startswith(("JGD", "JSLD"))

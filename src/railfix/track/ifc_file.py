@@ -52,7 +52,7 @@ class _Entity:
 
 @dataclass(frozen=True)
 class _Placement:
-    """Place and direction of axes in the project."""
+    """Location and direction of axes in the project."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -60,7 +60,7 @@ class _Placement:
     turn_rad: float = 0.0
 
     def then(self, x: float, y: float, z: float, turn: float) -> _Placement:
-        """Return axes that lie so in these."""
+        """Return axes given relative to these axes."""
         cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
         return _Placement(
             float(self.x_m + cosine * x - sine * y),
@@ -211,7 +211,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment; that of its layout in plan where it is relative to the alignment's."""
+    """Return the placement of an alignment, or of its layout in plan where that is relative to the alignment's."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative
@@ -245,8 +245,8 @@ def _chain(step: _Step, reference: Any) -> list[Any]:
 
 
 def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]:
-    """Return the elements, cubic parabolas as ordinates over the tangent: that of IFC 4.3 (``y = x^3 / (6 R L)``), or
-    the one of the projected length or of Japan's correction where the next element begins at its end.
+    """Return the elements, cubic parabolas as ordinates over the tangent: those of IFC 4.3 (``y = x^3 / (6 R L)``), or
+    those of the projected length or of Japan's correction where the next element begins at their end.
     """
     result: list[Plan] = []
     for element, after in zip(plan, [*plan[1:], None], strict=True):

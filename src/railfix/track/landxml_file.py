@@ -33,7 +33,7 @@ _UNITS: Final = {
     "mile": 1609.344,
 }
 #: Transitions given by ordinates over the tangent (`railfix.track.transitions`): with End, which every spiral has, the
-#: cubics are one curve, with Japan's correction and without.
+#: cubics are one curve, with and without Japan's correction.
 _ORDINATES: Final[dict[str, Shape]] = {
     "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
 }  # fmt: skip
@@ -49,7 +49,7 @@ _CANT_LAWS: Final = {**_SPIRALS, **dict.fromkeys(_ORDINATES, "linear"), "sineHal
 _SAME_M: Final = 1e-6  #: Elements shorter than this have no direction and are left out [m].
 #: Half the length of the line over which the kilometrage jumps at a station equation [m].
 _JUMP_M: Final = 0.05
-#: Least share of the ordinate of a cubic parabola at the end of a spiral, and the largest.
+#: Least and largest fraction of the ordinate of a cubic parabola at the end of a spiral.
 _ORDINATE_SHARE: Final = (0.9, 1.25)
 _BROKEN_RAD: Final = 0.1  #: Directions of elements that differ by more at a joint are of another order of coordinates.
 
@@ -109,7 +109,7 @@ def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Seg
 
 
 def _notes(alignment: Any, name: str) -> tuple[str, ...]:
-    """Return the notes on what of an alignment is not used."""
+    """Return the notes on unused parts of an alignment."""
     notes = []
     if (count := len(alignment.findall(".//{*}ProfAlign"))) > 1:
         notes.append(f"{name}: the first of {count} profiles is used")
@@ -122,7 +122,7 @@ def _elements(parent: Any) -> list[Any]:
 
 
 def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Stations:
-    """Return places in plan and the stations just before and after them: of the start, and of station equations."""
+    """Return distances in plan and the stations just before and after them: of the start, and of station equations."""
     rows, before, sign = [(0.0, start, start)], (0.0, start), 1.0
     for equation in alignment.iterfind("{*}StaEquation"):
         ahead = finite_number(equation.get("staAhead")) * scale
@@ -149,7 +149,7 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
     """Return the elements in plan, and a note where the file has easting before northing, against LandXML.
 
     The order is the one in which the coordinates lie in the area of the CRS; where both do, the one in which elements
-    go on in the direction of those before.
+    continue the direction of the preceding ones.
     """
     plans, broken, inside = [], [], []
     for easting_first in (False, True):

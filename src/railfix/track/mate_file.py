@@ -1,9 +1,8 @@
 """Track tables of EGNSS MATE: edges of lines, circles and clothoids, with gradients and cant.
 
 https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the arc from its north pole, a
-clothoid by its point without curvature, the azimuth there and the arc from it. The tables do not say which side is
-positive, nor what the constant of a clothoid is: the form is taken in which a segment meets those before and after it
-on its edge.
+clothoid by its point of zero curvature, the azimuth there and the arc from it. The tables state neither which side is
+positive, nor the constant of a clothoid: the form in which a segment meets its neighbours on its edge is used.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def read_edges(path: Path, reading: MapReading) -> list[Segment]:
 
 
 def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
-    """Return the points of one track edge; cant in millimetres, a radius of 0 or none is straight."""
+    """Return the points of one track edge; cant in millimetres; without a radius, or with 0, it is straight."""
     values = {name: rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy() for name in _NUMBERS}
     for name in _NUMBERS[:3]:
         if not np.isfinite(values[name]).all():
@@ -70,7 +69,7 @@ _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
 _SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
-#: Segments of an edge that are further apart than this do not meet [m].
+#: Segments of an edge that are farther apart than this do not meet [m].
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
@@ -91,7 +90,7 @@ def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
-    """Return rows of each edge by their distance from its start; of another table beside the file where it is there."""
+    """Return rows of each edge by their distance from its start; also of another table in the same folder."""
     file = Path(path)
     if table is not None:
         names = {entry.name.upper(): entry for entry in file.parent.iterdir()}
@@ -139,7 +138,7 @@ def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
     plan = [options[k] for options, k in zip(forms, chosen, strict=True)]
     for number, (first, second) in enumerate(pairwise(plan), start=2):
         if (gap := _gap(first, second)) > _MEETS_M:
-            raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the one before it")
+            raise InputFileError(path, f"edge {edge!r}: segment {number} begins {gap:.2f} m from the previous one")
     return plan
 
 
@@ -195,7 +194,7 @@ def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float
     """Return the part of a clothoid from an arc from its point without curvature on."""
     if arc == 0.0:
         return _element(east, north, azimuth, 0.0, rate * length, length)
-    # back from the origin a clothoid has the same curvature to the other side, and runs the other way
+    # backward from the origin a clothoid has the same curvature to the other side, and the opposite direction
     way = _element(east, north, azimuth if arc > 0.0 else azimuth + np.pi, 0.0, rate * abs(arc), abs(arc))
     (x, y), _ = _end(way)
     return _element(x, y, azimuth + rate * arc**2 / 2.0, rate * arc, rate * (arc + length), length)

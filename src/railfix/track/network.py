@@ -1,7 +1,7 @@
 """A network of tracks: track centrelines, the connections of their ends, and routes through it (P1 4.2(1)).
 
-Connections are stated by the file, else ends nearer to each other than a tolerance. Of a switch the stem and each leg
-are navigable, never the two legs.
+Connections are stated by the file, else ends nearer to each other than a tolerance. At a switch each leg is navigable
+with the stem, but not with the other leg.
 """
 
 from __future__ import annotations
@@ -19,21 +19,27 @@ from railfix.core.arrays import Floats, Indices, Integers, RowArrays, join_rows,
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.route import Segment, one_frame, sigma_of_files
-from railfix.track.track import SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
+from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 from railfix.track.trajectory import NearestOnPolyline, project_on_segments
 
 if TYPE_CHECKING:
     import networkx as nx
 
+#: Prior probability that the train is on a track that the map lacks, and the least distance of two tracks [m].
+UNMAPPED_PRIOR: Final = 0.05
+CLEARANCE_M: Final = 3.0
+#: Height of an antenna above the rails that is not known, and its standard deviation [m]: from bogies to roofs.
+ANTENNA_UP_M: Final = 2.5
+ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Way over which the direction of an end is taken [m].
 _NEAR_WAY_M: Final = 5_000.0  #: Ways searched before the whole network is [m].
 _SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
-#: Nearest samples examined for each position at first; more where these do not reach as far as asked.
+#: Number of nearest samples examined for each position at first; more where these do not extend far enough.
 _SAMPLES: Final = 32
-_TOGETHER: Final = 256  #: Positions that are looked up together: of each every sample near it is in memory.
+_TOGETHER: Final = 256  #: Positions that are processed together: every nearby sample of each is in memory.
 #: Properties that the connections do not change.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
-_NAMED: Final = 8  #: Tracks that a message names one by one.
+_NAMED: Final = 8  #: Number of tracks that a message names individually.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,14 +64,14 @@ class Candidates(RowArrays):
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """Tracks, each from one end or switch to the next, their connections, and notes on how these were found."""
+    """Tracks, each from one end or switch to the next, their connections, and notes on the source of these."""
 
     tracks: tuple[Segment, ...]
     links: tuple[Link, ...]
     notes: tuple[str, ...] = ()
 
     def connect(self, links: tuple[Link, ...], note: str) -> Network:
-        """Return the network with other connections, and a note on them; what is known of its points is kept."""
+        """Return the network with other connections, and a note on them; the data of its points are kept."""
         network = replace(self, links=links, notes=(note,))
         vars(network).update({name: vars(self)[name] for name in _OF_POINTS if name in vars(self)})
         return network
@@ -152,7 +158,7 @@ class Network:
 
     @cached_property
     def _way(self) -> tuple[Floats, Floats]:
-        """Place of each point, and of the start of each track, on one way over all tracks, a metre between them."""
+        """Chainage of each point, and of the start of each track, on one axis over all tracks, with gaps of a metre."""
         before = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
         return self.chainage_m + np.repeat(before, np.diff(self.first_point)), before
 
@@ -175,12 +181,17 @@ class Network:
 
     @cached_property
     def sigma_plan_m(self) -> float:
-        """Standard deviation of the tracks in plan: the worst that the files state, else that of a surveyed map."""
+        """Standard deviation of the tracks in plan: the worst that the files state, or that of a surveyed map."""
         return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
 
     @cached_property
+    def sigma_height_m(self) -> float:
+        """Standard deviation of the tracks' heights, likewise."""
+        return sigma_of_files(self.tracks, "sigma_height_m", SIGMA_HEIGHT_M)
+
+    @cached_property
     def datum_plan_m(self) -> float:
-        """Standard deviation of the transformation of the tracks from their datum, in the one above [m]."""
+        """Standard deviation of the transformation of the tracks from their datum, included in the above [m]."""
         return max(track.datum_plan_m for track in self.tracks)
 
     @property
@@ -265,7 +276,7 @@ class Network:
         return chainage, offset
 
     def kilometrage_on(self, track: Indices, chainage_m: Floats) -> Floats:
-        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where there is none."""
+        """Return the kilometrage of tracks at chainages on them, shape (n,); NaN where missing."""
         kilometrage = np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
             rows = track == number
@@ -302,7 +313,7 @@ class Network:
         return length, path
 
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
-        """Return the shortest route that passes the given tracks in order; MismatchError where there is none."""
+        """Return the shortest route that passes the given tracks in order; MismatchError where none exists."""
         route = self.route_over(stops)
         if route is None:
             first = next(stop for k, stop in enumerate(stops, start=1) if self.route_over(stops[:k]) is None)
@@ -312,7 +323,7 @@ class Network:
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Return the tracks of the shortest route that passes the given tracks in order; None where there is none."""
+        """Return the tracks of the shortest route that passes the given tracks in order; None without one."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         best: dict[int, tuple[float, list[int]]] = {4 * wanted[0] + e: (0.0, [wanted[0]]) for e in (1, 3)}
         for stop in wanted[1:]:

@@ -1,9 +1,10 @@
 """Probability of each track at each position of a log, with an error that the positions have in common.
 
-A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, or
-none of the map, and the common error of the positions: a first-order Gauss-Markov process east, north and up, on a
-lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). What is left of each position has heavy tails (Student's t)
-and lasts for `correlation_s`, of which each position has its share.
+A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, a
+track that the map lacks, and the common error of the positions: a first-order Gauss-Markov process east, north and up,
+on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). What is left of each position has heavy tails (Student's
+t) and lasts for `correlation_s`, of which each position has its share. A track that the map lacks runs beside the
+nearest one at a constant distance (`SHIFTS_M`), clear of all others, or is anywhere else.
 """
 
 from __future__ import annotations
@@ -16,24 +17,36 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
-from railfix.track.network import Candidates, Network
+from railfix.track.network import UNMAPPED_PRIOR, Candidates, Network
 
-#: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0:
-#: that of a position 5 standard deviations from its track.
+#: Negative logarithm of the likelihood of a position on a track that the map does not have and that runs beside none,
+#: compared with one at distance 0.
 _UNMAPPED_COST: Final = 5.0
+#: Distances right of the nearest track at which a track that the map lacks can run beside it [m].
+SHIFTS_M: Final = np.concatenate([np.arange(-15.0, -2.0, 2.0), np.arange(3.0, 16.0, 2.0)])
+#: Probability, from a position to the next, that such a track comes to be `SHIFTS_M` nearer or farther.
+_DRIFTS: Final = 1e-3
+_SHIFT_STEP_M: Final = 2.0
 _FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of positions.
 #: Negative logarithms of the probability, from a position to the next, of passing to another track without connection,
-#: of leaving the map and of entering it: to a track beside by way of none is as improbable as the jump.
+#: of leaving the map and of entering it, and the same two of a track beside that the map lacks: a train is on one for
+#: `UNMAPPED_PRIOR` of the time, a quarter of an hour at a time. To a track by way of none is as improbable as the jump.
 _JUMP_COST: Final = 17.0
 _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
+_LEAVE_BESIDE_COST: Final = 10.0
+_ENTER_BESIDE_COST: Final = 7.0
+#: And the same of a position that lies farther than this beyond an end of a track at which the map ends [m].
+_OPEN_COST: Final = 2.0
+_BEYOND_M: Final = 10.0
+_ROUNDED_M: Final = 1e-6
 #: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
-#: Difference of way and distance at which a joint is half as probably passed as where they agree [m].
+#: Difference of path length and distance at which a joint is half as probable as where they agree [m].
 _PASSING_M: Final = 5.0
-#: What a change of track has to gain, in positions on the right track; less over a joint, known by its probability: on
-#: a short track of a switch there are one or two positions.
+#: Least gain of a change of track, in positions on the right track; less at a joint, which is identified by its
+#: probability: on a short track of a switch there are one or two positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01
@@ -46,18 +59,23 @@ _BLOCK: Final = 1024  #: Positions whose probabilities are in memory at a time, 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """Positions beside their candidates, n rows with up to m candidates each.
+    """Positions with their candidates, n rows with up to m candidates each.
 
     `across` (n, m, 2) is the unit vector across the track, east and north; `offset_m` the distance to it, infinite
     without a candidate; `beyond_m` how far the position lies beyond an end; `above_m` its height above the track, NaN
-    without (n, m). `weight` is the share of the correlation time that a position covers, `seconds` since the one
-    before; `sigma_m` and `common_m` are of one horizontal axis, `common_up_m` is 0 where heights do not count.
+    without (n, m). `clear` tells which `SHIFTS_M` from the nearest track are clear of all tracks (n, S), `moved_m` how
+    far that track lies right of the nearest one of the previous position, and `turned` whether its direction is
+    opposite (n,). `weight` is the share of the correlation time that a position covers, `seconds` since the one before;
+    `sigma_m` and `common_m` are of one horizontal axis, `common_up_m` is 0 where heights do not count.
     """
 
     across: Floats
     offset_m: Floats
     beyond_m: Floats
     above_m: Floats
+    clear: Masks
+    moved_m: Floats
+    turned: Masks
     sigma_m: Floats
     sigma_up_m: Floats
     weight: Floats
@@ -67,19 +85,24 @@ class Residuals:
 
 
 class Transitions:
-    """Probability of each passage from the candidates of an epoch to those of the next."""
+    """Probability of each transition from the candidates of an epoch to those of the next."""
 
-    def __init__(self, network: Network, candidates: Candidates, step_m: Floats) -> None:
+    def __init__(self, network: Network, candidates: Candidates, step_m: Floats, residuals: Residuals) -> None:
         self._network, self._step = network, step_m
         self._track, self._place = candidates.track, candidates.chainage_m
+        self._clear, self._moved, self._turned = residuals.clear, residuals.moved_m, residuals.turned
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: Ways from an end of a track to the ends of others, and how far they were looked for.
+        #: Path lengths from an end of a track to the ends of others, and the search limit.
         self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
         self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
         to_end = np.fmin(self._place, self._rest)
         #: Whether an end of the track is within reach, before and after each passage, shapes (n - 1, m).
         self._leaves = to_end[:-1] <= self._reach[:, None]
         self._enters = to_end[1:] <= self._reach[:, None]
+        ends = np.array([[(t, e) not in network.passages for e in (0, 1)] for t in range(len(network.tracks))])
+        at_end = ends[self._track] & (np.stack([self._place, self._rest], axis=-1) <= _ROUNDED_M)
+        #: Whether a position lies beyond an open end, shape (n, m).
+        self._opens = at_end.any(axis=2) & (np.abs(residuals.beyond_m) > _BEYOND_M)
 
     @property
     def changes(self) -> Masks:
@@ -88,13 +111,18 @@ class Transitions:
         return np.asarray(state[:-1, :, None] != state[1:, None, :])
 
     def __call__(self, k: int) -> Floats:
-        """Return probabilities from epoch k to k + 1, shape (m + 1, m + 1), row by row."""
+        """Return probabilities from epoch k to k + 1, shape (m + S + 1, m + S + 1), row by row."""
         before, after = self._track[k], self._track[k + 1]
-        m = len(before)
+        m, free = len(before), self._clear[k + 1] * _shares_of_shifts()
         same = (before[:, None] == after) & (before[:, None] >= 0)
-        share = np.full((m + 1, m + 1), np.exp(-_LEAVE_COST))
-        share[m] = np.where(np.arange(m + 1) < m, np.exp(-_ENTER_COST), 1.0)
+        share = np.full((m + len(SHIFTS_M) + 1, m + len(SHIFTS_M) + 1), np.exp(-_LEAVE_COST))
+        share[:m, -1] = np.where(self._opens[k], np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
+        share[-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
+        share[-1, -1] = 1.0
+        share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
+        share[m:-1, :m] = np.exp(-_ENTER_BESIDE_COST)
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
+        share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
             way = self._way(k, i, j)
             if way <= self._reach[k]:
@@ -102,8 +130,8 @@ class Transitions:
         return np.asarray(share / share.sum(axis=1, keepdims=True))
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Way between two places over ends of tracks [m], infinite beyond reach: about the distance of the positions
-        where a train passes the joint between them.
+        """Path length between two positions over ends of tracks [m], infinite beyond the limit: about the distance of
+        the positions where a train passes the joint between them.
         """
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
@@ -126,9 +154,27 @@ class Transitions:
         return ways
 
 
+def _shares_of_shifts() -> Floats:
+    """Return the shares of `SHIFTS_M` in the prior, in inverse proportion: tracks are mostly neighbours."""
+    near = 1.0 / np.abs(SHIFTS_M)
+    return np.asarray(near / near.sum())
+
+
+def _shifted(moved_m: float, turned: bool) -> Floats:
+    """Return passages between `SHIFTS_M`, from row to column, where the track that they count from moves or turns."""
+    place = (SHIFTS_M - moved_m) * (-1.0 if turned else 1.0)
+    apart = np.abs(place[:, None] - SHIFTS_M)
+    nearest = apart == apart.min(axis=1, keepdims=True)
+    drifted = _DRIFTS * (apart <= apart.min(axis=1, keepdims=True) + _SHIFT_STEP_M)
+    inside = np.abs(place) <= SHIFTS_M[-1] + _SHIFT_STEP_M
+    return np.asarray(np.where(nearest, 1.0, drifted) * inside[:, None])
+
+
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the shares of the states of an urn in equilibrium, and its passages after a time, from row to column."""
+    """Return the equilibrium probabilities of the states of an urn, and its transition matrix after a time, from row to
+    column.
+    """
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -144,7 +190,7 @@ def _binomial(count: int, share: float) -> Floats:
 
 
 class _CommonError:
-    """Lattice of the common error: C places in plan by U heights, and its `first` probabilities (C, U)."""
+    """Lattice of the common error: C positions in plan by U heights, and its `first` probabilities (C, U)."""
 
     def __init__(self, residuals: Residuals) -> None:
         self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
@@ -159,7 +205,7 @@ class _CommonError:
         return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
-        """Return what is expected, a time before, of values of shape (..., C, U)."""
+        """Return the expectation, a time before, of values of shape (..., C, U)."""
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
@@ -181,35 +227,44 @@ def _student(square: Floats) -> Floats:
 
 
 def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
-    """Of a position given each state, shape (m + 1, C, U), up to a factor."""
-    known = np.flatnonzero(np.isfinite(residuals.offset_m[k]))
+    """Of a position given each state, shape (m + S + 1, C, U), up to a factor."""
+    m, offset = residuals.offset_m.shape[1], residuals.offset_m[k]
+    known = np.flatnonzero(np.isfinite(offset))
     across, beyond = residuals.across[k, known], residuals.beyond_m[k, known, None]
-    square = (residuals.offset_m[k, known, None] - across @ lattice.plan_m.T) ** 2
+    off_track = offset[known, None] - across @ lattice.plan_m.T
+    square = off_track**2
     if beyond.any():
-        # the common error may lie along the track, too: what is left of the way beyond the end counts
+        # the common error may lie along the track, too: the remaining distance beyond the end counts
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
         square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
-    cost = np.full((residuals.offset_m.shape[1] + 1, *lattice.first.shape), np.inf)
+    cost = np.full((m + len(SHIFTS_M) + 1, *lattice.first.shape), np.inf)
     cost[-1] = _UNMAPPED_COST
     cost[known] = _student(square / residuals.sigma_m[k] ** 2)[..., None]
+    # a track that the map lacks crosses others, but does not lie on them for long
+    cost[m:-1] = np.where(residuals.clear[k], 0.0, _UNMAPPED_COST)[:, None, None]
+    if len(known):
+        cost[m:-1] += _student(((off_track[:1] - SHIFTS_M[:, None]) / residuals.sigma_m[k]) ** 2)[..., None]
     if len(lattice.up_m) > 1:
         above = (residuals.above_m[k, known, None] - lattice.up_m) / residuals.sigma_up_m[k]
-        cost[known] += np.where(np.isnan(above), 0.0, _student(above**2))[:, None]
+        of_height = np.where(np.isnan(above), 0.0, _student(above**2))[:, None]
+        cost[known] += of_height
+        cost[m:-1] += of_height[:1] if len(known) else 0.0
     return np.asarray(np.exp(-residuals.weight[k] * (cost - cost.min())))
 
 
 def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     """Return the most probable track of each position (n,), m for none, and the probability of each (n, m + 1)."""
     n, m = residuals.offset_m.shape
-    lattice = _CommonError(residuals)
+    lattice, states = _CommonError(residuals), m + len(SHIFTS_M) + 1
     length = _BLOCK // len(lattice.up_m)
-    # of a long log the first positions of the blocks are kept, and each block is passed again on the way back
+    # of a long log the first positions of the blocks are stored, and each block is computed again on the backward pass
     firsts: dict[int, Floats | None] = {0: None}
     if n > length:
         firsts |= {k: at.share for k, at in _forward(residuals, moves, lattice, 0, None, n) if k and k % length == 0}
     probability, gains, changes = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1)), moves.changes
-    after = expected = np.ones((m + 1, *lattice.first.shape))
-    move = np.eye(m + 1)
+    after = expected = np.ones((states, *lattice.first.shape))
+    move = np.eye(states)
+    none = np.arange(m + 1)  # all states without a track of the map are one
     for start in reversed(firsts):
         block = [at for _, at in _forward(residuals, moves, lattice, start, firsts[start], min(start + length, n))]
         for k in reversed(range(start, start + len(block))):
@@ -218,12 +273,13 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
                 seconds = float(residuals.seconds[k + 1])
                 if k == start + length - 1:
                     move = moves(k)
-                pairs = move * (lattice.later(at.share, seconds).reshape(m + 1, -1) @ expected.reshape(m + 1, -1).T)
-                cost = np.where(move < _AT_JOINT, _CHANGE, _CHANGE_AT_JOINT)
-                gains[k] = pairs / pairs.sum() - np.where(changes[k], cost, 0.0)
-                after = (move @ lattice.earlier(expected, seconds).reshape(m + 1, -1)).reshape(after.shape)
+                pairs = move * (lattice.later(at.share, seconds).reshape(states, -1) @ expected.reshape(states, -1).T)
+                share = np.add.reduceat(np.add.reduceat(pairs / pairs.sum(), none, axis=0), none, axis=1)
+                cost = np.where(move[: m + 1, : m + 1] < _AT_JOINT, _CHANGE, _CHANGE_AT_JOINT)
+                gains[k] = share - np.where(changes[k], cost, 0.0)
+                after = (move @ lattice.earlier(expected, seconds).reshape(states, -1)).reshape(after.shape)
                 after /= after.max()
-            probability[k] = (at.share * after).sum(axis=(1, 2))
+            probability[k] = np.add.reduceat((at.share * after).sum(axis=(1, 2)), none)
             expected, move = at.likelihood * after, at.move
     probability /= probability.sum(axis=1, keepdims=True)
     return _sequence(probability, gains), probability
@@ -232,7 +288,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
 @dataclass(frozen=True)
 class _At:
     """One position going forward: probabilities of all states given the positions so far and its likelihood, shapes
-    (m + 1, C, U), and the passages to it, shape (m + 1, m + 1).
+    (m + S + 1, C, U), and the passages to it, shape (m + S + 1, m + S + 1).
     """
 
     share: Floats
@@ -244,12 +300,16 @@ def _forward(
     residuals: Residuals, moves: Transitions, lattice: _CommonError, start: int, first: Floats | None, stop: int
 ) -> Iterator[tuple[int, _At]]:
     """Yield positions from one, where all states have given probabilities, to before another."""
-    states = residuals.offset_m.shape[1] + 1
+    m = residuals.offset_m.shape[1]
+    states = m + len(SHIFTS_M) + 1
     share, move = first, np.eye(states)
     for k in range(start, stop):
         likelihood = _likelihood(residuals, lattice, k)
         if share is None:
-            entered = np.where(np.arange(states) < states - 1, 1.0, np.exp(-_ENTER_COST))
+            mapped = np.isfinite(residuals.offset_m[k])
+            entered = np.full(states, UNMAPPED_PRIOR * np.exp(-_ENTER_COST))
+            entered[:m] = mapped * (1.0 - UNMAPPED_PRIOR) / max(mapped.sum(), 1)
+            entered[m:-1] = residuals.clear[k] * UNMAPPED_PRIOR * _shares_of_shifts()
             share = entered[:, None, None] * lattice.first * likelihood
         elif k > start:
             move = moves(k - 1)
@@ -260,7 +320,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """The sequence of the largest gains: neighbouring pairs expected to be right, less what changes have to gain."""
+    """The sequence of the largest gains: neighbouring pairs expected to be right, less the required gain of changes."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

@@ -16,8 +16,8 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.io.positions import read_positions
 from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
-from railfix.track.network import Candidates, Network
-from railfix.track.network_decode import Residuals, Transitions, decode
+from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, Candidates, Network
+from railfix.track.network_decode import SHIFTS_M, Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M
 
 #: Standard deviation of the distance of a position from its track where its log states none and none can be estimated,
@@ -25,36 +25,38 @@ from railfix.track.track import ANOTHER_PLACE_M
 SIGMA_M: Final = 4.0
 _LEAST_SIGMA_M: Final = 1.0
 _ALONE_M: Final = 15.0  #: Distance of the next track from a position by which sigmas are estimated [m].
-#: Positions farther from the track than this, and than their noise so many times, are beside it for another reason [m].
+#: Positions farther from the track than this, and than this multiple of their noise, are off it for another reason [m].
 _LARGEST_LEVEL_M: Final = 5.0
 _BESIDE: Final = 3.0
 _ENOUGH: Final = 30  #: Positions that an estimate needs.
-#: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map, antenna height.
-_COMMON_M: Final = 2.0
-_COMMON_UP_M: Final = 4.0
+_COMMON_M: Final = 2.0  #: Largest standard deviation of the common error of positions [m]: satellites, atmosphere, map.
 _COMMON_SHARE: Final = 0.7  #: Share of the stated standard deviation that the common error has where it is smaller.
 _BEST: Final = 0.1  #: Quantile of the stated standard deviations that the common error has where it is smaller.
-#: Least distance to which tracks are looked for [m], and farther ones in standard deviations and metres.
+#: Least distance to which tracks are searched for [m], and farther ones in standard deviations and metres.
 _WITHIN_M: Final = 30.0
 _WITHIN_SIGMAS: Final = 5.0
 _FARTHEST_M: Final = 100.0
 #: Positions farther from all tracks than this many times that distance, for less than a time [s], are wrong.
 _FAR: Final = 6.0
 _WRONG_S: Final = 60.0
-#: Tracks that are looked at from such positions, and what stands where there is none.
+#: Number of tracks near such positions that are examined, and the placeholder for none.
 _MOST_FAR: Final = 8
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
-#: What stands where a position was not matched.
+#: Placeholder of a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a normal variable.
+_ROUNDED_M: Final = 0.1  #: Distances of tracks are known to this [m].
 _STEP_S: Final = 0.4  #: Time between positions that state none, or one before the last [s].
-_MOST_TRACKS: Final = 16  #: Tracks near a position that are looked at.
+_MOST_TRACKS: Final = 16  #: Tracks near a position that are examined.
 _APART_UP_M: Final = 1.0  #: Least difference of heights of two tracks near each other for which heights count [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLog(RowArrays):
-    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None or NaN without any."""
+    """Positions in plan, n rows, NaT or NaN without; `sigma_m` is of one axis; heights are None or NaN without any.
+
+    Heights are those of an antenna `antenna_up_m` above the rails, None where that is not known [m].
+    """
 
     path: str
     time: Datetimes
@@ -63,10 +65,13 @@ class PlanLog(RowArrays):
     sigma_m: Floats
     height_m: Floats | None = None
     sigma_up_m: Floats | None = None
+    antenna_up_m: float | None = None
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions, in the frame of the satellites, in that of the network; else MismatchError."""
+        """Return the positions, given in the frame of the satellites, in that of the network; otherwise
+        MismatchError.
+        """
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -85,7 +90,7 @@ class PlanLog(RowArrays):
 
 
 def _check_region(network: Network, log: PlanLog) -> None:
-    """Raise MismatchError where every position lies further than `ANOTHER_PLACE_M` from the network."""
+    """Raise MismatchError where every position is farther than `ANOTHER_PLACE_M` from the network."""
     known = np.isfinite(log.latitude_deg) & np.isfinite(log.longitude_deg)
     if not known.any():
         return
@@ -107,7 +112,7 @@ def _check_region(network: Network, log: PlanLog) -> None:
 class Matched:
     """Positions on a network, n rows; `track` is the most probable sequence (-1: none), `offset_m` in plan, positive to
     the right; `probability` is given the whole log, NaN without or with a wrong position; `probabilities`, shape (n,
-    m), of each candidate, the rest to 1 of no mapped track; `notes` say what was assumed of the log.
+    m), of each candidate, the rest to 1 of no mapped track; `notes` state assumptions on the log.
     """
 
     track: Indices
@@ -145,7 +150,9 @@ def read_plan_positions(
     )
 
 
-def plan_log(path: str, time: Datetimes, ecef_m: Floats, sigma_m: Floats) -> PlanLog:
+def plan_log(
+    path: str, time: Datetimes, ecef_m: Floats, sigma_m: Floats, *, antenna_up_m: float | None = None
+) -> PlanLog:
     """Return positions in plan with heights, of 3-D ones and their standard deviations north, east and up."""
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     return PlanLog(
@@ -156,6 +163,7 @@ def plan_log(path: str, time: Datetimes, ecef_m: Floats, sigma_m: Floats) -> Pla
         sigma_m=np.sqrt((sigma_m[:, :2] ** 2).mean(axis=1)),
         height_m=height,
         sigma_up_m=sigma_m[:, 2],
+        antenna_up_m=antenna_up_m,
     )
 
 
@@ -186,7 +194,7 @@ def match(
     residuals = _residuals(network, log, given, candidates, point, sigma, correlation_s)
     if sigma_m is None and np.isfinite(log.sigma_m[given]).any():
         residuals = replace(residuals, sigma_m=sigma * _scale(residuals, candidates.track, correlation_s))
-    path, gamma = decode(residuals, Transitions(network, candidates, step))
+    path, gamma = decode(residuals, Transitions(network, candidates, step, residuals))
     rows, mapped = np.arange(len(given)), path < most
     column = np.minimum(path, most - 1)
     found = Matched(
@@ -217,7 +225,7 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
     """Return the standard deviation of distances by their median where one track alone is near, and how it was found.
 
-    Where tracks lie beside each other, errors of the positions cannot be told from another track.
+    With parallel tracks, errors of the positions cannot be distinguished from another track.
     """
     latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
     near = network.near(latitude, longitude, within_m=_FARTHEST_M, most=2)
@@ -242,7 +250,7 @@ def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
-    """Find tracks near each position, and farther ones where it lies far from all."""
+    """Find tracks near each position, and farther ones where it is far from all."""
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
     far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
@@ -291,7 +299,7 @@ def _residuals(
     sigma_m: Floats,
     correlation_s: float,
 ) -> Residuals:
-    """Return the positions of some rows of a log beside their candidates."""
+    """Return the positions of some rows of a log with their candidates."""
     known = candidates.track >= 0
     row = np.nonzero(known)[0]
     track, chainage = candidates.track[known], candidates.chainage_m[known]
@@ -299,8 +307,8 @@ def _residuals(
     axes = enu_axes(log.latitude_deg[given], log.longitude_deg[given])[row, :2]
     away, along = ((axes @ vector[..., None])[..., 0] for vector in (point_m[row] - at, ahead))
     right = np.stack([along[:, 1], -along[:, 0]], axis=-1)
-    beyond = np.einsum("ij,ij->i", away, along)
-    outward = np.where(beyond > 0.0, chainage >= network.length_m[track] - 1e-6, chainage <= 1e-6)
+    ahead_m = np.einsum("ij,ij->i", away, along)
+    outward = np.where(ahead_m > 0.0, chainage >= network.length_m[track] - 1e-6, chainage <= 1e-6)
 
     def over(values: Floats, empty: float) -> Floats:
         full = np.full((*known.shape, *values.shape[1:]), empty)
@@ -308,7 +316,8 @@ def _residuals(
         return full
 
     offset = over(np.einsum("ij,ij->i", away, right), np.inf)
-    above = over(np.full(len(row), np.nan) if log.height_m is None else log.height_m[given[row]] - height, np.nan)
+    lowered = np.full(len(row), np.nan) if log.height_m is None else log.height_m[given[row]] - height
+    above = over(lowered - (ANTENNA_UP_M if log.antenna_up_m is None else log.antenna_up_m), np.nan)
     spread = np.nanmax(above, axis=1, initial=-np.inf) - np.nanmin(above, axis=1, initial=np.inf)
     counts = not np.isnan(network.height_m).any() and bool((spread > _APART_UP_M).any())
     seconds = np.concatenate([[0.0], np.diff(log.time[given]) / np.timedelta64(1, "s")])
@@ -320,23 +329,43 @@ def _residuals(
     sigma_up = np.where(np.isfinite(sigma_up), sigma_up, 2.0 * sigma_m)
     # reflections put heights off to one side for minutes
     sigma_up = sigma_up * _median_scale(np.nanmin(np.abs(above), axis=1, initial=np.inf) / sigma_up)
+    axis, beyond = over(right, 0.0), over(np.where(outward, ahead_m, 0.0), 0.0)
+    of_antenna = ANTENNA_SIGMA_M if log.antenna_up_m is None else 0.0
+    of_codes = _COMMON_SHARE * float(np.quantile(sigma_up, _BEST))
     return Residuals(
-        across=over(right, 0.0),
+        across=axis,
         offset_m=offset,
-        beyond_m=over(np.where(outward, beyond, 0.0), 0.0),
+        beyond_m=beyond,
         above_m=above,
+        **_beside(candidates.track, axis, offset, beyond),
         sigma_m=sigma_m,
         sigma_up_m=sigma_up,
         weight=weight,
         seconds=seconds,
-        # that of the transformation of the map is one of all positions, too
+        # the error of the map's transformation is common to all positions, too
         common_m=float(np.hypot(min(_COMMON_SHARE * np.quantile(sigma_m, _BEST), _COMMON_M), network.datum_plan_m)),
-        common_up_m=max(_COMMON_SHARE * float(np.quantile(sigma_up, _BEST)), _COMMON_UP_M) if counts else 0.0,
+        common_up_m=float(np.linalg.norm([of_codes, of_antenna, network.sigma_height_m])) if counts else 0.0,
     )
 
 
+def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) -> dict[str, Any]:
+    """Return where tracks that the map lacks can run: `clear`, `moved_m` and `turned` of `Residuals`."""
+    cosine = np.einsum("nmi,ni->nm", across, across[:, 0])
+    present = np.isfinite(offset_m)
+    offset = np.where(present, offset_m, 0.0)
+    right_m = offset[:, :1] - offset * cosine  # of the nearest track
+    apart = np.where(present, np.abs(SHIFTS_M[:, None, None] - right_m), np.inf).min(axis=2)
+    clear = (apart.T > CLEARANCE_M - _ROUNDED_M) & present[:, :1] & (np.abs(beyond_m[:, :1]) <= CLEARANCE_M)
+    before = np.concatenate([track[:1, :1], track[:-1, :1]])  # the nearest track of the previous position
+    same = (track == before) & (before >= 0)
+    rows, column = np.arange(len(track)), same.argmax(axis=1)
+    known = same.any(axis=1)
+    moved = np.where(known, -right_m[rows, column] * np.sign(cosine[rows, column]), 0.0)
+    return {"clear": clear, "moved_m": moved, "turned": known & (cosine[rows, column] < 0.0)}
+
+
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
-    """Return the matched positions put on their rows of a log, the others without."""
+    """Return the matched positions on their rows of a log, and the other rows without one."""
 
     def over(values: Any, empty: float) -> Any:
         full = np.full((count, *values.shape[1:]), empty, dtype=values.dtype)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, read_text
+from railfix.core.files import FilePath, ending, read_text
 from railfix.io.file_kind import find_kind
 from railfix.track.network import Link, Network, end_points
 from railfix.track.point_files import RELATION
@@ -32,14 +32,13 @@ def read_network(
     paths: Sequence[FilePath], reading: MapReading | None = None, *, tolerance_m: float = TOLERANCE_M
 ) -> Network:
     """Read a network from map files, connected as they state, else where ends, or an end and a track, meet."""
-    of_file = replace(reading or MapReading(), duplicates="keep")
-    tracks = [track for path in paths for track in read_segments(path, of_file)]
+    tracks = [track for path in paths for track in read_segments(path, reading or MapReading())]
     check_order(tracks)
     return connect_network(tracks, paths, tolerance_m=tolerance_m)
 
 
 def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
-    """Connect tracks to a network: as their files state it, else by their ends; see `read_network`."""
+    """Connect tracks to a network: as their files state it, otherwise by their ends; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
@@ -47,11 +46,13 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
         return _of_nodes(tracks)
     network, cuts = _divide(Network(tracks=tuple(tracks), links=()), tolerance_m)
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
+    if packed := [path for path in paths if ending(path) == ".pbf"]:
+        note += f"; {packed[0]} is read without the ids of its nodes, which 'osmium cat FILE.osm.pbf -o FILE.osm' keeps"
     return network.connect(links_of_ends(network, tolerance_m=tolerance_m), note)
 
 
 def _of_nodes(tracks: list[Segment]) -> Network:
-    """Connect ways of OpenStreetMap at the nodes that they share, inner ones too, and nowhere else."""
+    """Connect ways of OpenStreetMap at their shared nodes, inner ones too, and nowhere else."""
     used = Counter(node for track in tracks for node in track.nodes)
     parts: list[Segment] = []
     divided = 0
@@ -125,7 +126,7 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
 
 
 def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
-    """Connections of ends that lie within a tolerance; navigable where the direction changes by less than 60 deg."""
+    """Connections of ends within a tolerance; navigable where the direction changes by less than 60 deg."""
     ends, outward = end_points(network)
     pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")
     level = np.array([track.metadata.get("level", "") for track in network.tracks])
@@ -151,7 +152,7 @@ def is_route(segments: Sequence[Segment]) -> bool:
 
 
 def _divide(whole: Network, tolerance_m: float) -> tuple[Network, int]:
-    """Return tracks divided at inner points on which the end of another track lies, and how many were divided."""
+    """Return tracks divided at inner points that are the end of another track, and the number of divided ones."""
     tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
@@ -200,16 +201,16 @@ _GAP_M: Final = 5.0  #: Ends nearer than this without a connection are a gap [m]
 _JOINT_M: Final = 0.5  #: Connected ends farther apart than this do not meet [m].
 #: Largest change of direction over a navigable connection [deg]; a switch of 1:4.5 turns 12.5 deg over its length.
 _KINK_DEG: Final = 15.0
-#: Least spacing of tracks beside each other [m]: less leaves no clearance between vehicles.
+#: Least spacing of parallel tracks [m]: a smaller one leaves no clearance between vehicles.
 _LEAST_SPACING_M: Final = 2.5
 #: Tracks may be nearer than that within this way of their ends, where a switch brings them together [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Least way over which tracks run too near to each other to count [m].
+_LEAST_WAY_M: Final = 10.0  #: Least length over which tracks that are too near to each other are reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkFinding:
-    """A fault of a network: kind, tracks, place and a sentence."""
+    """A fault of a network: kind, tracks, location and a sentence."""
 
     kind: str
     tracks: tuple[str, ...]
@@ -248,7 +249,7 @@ def check_network(network: Network) -> NetworkQuality:
 
 
 def _finding(network: Network, kind: str, tracks: Sequence[int], end: int, sentence: str) -> NetworkFinding:
-    """Return a fault at an end of the first of some tracks, whose names stand in the sentence for {0} and {1}."""
+    """Return a fault at an end of the first of some tracks, whose names replace {0} and {1} in the sentence."""
     names, segment = tuple(network.names[track] for track in tracks), network.tracks[tracks[0]]
     k = -end  # 0 is the first point, -1 the last
     return NetworkFinding(
@@ -267,7 +268,7 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
     ends, outward = end_points(network)
     points = np.array([ends[t, e] for t, e in loose])
     facing = np.array([outward[t, e] for t, e in loose])
-    # two tracks that end beside each other point the same way
+    # two adjacent track ends point the same way
     near = [(a, b) for a, b in cKDTree(points).query_pairs(_GAP_M) if facing[a] @ facing[b] < 0.0]
     for a, b in sorted(near):
         (t, e), (u, _) = loose[a], loose[b]

@@ -17,9 +17,10 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
 
-#: Rows that are filled: those without position between known places, or also those whose positions lie off the map.
+#: Rows that are filled: those without a position between known positions, or also those whose positions lie off the
+#: map.
 Rows = Literal["gaps", "off-map"]
-#: Farthest track looked at from a position that drifts, and largest difference of a route from the distance travelled
+#: Farthest track examined from a position that drifts, and largest difference of a route from the distance travelled
 #: [m]; and steps of which the speed is the median.
 _DRIFT_M = 500.0
 _STEPS = 15
@@ -27,8 +28,8 @@ _STEPS = 15
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """Places of all positions, shapes (n,); `track` is -1 without a place or route; `bound_m` is the farthest that a
-    train on this route can be from a filled place [m], infinite before and after known ones.
+    """Positions of all rows, shapes (n,); `track` is -1 without a position or route; `bound_m` is the largest
+    distance of a train on this route from a filled position [m], infinite before and after known ones.
     """
 
     track: Indices
@@ -66,7 +67,7 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
 def _fill_before(
     network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
 ) -> None:
-    """Fill rows from a known place outward, as far as they have positions."""
+    """Fill rows outward from a known position, as far as they have positions."""
     rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
     if len(rows) < 2:
         return
@@ -120,7 +121,9 @@ def _put_on(
 def _fill_legs(
     network: Network, first: int, from_m: float, last: int, to_m: float
 ) -> tuple[Indices, Floats, Floats] | None:
-    """Return the tracks of the shortest route between two places, and the chainages where each is entered and left."""
+    """Return the tracks of the shortest route between two positions, and the chainages where each is
+    entered and left.
+    """
     if first == last:
         return np.array([first]), np.array([from_m]), np.array([to_m])
     length = network.length_m
@@ -151,13 +154,13 @@ def find_route(network: Network, matched: Matched) -> tuple[list[int], list[int]
         # the train turned back, the map has a gap, or positions lay on a track that was not passed
         routes = [*_legs(network, passed), *(_choose_route(network, order, share) for order in (passed, passed[::-1]))]
     once = [part for route in routes if route is not None for part in _once(network, route)]
-    # `fsum` rounds the same in any order: there and back over the same tracks, the way there is the route
+    # `fsum` rounds the same in any order: the return over the same tracks has the same length
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:
-    """Return the longest parts of a route that come to no joint a second time but at their end."""
+    """Return the longest parts of a route that visit no joint twice, except at their end."""
     joints = _joints(network, route)
     parts: list[list[int]] = []
     last = 0

@@ -93,7 +93,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Return the name of one of several features: its id, where it has no name of its own."""
+    """Return the name of one of several features: its own name, or its id."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -164,7 +164,7 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
 
 
 def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
-    """Return the places of coordinates in easting-northing or longitude-latitude order."""
+    """Return the positions of coordinates in easting-northing or longitude-latitude order."""
     if find_crs(crs, path=path).is_geographic:
         over = np.abs(values[:, 1]) > 90.0
         if over.any() or (np.abs(values[:, 0]) > 360.0).any():
@@ -178,7 +178,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
 
 
 def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a GeoJSON file as segments; `reading` gives what the file leaves out."""
+    """Read the lines of a GeoJSON file as segments; `reading` gives options that the file leaves out."""
     text = read_text(path)
     try:
         document = json.loads(text)
@@ -200,14 +200,14 @@ def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _without_geometry(document: dict[str, Any]) -> list[int]:
-    """Return the numbers of features whose geometry is null (RFC 7946, 3.2) and that are no connections."""
+    """Return the numbers of features whose geometry is null (RFC 7946, 3.2) and that are not connections."""
     features = [f if isinstance(f, dict) else {} for f in document.get("features") or ()]
     empty = [f.get("geometry", ...) is None and RELATION not in (f.get("properties") or {}) for f in features]
     return [number for number, without in enumerate(empty, start=1) if without]
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
-    """Return the ways of the JSON of Overpass, which is no GeoJSON."""
+    """Return the ways of the JSON of Overpass, which is not GeoJSON."""
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
@@ -222,17 +222,11 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     for wrong, right in misspelt(line.properties, (*OPTIONAL_COLUMNS, "geoid_m", *_MEMBERS)).items():
         if right not in line.properties:
             raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
-    same = (np.diff(line.coordinates, axis=0) == 0).all(axis=1)
-    if reading.duplicates == "reject" and same.any():
-        raise line.error(
-            f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
-            "'railfix map check' lists them all"
-        )
     place = _in_frame(line.source, crs, line.coordinates)
     of_way = get_metadata(line.feature)
     return make_segment(
         place,
-        # heights that are all 0 are none, as in files of other formats
+        # heights that are all 0 count as missing, as in files of other formats
         _heights(line, crs, place, reading) if line.coordinates[:, 2:].any() else None,
         source=f"{line.path} ({of_way['name']})" if "name" in of_way else line.source,
         file=line.path,
@@ -256,7 +250,7 @@ def _heights(line: _GeojsonLine, crs: str, place: Georeference, reading: MapRead
         raise line.error(f"the height datum is missing; {_DATUM_HELP}")
     geoid_m = line.array("geoid_m", np.nan) if datum == "orthometric" else None
     if geoid_m is not None and not isinstance(geoid, str):
-        geoid = None  # of the compound CRS, in place of which the map has its own
+        geoid = None  # of the compound CRS, which is replaced by the map's own
     if geoid is None and datum == "orthometric" and geoid_m is None:
         geoid = line.text("geoid")
     stated_m = line.coordinates[:, 2] * unit_of_heights(crs)
@@ -270,7 +264,7 @@ OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "radius_m": ("radius_m", 1.0, np.inf),
     "gradient_permille": ("gradient_permille", 1.0, np.nan),
 }
-#: Standard deviations of each point, for people: positioning takes those of the whole map.
+#: Standard deviations of each point, for information: positioning uses those of the whole map.
 SIGMA_COLUMNS: Final = ("sigma_plan_m", "sigma_height_m")
 KNOWN_COLUMNS: Final = (
     "latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS, *SIGMA_COLUMNS,
@@ -299,14 +293,6 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
     heights = table.numbers("height_m" if datum == "ellipsoidal" else "elevation_m")
     if len(table) < 2:
         raise InputFileError(path, f"{plural(table, 'point')}; a track needs at least two")
-    same = (np.diff(latitude) == 0) & (np.diff(longitude) == 0) & (np.diff(heights) == 0)
-    if reading.duplicates == "reject" and same.any():
-        row = int(np.argmax(same)) + 1
-        raise table.error(
-            row,
-            f"the same point as line {table.line[row - 1]} ({int(same.sum())} such in the file); remove it, "
-            "'railfix map check' lists them all",
-        )
     crs = choose_crs(path, reading.crs, table.metadata.get("crs"))
     place = _place(crs, latitude, longitude, path=table.path)
     geoid, geoid_m, above = reading.geoid, None, None
@@ -398,7 +384,7 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
 
 
 def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> Georeference:
-    """Return the places of degrees in a geographic system."""
+    """Return the positions of degrees in a geographic system."""
     if crs is None:
         return Georeference(latitude_deg=latitude, longitude_deg=longitude)
     system = find_crs(crs, path=path)

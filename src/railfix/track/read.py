@@ -10,8 +10,10 @@ from typing import Unpack
 
 import numpy as np
 
+from railfix.core.arrays import take_rows
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending
+from railfix.core.tables import plural
 from railfix.io.file_kind import GDAL, find_kind, wrong_kind
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum
@@ -49,13 +51,13 @@ def read_track(
     geoid : str, optional
         Geoid of orthometric heights: ``japan`` (JPGEO2024), ``gsigeo2011``, a pyproj grid or CRS.
     name : str, optional
-        Name of the route; by default that of the file, else the file name.
+        Name of the route; by default that of the file, otherwise the file name.
     max_gap_m : float [m]
         Widest gap between the ends of two segments.
     sigma_plan_m, sigma_height_m : float, optional [m]
         Accuracy of the map; by default that of the file, else 0.30 m and 0.60 m (P1 4.1(3)).
-    duplicates : {"reject", "keep"}
-        Equal consecutive points are an error, or kept for `railfix.track.check_track`.
+    duplicates : {"merge", "keep"}
+        Equal consecutive points become one, with a note, or are kept for `railfix.track.check_track`.
     heights : path, optional
         Second source of the heights of a map that has none; see `railfix.track.height_source.with_heights`.
 
@@ -72,8 +74,8 @@ def read_track(
     """
     reading = MapReading(**options)
     check_height_datum(reading.height_datum)
-    if reading.duplicates not in ("reject", "keep"):
-        raise ValueError(f"duplicates is {reading.duplicates!r}, expected 'reject' or 'keep'")
+    if reading.duplicates not in ("merge", "keep"):
+        raise ValueError(f"duplicates is {reading.duplicates!r}, expected 'merge' or 'keep'")
     for key, value in (("sigma_plan_m", reading.sigma_plan_m), ("sigma_height_m", sigma_height_m)):
         if value is not None and not value > 0.0:
             raise SettingsError(f"{key} is {value:g}; a positive number of metres was expected")
@@ -139,8 +141,8 @@ def check_heights(
 
 
 def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of one map file in their order; a file without heights gives segments without."""
-    segments = _read_segments(file, reading)
+    """Read the lines of one map file in their order; a file without heights gives segments without heights."""
+    segments = [_without_repeated(segment, reading) for segment in _read_segments(file, reading)]
     if (given := reading.sigma_plan_m) is not None:
         return [_with_given_accuracy(segment, given) for segment in segments]
     if unknown := [s for s in segments if np.isnan(s.datum_plan_m)]:
@@ -149,6 +151,18 @@ def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
             "with it (--plan-sigma)"
         )
     return [s if "sigma_plan_m" in s.metadata else _with_usual_accuracy(s, Path(file).name) for s in segments]
+
+
+def _without_repeated(segment: Segment, reading: MapReading) -> Segment:
+    """Return a segment without points that repeat the one before; InputFileError where fewer than two are left."""
+    points = np.stack([segment.latitude_deg, segment.longitude_deg, np.nan_to_num(segment.height_m)])
+    new = np.concatenate([[True], (np.diff(points) != 0.0).any(axis=0)])
+    if new.sum() < 2:
+        raise InputFileError(segment.source, "a track needs at least two different points")
+    if new.all() or reading.duplicates == "keep":
+        return segment
+    note = f"{segment.source}: {plural(int((~new).sum()), 'repeated point')} left out"
+    return replace(take_rows(segment, new), notes=(*segment.notes, note))
 
 
 def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
@@ -160,7 +174,7 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with an accuracy in plan that holds for all, the transformation from its datum included."""
+    """Return a segment with an accuracy in plan that is valid for all, including the transformation from its datum."""
     note = f"map: {given_m:g} m in plan (--plan-sigma) is less than the accuracy of its transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)

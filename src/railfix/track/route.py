@@ -16,11 +16,11 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference
 from railfix.track.track import BACKWARDS, SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, Provenance, Track
 
-NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights; they are NaN, or come from a second source.
+NO_HEIGHTS = "none"  #: `Segment.height_datum` of a segment without heights, which are NaN or from a second source.
 #: Optional attributes of each point of a map.
 ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
-#: Names by which files of ERA RINF are known that have no tracks, in small letters, and what is said of them.
+#: Names of ERA RINF files that have no tracks, in small letters, with the message.
 RINF_NAMES = ("sectionofline", "operationalpoint", "solopstart", "uniqueopid", "uopid", "opstart")
 RINF_SECTIONS = (
     "sections of line and operational points of ERA RINF have no geometry of tracks; export the register's topology as "
@@ -45,7 +45,7 @@ class MapReading:
     crs: str | None = None
     height_datum: str | None = None
     geoid: str | None = None
-    duplicates: str = "reject"
+    duplicates: str = "merge"
     sigma_plan_m: float | None = None
 
 
@@ -64,13 +64,13 @@ class Segment:
     cant_m: Floats
     radius_m: Floats
     gradient_permille: Floats
-    #: Of the file, and the geoid used.
+    #: Height datum of the file, and the geoid used.
     crs: str
     height_datum: str
     geoid: str
     metadata: dict[str, str]  #: Name, accuracy and origin, where the file has them.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates here.
-    #: Standard deviations of the transformations that led to them, beside the map's own accuracy [m]; NaN if unknown.
+    #: Standard deviations of their transformations, in addition to the map's own accuracy [m]; NaN if unknown.
     datum_plan_m: float = 0.0
     datum_height_m: float = 0.0
     notes: tuple[str, ...] = ()
@@ -154,7 +154,7 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
 
 
 def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
-    """Whether each segment, of ends of shape (n, 2, 3), must be reversed to begin at the end of the one before."""
+    """Whether each segment, of ends of shape (n, 2, 3), must be reversed to begin at the end of the previous one."""
     turned = [False] * len(ends)
     if len(ends) > 1:
         distance = np.linalg.norm(ends[0][:, None] - ends[1][None, :], axis=-1).min(axis=1)
@@ -166,7 +166,7 @@ def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
 
 
 def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
-    """Return the first segment that does not meet the one before, and the gap [m]; None where all meet."""
+    """Return the first segment that does not meet the previous one, and the gap [m]; None where all meet."""
     ends = _ends(segments)
     backwards = np.array(_turn(ends, max_gap_m), dtype=np.intp)
     rows = np.arange(1, len(ends))
@@ -234,7 +234,7 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the worst accuracy of the pieces: as the files state it, else the default of P1 4.1(3), with that of the
+    """Return the worst accuracy of the pieces: as stated by the files, or the default of P1 4.1(3), with that of the
     transformation from their datum.
     """
     sigmas: list[float] = []

@@ -1,7 +1,7 @@
 """3-D centreline of a railway line with curve attributes (P1 2.2(1), 4.1(3)).
 
 Right is positive: seen in the direction of rising chainage, a curve to the right has a positive radius. Cant is the
-height of the outer rail above the inner one. The height of a point is that of the rail tops' middle.
+height of the outer rail above the inner one. The height of a point is that of the middle between the rail tops.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ UNNAMED = "not named (WGS 84 assumed)"  #: Name of the reference system of a map
 #: Kilometrage has a break where it differs by more than this and a twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Ellipsoidal heights of railways, tunnels below the sea included [m].
-ANOTHER_PLACE_M = 100_000.0  #: A log further from a map than this is of another place [m].
+ANOTHER_PLACE_M = 100_000.0  #: A log farther from a map than this is of another location [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class Provenance:
 
 
 class TrackFields(TypedDict, total=False):
-    """Fields of `Track` beside its coordinates: attributes (V,), sections, accuracy, and origin."""
+    """Fields of `Track` besides its coordinates: attributes (V,), sections, accuracy, and origin."""
 
     name: str
     kilometrage_m: ArrayLike | None
@@ -222,7 +222,7 @@ class Geometry:
     turn_deg: Floats
     reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is; shape (V,).
     #: Arc minus chord at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; R from the map where
-    #: both ends have it, else from the circle through neighbouring points; shape (V - 1,).
+    #: both ends have it, otherwise from the circle through neighbouring points; shape (V - 1,).
     mid_chord_m: Floats
     gradient_permille: Floats  #: Gradient from the heights; NaN at duplicates; shape (V - 1,).
     height_spike_m: Floats  #: Height over the straight line between the neighbours; NaN at the ends; shape (V,).

@@ -23,7 +23,7 @@ _CHUNK = 2_000_000  #: Positions times candidates processed at once.
 
 
 def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
-    """Return differences of places the short way round a closed line of length `turn_m` (infinite: open)."""
+    """Return differences of positions in the shorter direction of a closed line of length `turn_m` (infinite: open)."""
     return difference_m - turn_m * np.round(difference_m / turn_m) if np.isfinite(turn_m) else difference_m
 
 
@@ -47,7 +47,7 @@ class NearestOnPolyline:
         pieces = np.maximum(np.ceil(self._length / spacing).astype(np.int64), 1)
         self._segment, piece = places_in_groups(pieces)
         share = (piece + 0.5) / pieces[self._segment]
-        #: Half the spacing of the samples, which lie in the middle of their pieces [m].
+        #: Half the spacing of the samples, which are in the middle of their pieces [m].
         self.reach_m = float((self._length / pieces).max()) / 2.0 * (1.0 + 1e-9)
         self._tree = scipy.spatial.cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
 
@@ -83,7 +83,7 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Return the nearest of some segments (n, C) to each point (n, 3), the place on it and the distance."""
+    """Return the nearest of some segments (n, C) to each point (n, 3), the position on it and the distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
     # independent of the order of the tree that has named the segments
@@ -92,21 +92,21 @@ def nearest_segments(
     return segment[row, column], share[row, column], best
 
 
-#: A line goes on where its end comes this close to another place of it [m]: no other track is as near.
+#: A line continues where its end comes this close to another part of it [m]: no other track is as near.
 _CLOSED_M: Final = 3.0
 _SAME_WAY: Final = 0.9  #: In the same direction: cosine of the angle between them.
-_END_M: Final = 100.0  #: Places this near along the line are the end itself [m].
+_END_M: Final = 100.0  #: Positions this near along the line are the end itself [m].
 
 
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
-    """Return the arc lengths at which a closed line goes on before its start and after its end; NaN if open."""
+    """Return the arc lengths at which a closed line continues before its start and after its end; NaN if open."""
     segment = np.diff(ecef_m, axis=0)
     segment /= np.linalg.norm(segment, axis=1, keepdims=True)
     return _beside(arc_m, ecef_m, segment, 0), _beside(arc_m, ecef_m, segment, -1)
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Arc length of the nearest other place of the line to one of its ends, in the same direction; NaN without."""
+    """Arc length of the nearest other part of the line to one of its ends, in the same direction; NaN without."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -118,7 +118,7 @@ def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
 
 
 #: Note in every output of a run without a vehicle file.
-TRACK_AS_PATH = "no vehicle file: the track is taken as the antenna's own path"
+TRACK_AS_PATH = "no vehicle file: the track is assumed to be the antenna's own path"
 _END_TOLERANCE_M = 1e-6  #: Rounding allowed beyond the ends of a trajectory [m].
 
 
@@ -126,10 +126,10 @@ _END_TOLERANCE_M = 1e-6  #: Rounding allowed beyond the ends of a trajectory [m]
 class Trajectory(FrozenArrays, NotebookTable):
     """Trajectory of one antenna, V points.
 
-    Right is positive across the path, seen in the direction of rising chainage.
+    Right is positive across the path, in the direction of rising chainage.
     """
 
-    name: str  #: Of the antenna, or of the track used as its path.
+    name: str  #: Positions of the antenna, or of the track used as its path.
     ecef_m: Floats  #: Shape (V, 3).
     chainage_m: Floats  #: Chainage of the track at the reference point, strictly rising, shape (V,).
     kilometrage_m: Floats  #: Kilometrage there; NaN where the map has none; shape (V,).
@@ -207,7 +207,7 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @cached_property
     def joins_m(self) -> tuple[float, float]:
-        """Arc lengths at which a closed line goes on before its start and after its end [m]; NaN at an open end."""
+        """Arc lengths at which a closed line continues before its start and after its end [m]; NaN at an open end."""
         return joins_m(self.arc_m, self.ecef_m)
 
     @cached_property
@@ -324,7 +324,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         points the one of smaller arc length; NaN where the position is NaN.
         """
         index, along, offset = self._nearest(ecef_m)
-        return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where there is no segment
+        return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where no segment was found
 
 
 class Passes(NamedTuple):
@@ -337,7 +337,7 @@ class Passes(NamedTuple):
     foot_m: Floats
     offset_m: Floats  #: From that point to the position, shape (P, 3).
     lowest: Masks  #: No neighbouring segment comes nearer: the line passes the position here.
-    again: Masks  #: As near as the segment before: at the point between the two.
+    again: Masks  #: As near as the previous segment: at the point between the two.
 
 
 def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:

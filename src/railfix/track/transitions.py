@@ -39,7 +39,7 @@ class OrdinateElement:
     into: bool = True  #: Whether the first point is the straight end.
 
     def _ordinates(self, x: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return y and its first and second derivative at places on the tangent."""
+        """Return y and its first and second derivative at abscissae on the tangent."""
         share, end, size = x / self.tangent_m, self.ordinate_m, self.tangent_m
         if self.shape == "cubic":
             return end * share**3, 3.0 * end / size * share**2, 6.0 * end / size**2 * share
@@ -52,7 +52,7 @@ class OrdinateElement:
 
     @cached_property
     def _knots(self) -> tuple[Floats, Floats]:
-        """Places on the tangent and the lengths of the curve to them."""
+        """Abscissae on the tangent and the lengths of the curve to them."""
         x = np.linspace(0.0, self.tangent_m, _PIECES + 1)
         return x, np.concatenate([[0.0], np.cumsum(self._length_between(x[:-1], x[1:]))])
 
@@ -67,7 +67,7 @@ class OrdinateElement:
         return float(self._knots[1][-1])
 
     def _place_on_tangent(self, way_m: Floats) -> Floats:
-        """Return the places on the tangent of lengths of the curve from the first point."""
+        """Return the abscissae on the tangent for lengths of the curve from the first point."""
         x, length = self._knots
         target = way_m if self.into else length[-1] - way_m
         piece = np.clip(np.searchsorted(length, target, side="right") - 1, 0, _PIECES - 1)

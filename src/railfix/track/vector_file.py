@@ -1,8 +1,8 @@
 """Lines of map files of geographic information systems, read through GDAL by `pyogrio`, OpenStreetMap among them.
 
-OpenStreetMap's ways are known by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters write
-the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class (`fclass`
-of Geofabrik's shapefiles), and the id in a dozen forms.
+OpenStreetMap's ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters
+write the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class
+(`fclass` of Geofabrik's shapefiles), and the id in a dozen forms.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SIGMA_M: Final = 2.0
 ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Origin of a segment, in its metadata.
 #: Values of the tag railway that are tracks on which trains run.
 _RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", "preserved", "monorail", "rack")
-#: Values of that tag that are no such tracks, by which a feature of OpenStreetMap is known.
+#: Values of that tag for other features than tracks, which identify a feature of OpenStreetMap.
 _OTHERS: Final = (
     "abandoned", "construction", "disused", "dismantled", "demolished", "funicular", "historic", "loading_ramp",
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
@@ -43,12 +43,12 @@ _OTHERS: Final = (
 #: Columns of the id of a feature; those that only exporters of OpenStreetMap write come first.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
-_ID: Final = re.compile(r"\W*(way|relation|[wr])?\W*(\d+)\)?")
+_ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
 CROSSING: Final = "x"  #: Begins the id of a node at which tracks cross without a connection.
-_LEFT_OUT: Final = "@left out"  #: Why a way is left out, beside its tags.
+_LEFT_OUT: Final = "@left out"  #: Reason for leaving out a way, besides its tags.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,7 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
-    """Return why a feature is no track: of OpenStreetMap those not tagged as railways that run; empty for tracks."""
+    """Return why a feature is not a track: for OpenStreetMap those not tagged as active railways; empty for tracks."""
     if row.get(_LEFT_OUT):
         return str(row[_LEFT_OUT])
     railway = get_tags(row).get("railway")
@@ -125,7 +125,7 @@ def find_level(tags: Mapping[str, Any]) -> int:
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
-    """Segments of a file, the first with a note on its lines that are no tracks; InputFileError where none is left."""
+    """Segments of a file, the first with a note on its lines that are not tracks; InputFileError where none is left."""
     left_out = ", ".join(f"{n} {why}" for why, n in reasons.items())
     note = f"{path}: lines left out that are no tracks: {left_out}"
     if not segments:
@@ -161,8 +161,8 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection."""
-    return tags.get("railway") == "railway_crossing"
+    """Return whether a node is a crossing of tracks without a connection: a slip has one."""
+    return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
 def read_overpass(path: str, elements: Any) -> list[Way]:
@@ -198,9 +198,9 @@ def _ways(
     nodes: Mapping[str, tuple[float, float]],
     crossings: Set[str],
 ) -> list[Way]:
-    """Ways with their points, in parts where some lie outside the extract; those without two points are left out.
+    """Ways with their points, in parts where some points are outside the extract; ways without two points are left out.
 
-    InputFileError: no way has two.
+    InputFileError: no way has two points.
     """
     found, short = [], []
     for row, refs in ways:
@@ -216,7 +216,7 @@ def _ways(
     if not found and short:
         raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; ask Overpass for them, too (out geom;)")
     if not found:
-        raise InputFileError(path, "there is no way with a tag railway in this file")
+        raise InputFileError(path, "no way in this file has a tag railway")
     return [*found, *short]
 
 
@@ -233,9 +233,10 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
         what = KIND_WORDS[find_kind(path)]
         raise InputFileError(path, f"is {what}, which pyogrio and shapely read; {INSTALL}") from None
     layers = []
+    pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # ids of nodes in .osm.pbf may be negative
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are no heights and not read
+            warnings.filterwarnings("ignore", "Measured", UserWarning)  # measures are not heights and are not read
             with unpacked_file(path) as file:
                 found = [
                     pyogrio.raw.read(file, layer=layer, read_geometry=geometry != "none")

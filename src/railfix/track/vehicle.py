@@ -27,7 +27,7 @@ Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 #: Distance between the contact points of the wheels minus the gauge [m]: about the width of a rail head.
 RAIL_HEAD_M: Final = 0.070
 PATH_TOLERANCE_M: Final = 0.004  #: Largest deviation of the antenna's path from the chord between two points [m].
-_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Shares of a segment at which its chord is compared with the path.
+_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Fractions of a segment at which its chord is compared with the path.
 #: Shortest segment of the path [m].
 _SHORTEST_M: Final = 0.25
 _MAX_ITERATIONS: Final = 200
@@ -105,7 +105,7 @@ class Body:
 
 
 class _VehicleLine:
-    """Centreline and roll of a bogie by cant, as functions of chainage; a closed line goes on beyond its ends."""
+    """Centreline and roll of a bogie by cant, as functions of chainage; a closed line continues beyond its ends."""
 
     def __init__(self, track: Track, contact_spacing_m: float) -> None:
         self.chainage = track.chainage_m
@@ -125,7 +125,7 @@ class _VehicleLine:
 
     @property
     def open_ends(self) -> tuple[bool, bool]:
-        """Whether the line does not go on before its start, after its end."""
+        """Whether the line does not continue before its start, after its end."""
         return bool(np.isnan(self.joins[0])), bool(np.isnan(self.joins[1]))
 
     def at(self, chainage: Floats) -> Floats:
@@ -146,7 +146,7 @@ class _VehicleLine:
         return self.curve.at(chainage)
 
     def roll_at(self, chainage: Floats) -> Floats:
-        """Return the roll by cant, shape (n,) [rad]; that of the end beyond an open end."""
+        """Return the roll by cant, shape (n,) [rad]; beyond an open end that of the end."""
         before, after = self.joins
         last = self.chainage[-1]
         open_start, open_end = self.open_ends
@@ -170,7 +170,7 @@ def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
         side = np.where(np.isfinite(track.radius_m), np.sign(track.radius_m), 0.0)
     if (canted & np.isnan(track.radius_m)).any():
         side = np.where(np.isnan(track.radius_m), _side_of_bends(track), side)
-        notes.append("the side of the cant is taken from the bend of the centreline where the map has no radius")
+        notes.append("the side of the cant is that of the bend of the centreline where the map has no radius")
     curved = np.flatnonzero(side)
     if not curved.size:
         raise MismatchError(f"{track.name}: the track has cant but no curve, so its side is unknown; give radius_m")

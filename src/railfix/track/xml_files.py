@@ -16,6 +16,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, file_sha256, read_bytes
+from railfix.io.xml_lines import read_root, tag
 from railfix.track.crs import choose_crs
 from railfix.track.landxml_file import finite_number, read_landxml_segments
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
@@ -38,28 +39,16 @@ class Relation:
     navigable: bool  #: Whether trains pass from one to the other.
 
 
-def _root(path: FilePath) -> Any:
-    try:
-        from lxml import etree
-    except ImportError:
-        raise InputFileError(path, f"reading XML maps needs lxml; {INSTALL}") from None
-    try:
-        parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
-        return etree.fromstring(read_bytes(path), parser)
-    except etree.XMLSyntaxError as error:
-        raise InputFileError(path, f"this is not XML ({error.msg})", line=error.lineno) from None
-
-
 def read_xml_segments(path: FilePath, reading: MapReading) -> list[Segment]:
     """Read the lines of a LandXML or railML 3 file as segments; InputFileError when it is neither, or has no line."""
-    root = _root(path)
-    kind = str(root.tag).rsplit("}", 1)[-1]
+    root = read_root(path)
+    kind = tag(root)
     if kind == "LandXML":
         return read_landxml_segments(str(path), root, reading)
     if kind == "railML":
         return _railml(str(path), root, reading)
     message = f"the root element is {kind!r}; LandXML or railML (3) was expected"
-    if any(str(element.tag).rsplit("}", 1)[-1].lower() in RINF_NAMES for element in root.iter()):
+    if any(tag(element).lower() in RINF_NAMES for element in root.iter()):
         message += f"; {RINF_SECTIONS}"
     raise InputFileError(path, message)
 
@@ -105,12 +94,12 @@ def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
 
 def read_railml_relations(path: FilePath) -> list[Relation]:
     """Read the net relations of a railML 3 file; empty for other XML files."""
-    root = _root(path)
+    root = read_root(path)
     relations = []
     for item in root.iterfind(".//{*}netRelation"):
         first, second = item.find("{*}elementA"), item.find("{*}elementB")
         if first is None or second is None:
-            raise InputFileError(path, f"netRelation {item.get('id')} names no two elements", line=item.sourceline)
+            raise InputFileError(path, f"netRelation {item.get('id')} names no two elements")
         relations.append(
             Relation(
                 first=str(first.get("ref")),
@@ -133,7 +122,7 @@ _CODE: Final = re.compile(r".*/crs/(?P<name>OGC|EPSG)/[^/]*/(?P<code>\w+)")
 
 
 def read_rinf_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the linear elements that have a geometry as segments; InputFileError where there is none."""
+    """Read the linear elements that have a geometry as segments; InputFileError where none exists."""
     graph, segments = _graph(path), []
     for element in _all(graph, "LinearElement"):
         texts = [
@@ -215,6 +204,6 @@ def _values(graph: Graph, subject: Any, predicate: str) -> list[Any]:
 
 
 def _name(graph: Graph, subject: Any) -> str:
-    """Label of a resource, else the last part of its address."""
+    """Label of a resource, otherwise the last part of its address."""
     labels = _values(graph, subject, _LABEL)
     return str(labels[0]) if labels else re.split(r"[/#]", str(subject))[-1]

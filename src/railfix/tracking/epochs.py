@@ -32,6 +32,7 @@ class GnssEpochs:
 
     time: Datetimes  #: Shape (T,).
     satellite: Strings  #: Shape (K,).
+    signal: Strings  #: With the satellite the name of the channel, which no other one has; shape (K,).
     clock: Strings  #: Letter of the receiver clock of each channel's codes; shape (K,).
     #: Satellites at transmission; shape (T, K, 3).
     sat_ecef_m: Floats
@@ -55,9 +56,14 @@ class GnssEpochs:
     def __len__(self) -> int:
         return len(self.time)
 
+    @property
+    def channel(self) -> Strings:
+        """Names of the channels, shape (K,)."""
+        return np.char.add(self.satellite, self.signal)
+
     def take(self, rows: Indices | slice) -> GnssEpochs:
         """Return some of the epochs; what belongs to channels stays whole."""
-        of_channels = ("satellite", "clock")
+        of_channels = ("satellite", "signal", "clock")
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in of_channels}
         values = {name: value[rows] for name, value in values.items() if value is not None}
         return replace(self, **values)
@@ -135,6 +141,6 @@ class SensorEpochs:
 class Previous:
     """The last epoch: what a change of the carrier phase is taken from."""
 
-    satellite: Strings  #: Shape (K,).
+    channel: Strings  #: Shape (K,).
     sat_ecef_m: Floats  #: Shape (K, 3).
     phase_m: Floats  #: Shape (K,).

@@ -50,7 +50,7 @@ class Orbits(RowArrays):
     eccentricity: Floats
     root: Floats  #: sqrt(1 - e^2).
     m0: Floats
-    #: Of the argument of perigee and of the inclination at toe.
+    #: Rates of the argument of perigee and of the inclination at toe.
     cos_omega: Floats
     sin_omega: Floats
     cos_i0: Floats
@@ -266,11 +266,12 @@ class GlonassStates:
         return position, velocity
 
 
-#: Points of the interpolation polynomial (order 12). With positions every 15 minutes it is within 3 mm on the two
-#: Galileo satellites in elliptic orbits, where the usual 11 points err by 17 mm near perigee, and within a
-#: micrometre elsewhere; in the first and last interval of a file up to 0.7 m on these two (0.05 mm elsewhere).
+#: Points of the interpolation polynomial (order 12). With positions every 15 minutes the error is within 3 mm for the
+#: two Galileo satellites in elliptic orbits, where the usual 11 points err by 17 mm near perigee, and within a
+#: micrometre for the others; in the first and last interval of a file up to 0.7 m for these two (0.05 mm for the
+#: others).
 POINTS: Final = 13
-#: Epochs further apart than this many times the usual interval are a gap, within which there is no state.
+#: Epochs farther apart than this many times the usual interval are a gap, within which there are no states.
 _GAP: Final = 1.5
 _STATES: Final = 4096  #: Number of states computed at once, so that the arrays stay in the cache.
 
@@ -290,8 +291,8 @@ def precise_state(
     """Compute positions and velocities (3, n), and clocks (n,) of satellites at ``time + offset``.
 
     `column` is -1 where a satellite is not in the ephemeris of at least `POINTS` epochs; `offset_s` a fraction of a
-    second. NaN where a node is missing or the time lies outside the file or in a gap. The clock has the relativistic -2
-    r.v / c^2 that SP3 clocks do not contain.
+    second. NaN where a node is missing or where the time lies outside the file or in a gap. The clock has the
+    relativistic -2 r.v / c^2 that SP3 clocks do not contain.
     """
     if len(ephemeris.time) < POINTS:
         raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")
@@ -317,7 +318,7 @@ def _state(
     place = np.moveaxis(ephemeris.position_ecef_m[index], -1, 0)
     rotated = np.stack(_rotate_axes(EARTH_ROTATION_RATE * since[..., None], place))
     own = seconds(time - nodes[begin]) + offset_s
-    difference = since[:, None] - since[None]  # of each node to the others of its window
+    difference = since[:, None] - since[None]  # difference of each node from the others of its window
     difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
     weight, slope = _lagrange_at_zero(since[:, which] - own, difference.prod(axis=1)[:, which])
     chosen = rotated[:, :, which, column]

@@ -1,11 +1,10 @@
 """Selection of the navigation record of a satellite at an epoch; lookups and orbit elements, computed once and cached.
 
-The newest record transmitted before the epoch is selected. A record without a transmission time
-counts as transmitted half-way between the reference times of the record before it and its own. Where
-the newest record is outside its validity (expired while an older one is still valid, or transmitted
-long before its validity begins), or where all records were transmitted after the epoch (a file that
-begins later than the log), the record with the nearest reference time is selected if it is valid,
-and flagged if it had not been transmitted yet. Health is that of the selected record: an older
+The newest record transmitted before the epoch is selected. A record without a transmission time counts as transmitted
+half-way between its own reference time and that of the previous record. Where the newest record is outside its validity
+(expired while an older one is still valid, or transmitted long before its validity begins), or where all records were
+transmitted after the epoch (a file that begins later than the log), the record with the nearest reference time is
+selected if it is valid, and flagged if it had not been transmitted yet. Health is that of the selected record: an older
 healthy record does not override it.
 """
 
@@ -27,9 +26,9 @@ from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 
 #: Longest distance of an epoch from toe [s]: GPS and QZSS half the broadcast fit interval and
 #: never less than this (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour);
-#: Galileo 4 h (Galileo OS SDD 1.3, 2.4.2: no data older than that are broadcast). BeiDou (renewed
-#: every hour) and GLONASS (renewed every 30 min) broadcast none: the limits are those of RTKLIB 2.4.3
-#: (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
+#: Galileo 4 h (Galileo OS SDD 1.3, 2.4.2: no data older than that are broadcast). BeiDou (renewed every hour) and
+#: GLONASS (renewed every 30 min) do not broadcast a validity: the limits are those of RTKLIB 2.4.3 (MAXDTOE_CMP,
+#: MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
 #: A record transmitted earlier than this before its validity begins has a wrong transmission time [s].
@@ -49,7 +48,7 @@ class Lookup:
     #: shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: The same by reference time: from half-way between the reference time before and its own; shape (n,).
+    #: Start of use by reference time: half-way between the previous reference time and its own; shape (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -117,14 +116,16 @@ def validity_s(records: KeplerRecords) -> Floats:
     return np.fmax(base, records.fit_interval_h * 1800.0)
 
 
-_ISSUES: Final = 1024  #: Number of different issues of data: 10 bits of Galileo; the others have 8.
+_ISSUES: Final = 1024  #: Number of distinct issues of data: Galileo has 10 bits, the others 8.
 #: Time span that a lookup key can hold [ms]: 278 years.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 
 
 class _Issues:
-    """Records by satellite and issue, each from half-way between the toe before and its own; F/NAV before I/NAV."""
+    """Records by satellite and issue, each valid from half-way between the preceding toe and its own; F/NAV before
+    I/NAV.
+    """
 
     def __init__(self, kepler: KeplerRecords) -> None:
         row = np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")).nonzero()[0]
@@ -173,10 +174,18 @@ GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b1
 #: QZSS: bits of the health word that concern a signal (IS-QZSS-PNT-006, 4.1.2.3(4)): L1, L1C/A, L2C, L5, L1C, L1C/B
 #: from the most significant one. 1 (no L1C/B) is broadcast by satellites with L1C/A since 2022.
 QZSS_HEALTH: Final[Mapping[str, int]] = {
-    "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
-    "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
-}  # fmt: skip
-#: A record that states an accuracy beyond this (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
+    "1C": 0b110_000,
+    "1E": 0b100_001,
+    "1S": 0b10,
+    "1L": 0b10,
+    "1X": 0b10,
+    "2S": 0b1000,
+    "2L": 0b1000,
+    "2X": 0b1000,
+    "5I": 0b100,
+    "5Q": 0b100,
+    "5X": 0b100,
+}  # A record that states a larger accuracy is rejected (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
 #: IS-GPS-200, 20.3.3.3.1.3) is of no use [m]; the performance standard of GPS calls such a signal marginal.
 LARGEST_ACCURACY_M: Final = 48.0
 #: Columns of `KeplerRecords.inter_signal_s` by signal of GPS and QZSS; their mean where data and pilot are one code.
@@ -185,7 +194,7 @@ _ISC: Final[Mapping[str, list[int]]] = {
     "1S": [4], "1L": [5], "1X": [4, 5],
 }  # fmt: skip
 #: Standard deviation of the delay on L2 and L5 without ISC [m]: over the satellites of GPS whose CNAV has it, on
-#: 2025-02-15, TGD - ISC less what stands for it has 0.24 m on L2C and 0.55 m on L5Q
+#: 2025-02-15, TGD - ISC less the value used instead has 0.24 m on L2C and 0.55 m on L5Q
 #: (`tests/gnss/test_group_delays.py`).
 _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 _P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
@@ -199,7 +208,7 @@ def unhealthy(records: KeplerRecords, signal: str) -> Masks:
 
     GPS: any of the six bits. QZSS and Galileo: the bits of the signal; Galileo also where no
     accuracy is predicted (SISA "NAPA", written as -1; OS SDD 1.3, 2.3.1.4 calls that marginal).
-    CNAV and CNAV-2: the bit of the band. BeiDou: SatH1 or HS. All: an accuracy beyond `LARGEST_ACCURACY_M`.
+    CNAV and CNAV-2: the bit of the band. BeiDou: SatH1 or HS. All constellations: accuracy beyond `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")
     bits = np.full(len(records), _ANY, dtype=np.int64)
@@ -223,14 +232,13 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
              3.5.3.9). LNAV has no ISC: TGD on L5 (`group_delay_sigma_m`).
     Galileo  OS SIS ICD 5.1.5. Clocks of I/NAV refer to E1 and E5b, of F/NAV to E1 and E5a. E1 uses
              the BGD of its clock; E5a and E5b follow from both BGDs. F/NAV has no BGD E5b/E1:
-             BGD E5a/E1 is used in its place. NaN on E6, whose delay is not broadcast.
-    BeiDou   The clock is that of B3I (B1I ICD 3.0, 5.2.4.10), 0 on B3I. D1 and D2: TGD1 on B1I, TGD2 on B2I.
+             BGD E5a/E1 is used instead. NaN on E6, whose delay is not broadcast.
+    BeiDou The clock refers to B3I (B1I ICD 3.0, 5.2.4.10), 0 on B3I. D1 and D2: TGD1 on B1I, TGD2 on B2I.
              CNV1, CNV2 (B1C ICD 1.0, 7.6; B2a ICD 1.0, 7.6): TGD_B1Cp and TGD_B2ap on the pilots, with ISC on
              the data signals. CNV3: TGD_B2bI on B2b. NaN on signals whose delay the message does not contain.
     ======== =====================================================================================
 
-    The clock is that of the record ("broadcast"), or of SP3 files ("ionosphere_free": the pairs L1/L2, E1/E5a,
-    B1I/B3I).
+    Clock source: the record ("broadcast"), or SP3 files ("ionosphere_free": the pairs L1/L2, E1/E5a, B1I/B3I).
     """
     delay = np.full(len(records), np.nan)
     system = records.satellite.astype("<U1")
@@ -245,7 +253,9 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m]; else 0."""
+    """Return the sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m];
+    otherwise 0.
+    """
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
 
@@ -370,7 +380,7 @@ class PreparedRecords:
         first, second = zip(*(_labels(name, code) for name, code in names), strict=True) if names else ((), ())
         pairs = [(number.get(a, -1), number.get(b, -1)) for a, b in zip(first, second, strict=True)]
         preferred, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        # A satellite that has only the other message uses it as the preferred one.
+        # A satellite that has only the other message uses it instead of the preferred one.
         preferred, other = np.where(preferred < 0, other, preferred), np.where(preferred < 0, -1, other)
         clock: ClockReference = "broadcast" if self.navigation.precise is None else "ionosphere_free"
         records = self.navigation.kepler

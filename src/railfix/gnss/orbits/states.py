@@ -29,17 +29,17 @@ class SatelliteStates:
     NaN where a channel has no code, no record, or only records out of their validity.
     """
 
-    #: In the Earth-fixed frame of the time of transmission, not rotated to that of reception
+    #: Position in the Earth-fixed frame at the time of transmission, not rotated to the time of reception
     #: (`railfix.core.geodesy.range_with_rotation` does that); shape (T, M, 3).
     position_ecef_m: Floats
     velocity_ecef_mps: Floats  #: Derivative of `position_ecef_m` in the same frame, shape (T, M, 3).
     clock_m: Floats  #: c times the satellite clock with the relativistic correction, without group delay; shape (T, M).
-    #: Of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on signals whose delay is
-    #: not broadcast (`prepared_records.group_delay_s`); shape (T, M).
+    #: Group delay of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on signals
+    #: whose delay is not broadcast (`prepared_records.group_delay_s`); shape (T, M).
     group_delay_m: Floats
     age_s: Floats  #: Epoch minus the reference time of the record; 0 for a precise ephemeris; shape (T, M).
     accuracy_m: Floats  #: As broadcast; NaN for GLONASS and for a precise ephemeris; shape (T, M).
-    #: Row of the record table of the constellation, -1 where there is none; set also where the record is too old or the
+    #: Row in the record table of the constellation, -1 without a record; set also where the record is too old or the
     #: channel has no code; shape (T, M).
     record: Integers
     no_record: Masks  #: The satellite has no record, shape (T, M).
@@ -77,8 +77,8 @@ def satellite_states(
     The receiver clock affects time tag and code equally, so the time of transmission needs no
     estimate of it. No result depends on the other epochs or channels of the call, to the last bit.
 
-    Galileo channels on E5a use F/NAV records, all others I/NAV; where no such record is valid at an
-    epoch, a valid record of the other message with its clock and group delay.
+    Galileo channels on E5a use F/NAV records, all others I/NAV; where no such record is valid at an epoch, they use a
+    valid record of the other message with its clock and group delay.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _fill_kepler(
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
-    """Yield channels, epochs and record rows to compute together: all of a short chunk, else by channel."""
+    """Yield channels, epochs and record rows to compute together: all of a short chunk, otherwise by channel."""
     if rows.shape[1] < _SHORT:
         k, t = np.nonzero(usable)
         if len(k):

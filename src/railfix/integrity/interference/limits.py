@@ -17,16 +17,16 @@ from railfix.core.timescale import GPS_EPOCH, seconds
 
 
 class Suspicion(IntEnum):
-    """Likely cause of what all satellites of an epoch show; `suspicion` decides it."""
+    """Likely cause of signs that all satellites of an epoch share; `suspicion` decides it."""
 
     NONE = 0
     JAMMING_SUSPECTED = 1
     SPOOFING_SUSPECTED = 2
-    #: All satellites fit, with one error of the time tags.
+    #: All satellites are consistent with one error of the time tags.
     TIME_TAGS = 3
-    #: The 3-D positions have left the map, and nothing else is the matter.
+    #: The 3-D positions have left the map, without any other sign.
     LEFT_MAP = 4
-    #: All positions of the last minute failed a check; the cause is open.
+    #: All positions of the last minute failed a check; the cause is unknown.
     CONTRADICTED = 5
 
 
@@ -50,11 +50,11 @@ class Sign(IntFlag):
     SPEED_JUMP = 1 << 6
     #: The 3-D position moves farther than a train can.
     POSITION_JUMP = 1 << 7
-    #: Constellations, each by itself, place antenna or clock apart.
+    #: Constellations give different positions or clocks of the antenna.
     CONSTELLATIONS_PART = 1 << 8
     #: Consistent 3-D positions have left the map sideways.
     LEFT_MAP = 1 << 9
-    #: The distance by satellites parts from that of the wheel.
+    #: The distance by satellites deviates from that of the wheel.
     WHEEL_PARTS = 1 << 10
     #: One error of the time tags explains the ranges.
     TIME_TAGS = 1 << 11
@@ -82,8 +82,8 @@ class InterferenceLimits(Settings):
     #: Largest standard deviation of the falls: a jammer raises the noise of all channels alike, walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: How fast a peak is forgotten [dB/min].
-    known_after_s: float = Field(default=10.0, ge=0)  #: A satellite is compared once it has been tracked for so long.
-    #: Fall of the front end's gain as a share of its recent peak; 14 % within a start without interference.
+    known_after_s: float = Field(default=10.0, ge=0)  #: A satellite is compared once it has been tracked for this time.
+    #: Fall of the front end's gain as a fraction of its recent peak; 14 % within a start without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
     #: Largest standard deviation of equal C/N0; in open sky 1.2 dB and more.
     equal_db: float = Field(default=0.8, gt=0)
@@ -98,12 +98,12 @@ class InterferenceLimits(Settings):
     #: and a phone's with seven satellites within 0.13 s.
     tag_error_s: float = Field(default=0.1, gt=0)
     tag_sigmas: float = Field(default=6.0, gt=0)
-    #: How long all positions fail a check before no position is taken as sure.
+    #: Time for which all positions fail a check before positions are considered unreliable.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: The same in standard deviations; and of the difference of two constellations.
+    #: Limit in standard deviations; and of the difference of two constellations.
     jump_sigmas: float = Field(default=10.0, gt=0)
     part_sigmas: float = Field(default=15.0, gt=0)
-    #: Of a train; position jumps are beyond what these allow.
+    #: Limits of a train's motion; position jumps exceed these.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Epochs farther apart are not compared.
@@ -129,7 +129,7 @@ class InterferenceLimits(Settings):
     wheel_change: float = Field(default=0.001, gt=0)
     #: A wheel that changes its speed faster has slipped: the comparison restarts. Adhesion gives 1 to 1.5.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: How long a suspicion stays after its last sign: a jump is over in one epoch, what it began is not.
+    #: Time for which a suspicion remains after its last sign: a jump takes one epoch, its cause lasts.
     jamming_release_s: float = Field(default=10.0, ge=0)
     spoofing_release_s: float = Field(default=300.0, ge=0)
 
@@ -142,11 +142,12 @@ def cause_text(causes: Bits) -> Strings:
 
 
 def suspicion(causes: Bits) -> Codes:
-    """Return the `Suspicion` of epochs by their causes, same shape: the only place that decides between causes.
+    """Return the `Suspicion` of epochs by their causes, same shape: all decisions between causes are made here.
 
-    What explains most comes first. One error of the time tags, fitted to all ranges, moves positions and clocks as a
-    spoofer would. Jumps, equal C/N0 and parted constellations are no driving off the map. A train that leaves its map
-    shows no sign but that, and neither does jamming. Satellites that are wrong by themselves are excluded before.
+    The cause that explains most signs comes first. One error of the time tags, fitted to all ranges, moves positions
+    and clocks as a spoofer would. Jumps, equal C/N0 and different constellations are not caused by leaving the map. A
+    train that leaves its map shows no other sign than that, and neither does jamming. Satellites that are wrong
+    separately are excluded before.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -166,7 +167,7 @@ class HeldState:
     """State of C conditions after a chunk."""
 
     time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Last epoch; NaT before the first.
-    #: How long each condition had held, shape (C,).
+    #: Time for which each condition has been true, shape (C,).
     run_ns: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     #: When it last counted; NaT for never; shape (C,).
     last: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
@@ -175,7 +176,7 @@ class HeldState:
 def hold_signs(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
-    """Return which conditions have held for their time, which have within their time of release, and the state.
+    """Return which conditions have been true for their time, which within their time of release, and the state.
 
     An interval between epochs counts for half the time of holding at most, so that one epoch after a gap proves
     nothing. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a time of holding of 0
@@ -196,9 +197,9 @@ def hold_signs(
 
 
 _MINUTE_S: Final = 60.0
-_GAIN_DECAY_PER_MIN: Final = 0.005  #: The gain's peak is forgotten by this share of it a minute.
-_LARGEST_DBHZ: Final = 100.0  #: A peak that has been forgotten by so much is below every C/N0.
-_LONGEST_SILENCE_S: Final = 60.0  #: Satellites not heard for longer are not compared with what they were [s].
+_GAIN_DECAY_PER_MIN: Final = 0.005  #: The gain's peak is forgotten by this fraction of it per minute.
+_LARGEST_DBHZ: Final = 100.0  #: A peak that has been forgotten by this much is below every C/N0.
+_LONGEST_SILENCE_S: Final = 60.0  #: Satellites that were absent for longer are not compared with earlier values [s].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +223,7 @@ class PowerSigns:
     fall_db: Floats
     spread_db: Floats
     difference_db: Floats  #: Standard deviation of C/N0 over the satellites, shape (T,).
-    #: Fall of the gain as a share of its recent peak; NaN where the receiver does not give it; shape (T,).
+    #: Fall of the gain as a fraction of its recent peak; NaN where the receiver does not give it; shape (T,).
     gain_fall: Floats
 
 
@@ -231,9 +232,9 @@ def power_signs(
 ) -> tuple[PowerSigns, PowerState]:
     """Return the statistics of C/N0, shape (T, K), and gain, shape (T,), and the state to pass on.
 
-    The recent peak of a satellite falls by `peak_decay_db_per_min`: a slow change of the sky passes, a jammer that
-    stays is seen for minutes. `channel` names satellite and signal, one signal of each satellite at an epoch. The gain
-    is in the receiver's unit, + for more gain; NaN where unknown.
+    The recent peak of a satellite falls by `peak_decay_db_per_min`: a slow change of the sky does not raise a sign, a
+    constant jammer is detected for minutes. `channel` names satellite and signal, one signal of each satellite at an
+    epoch. The gain is in the receiver's unit, + for more gain; NaN where unknown.
     """
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ

@@ -16,15 +16,16 @@ from railfix.integrity.interference.limits import InterferenceLimits
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_time_tags, median_tag_error
 
-#: Steps of receiver clocks by whole milliseconds are none of interference [m].
+#: Steps of receiver clocks by whole milliseconds are not signs of interference [m].
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
-_LEAST_FREEDOM: Final = 3  #: Redundant ranges or Dopplers that their noise is taken from: fewer can agree by chance.
+#: Redundant ranges or Dopplers from which their noise is estimated: fewer can agree by chance.
+_LEAST_FREEDOM: Final = 3
 _LEAST_MPS: Final = 0.05  #: Least noise of Dopplers [m/s].
-_SIZE: Final = 4  #: Unknowns that two constellations give by themselves: position and clock.
+_SIZE: Final = 4  #: Unknowns that two constellations determine separately: position and clock.
 
 
 class Fix(NamedTuple):
-    """Positions and velocities of T epochs, each with its standard deviation; NaN where there is none."""
+    """Positions and velocities of T epochs, each with its standard deviation; NaN where missing."""
 
     time: Datetimes
     ecef_m: Floats  # (T, 3)
@@ -33,7 +34,7 @@ class Fix(NamedTuple):
     velocity_sigma_mps: Floats
 
     def take(self, rows: Indices | slice) -> Fix:
-        """Return those of some epochs."""
+        """Return the fits of some epochs."""
         time, ecef, sigma, velocity, velocity_sigma = self
         return Fix(time[rows], ecef[rows], sigma[rows], velocity[rows], velocity_sigma[rows])
 
@@ -61,7 +62,7 @@ class MotionSignState:
     position: Fix = field(default_factory=_no_fix)
     velocity: Fix = field(default_factory=_no_fix)
     on_map: bool = False  #: A position has been on the map.
-    tags: TagErrors = NO_TAGS  #: Of the last epochs.
+    tags: TagErrors = NO_TAGS  #: Fits of the last epochs.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +70,7 @@ class MotionSigns:
     """Statistics of T epochs; NaN where there is nothing to compare."""
 
     clock_jump_m: Floats  #: Median change of the codes against the Dopplers, less whole milliseconds; shape (T,).
-    #: Changes beyond what train and oscillator allow, and the same in standard deviations; shape (T,).
+    #: Changes beyond the limits of train and oscillator, and in standard deviations; shape (T,).
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
@@ -87,7 +88,7 @@ class MotionSigns:
 
 
 class MotionFit(NamedTuple):
-    """What the ranges of T epochs give by themselves, of whatever antenna."""
+    """Fits of the ranges of T epochs, of any antenna, without other data."""
 
     fixes: Fix
     part_sigmas: Floats  #: Of `MotionSigns`.
@@ -177,7 +178,7 @@ def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
 
 
 def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return changes of velocity and clock drift beyond what is possible, each also in standard deviations."""
+    """Return changes of velocity and clock drift beyond the physical limits, each also in standard deviations."""
     dt = seconds(now.time - before.time)
     near = np.where(dt <= limits.longest_gap_s, 1.0, np.nan)
     sigma = np.hypot(now.velocity_sigma_mps, before.velocity_sigma_mps)

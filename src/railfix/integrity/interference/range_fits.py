@@ -1,4 +1,4 @@
-"""Ranges of epochs that the signs of interference are looked for in, and least-squares fits of them."""
+"""Ranges of epochs that the signs of interference are searched for in, and least-squares fits of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.positioning.search_index import SearchIndex
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-_RIDGE: Final = 1e-9  #: Weight of the unknowns by themselves, for what a satellite is missing for.
+_RIDGE: Final = 1e-9  #: Weight of the unknowns themselves, for those that too few satellites determine.
 
 
 class MotionInputs(NamedTuple):
@@ -31,7 +31,7 @@ class MotionInputs(NamedTuple):
     corrected_code_m: Floats
     sigma_m: Floats
     used: Masks  #: Channels without a reason against them, shape (T, K).
-    named: Masks  #: Channels that are wrong by themselves, and would be used otherwise; shape (T, K).
+    named: Masks  #: Channels that are wrong separately, and would be used otherwise; shape (T, K).
     noise_scale: Floats  #: Shape (T,).
     #: Known offsets between the receiver clocks, and their sigmas; shape (T, G).
     clock_offset_m: Floats

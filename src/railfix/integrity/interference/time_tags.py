@@ -1,7 +1,7 @@
 """A common error of the time tags as a hypothesis: position, receiver clocks and the error fitted together.
 
 Satellites were where they are not at the tags, so that the column of the error is the range rate of the satellites with
-its sign changed. Bad codes and a train off its map are the other hypotheses: the error has to explain clearly more.
+its sign changed. Bad codes and a train off its map are the alternative hypotheses: the error must explain clearly more.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 
 _RATE_MPS: Final = 500.0  #: Range rate of a satellite, by its order: unit of the column of the error [m/s].
-#: The error is a median over so many epochs at most and at least, none older than the window.
+#: The error is a median over at most and at least these numbers of epochs, none older than the window.
 _TAG_EPOCHS: Final = 10
 _TAG_LEAST: Final = 3
 _TAG_WINDOW: Final = np.timedelta64(60, "s")
@@ -23,12 +23,12 @@ _STEPS: Final = 6  #: Steps of a fit at most; and up to which error [s] and posi
 _SETTLED_S: Final = 0.05
 _SETTLED_M: Final = 100.0
 _ROUNDS: Final = 2  #: Fits of each step, with the weights by the residuals before.
-_FITS_WELL: Final = 3.0  #: Residuals up to so many times the median one have their full weight.
-_SHOWN: Final = 3.0  #: Errors from so many standard deviations on are tested against the other hypotheses.
+_FITS_WELL: Final = 3.0  #: Residuals up to this multiple of the median have full weight.
+_SHOWN: Final = 3.0  #: Errors from this many standard deviations on are tested against the other hypotheses.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's position across and above its line.
 _LEAST_FREEDOM: Final = 3  #: Redundant ranges that agree on an error at least.
-#: Residuals up to so many standard deviations agree; larger ones cost no more. An error of the time tags takes one bad
-#: code in by itself, so that it has to cost less by more than one of these squared.
+#: Residuals up to this many standard deviations agree; larger ones cost no more. An error of the time tags takes one
+#: bad code in by itself, so that it has to cost less by more than one of these squared.
 _AGREES: Final = 5.0
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
@@ -79,9 +79,9 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
     """Return whether an error of the time tags explains clearly more than bad codes do, by both residuals; (T,)."""
     every = inputs.used | inputs.named
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
-    # without a redundant range those that are left fit, and those that are named do not
+    # without a redundant range the remaining ones fit in any case, and the named ones do not
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # of this fit, and no more than that of the receiver, which takes an error of the tags for noise
+    # noise of this fit, at most that of the receiver, which would include an error of the tags
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
@@ -124,7 +124,8 @@ def _with_line(channels: Masks, line: bool) -> Masks:
 def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks) -> tuple[Floats, Floats, Floats]:
     """Return solutions, standard deviations of the fourth unknown, and residuals over their standard deviations.
 
-    Rows that are `counted` are fitted, those that fit badly with less weight; of others there are residuals alone.
+    Rows that are `counted` are fitted, with less weight where they fit badly; for the others only residuals are
+    computed.
     """
     now = full = np.where(counted, weight, 0.0)
     for _ in range(_ROUNDS):
@@ -150,7 +151,7 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
     """Return the median error of the time tags over the last epochs, also in standard deviations, and those to keep.
 
-    The standard deviation is the median one of the epochs, or that of their spread where it is larger. NaN for fewer
+    The standard deviation is the median of the epochs, or that of their spread where it is larger. NaN for fewer
     than `_TAG_LEAST` epochs.
     """
     tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))

@@ -1,7 +1,7 @@
-"""Distance by satellites against that of a wheel: a pull along the track that nothing else sees.
+"""Distance by satellites against that of a wheel: detects a pull along the track that no other test detects.
 
-Over a window both differ by the noise of two positions and by the wheel's scale error, which is taken from the time
-before the window. A pull from the beginning, or as slow as the diameter is uncertain, is not seen.
+Over a window the two differ by the noise of two positions and by the wheel's scale error, which is estimated before the
+window. A pull from the beginning, or as slow as the uncertainty of the diameter, is not detected.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Least standard deviation of a position: errors of satellites and atmosphere that change over minutes [m].
+#: Least standard deviation of a position: satellite and atmospheric errors that change over minutes [m].
 _LEAST_M: Final = 1.0
-#: A tachometer that gives no distance below this speed is taken as standing, to this speed [m/s].
+#: Speed up to which a tachometer without output counts as standing, or may creep [m/s].
 _SLOW_MPS: Final = 0.5
-#: Positions are taken once so long, as tags may be so much before the whole second.
+#: Positions are used at this interval; tags may precede the whole second by this time.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
@@ -31,9 +31,10 @@ class WheelSamples(RowArrays):
     #: By satellites.
     arc_m: Floats = field(default_factory=lambda: np.empty(0))
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Of the wheel since its beginning.
-    doubt_m: Floats = field(default_factory=lambda: np.empty(0))  #: What it may have rolled at speeds too slow for it.
-    #: The same where the wheel has turned without slip or a gap.
+    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Distance of the wheel since its beginning.
+    #: Largest distance that it may have rolled below its least speed.
+    doubt_m: Floats = field(default_factory=lambda: np.empty(0))
+    #: Distance over which the wheel has turned without slip or a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
@@ -41,10 +42,10 @@ class WheelSamples(RowArrays):
 class WheelState:
     """State after a chunk."""
 
-    #: The first one of the present part, and those of the last window.
+    #: The first sample of the present part, and those of the last window.
     samples: WheelSamples = field(default_factory=WheelSamples)
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last epoch.
-    #: Of the wheel there; the speed NaN where unknown.
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
+    #: Distance of the wheel there; the speed is NaN where unknown.
     distance_m: float = 0.0
     doubt_m: float = 0.0
     speed_mps: float = float("nan")
@@ -52,7 +53,7 @@ class WheelState:
     part: int = 0
     second: int = -1
     held: HeldState = field(default_factory=HeldState)
-    #: Of the last sample.
+    #: Time of the last sample.
     difference_m: float = float("nan")
     bound_m: float = float("nan")
     beyond: bool = False
@@ -64,11 +65,11 @@ class WheelSigns:
 
     #: Distance by satellites over the window less that of the wheel; NaN where not compared; shape (T,).
     difference_m: Floats
-    #: Of the error of the position, for a pull that began within the window, be it shorter than `wheel_least_s`: the
+    #: Bound of the position error, for a pull that began within the window, even if shorter than `wheel_least_s`: the
     #: difference, and `wheel_level_sigmas` of the position at the beginning and of the wheel's distance since; shape
     #: (T,).
     bound_m: Floats
-    parted: Masks  #: It is beyond what noise and diameter allow, or was within the time of release; shape (T,).
+    parted: Masks  #: The difference exceeds noise and diameter error, or did so within the time of release; shape (T,).
 
 
 def wheel_signs(
@@ -84,7 +85,7 @@ def wheel_signs(
     """Compare distances by satellites and wheel, shapes (T,), and return the state to pass on.
 
     `arc_m` and `sigma_m` are positions along the line, of single epochs or of the filter, NaN without one; `wheel_m` is
-    the distance that the wheel has rolled since the epoch before, NaN where it is not known, `signed` whether it has
+    the distance that the wheel has rolled since the previous epoch, NaN where it is not known, `signed` whether it has
     the sign of the motion along the line.
     """
     if not len(time):

@@ -1,12 +1,9 @@
 # The names of `railfix.integrity.protection`, imported at their first use (lazy-loader).
 
 from .level import Cause, LevelStatus, ProtectionLevel, availability, protection_level
-from .risk import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
+from .risk import MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
 
 __all__ = [
-    "K_H_NPA",
-    "K_H_PA",
-    "K_V",
     "MOST_EXCLUDED",
     "SATELLITE_PRIOR",
     "Cause",

@@ -32,8 +32,8 @@ from railfix.integrity.protection.risk import one_sided_k, set_sums
 #: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.
 _HALVINGS: Final = 48
 _LONGEST_M: Final = 1e4
-_BLOCK_SIZE: Final = 4_000_000  #: Numbers of the largest array that a block of epochs holds.
-#: Determinants below this share of the product of the diagonal are those of singular matrices.
+_BLOCK_SIZE: Final = 4_000_000  #: Number of elements of the largest array of a block of epochs.
+#: Determinants below this fraction of the product of the diagonal are those of singular matrices.
 _SINGULAR: Final = 1e-12
 
 
@@ -65,7 +65,7 @@ class AraimGeometry:
     sigma_int_m: Floats
     sigma_acc_m: Floats
     bias_m: Floats  #: Shape (T, N).
-    prior: Floats  #: Of a fault of the observation alone; 0: none; shape (N,).
+    prior: Floats  #: Prior of a fault of the observation alone; 0: none; shape (N,).
     together: Masks  #: Observations that one fault makes faulty together: of constellations, of the map; shape (C, N).
     together_prior: Floats  #: Shape (C,).
 
@@ -81,11 +81,11 @@ class AraimLevels:
 
     #: NaN without a position, infinite where unchecked faults are likelier than the risk; shape (T, Q).
     level_m: Floats
-    #: Of the position with all observations, shape (T, Q).
+    #: Variance of the position with all observations, shape (T, Q).
     sigma_int_m: Floats
     sigma_acc_m: Floats
     modes: Integers  #: Fault modes, shape (T,).
-    unmonitored: Floats  #: Probability of what is no mode, or leaves no position; shape (T,).
+    unmonitored: Floats  #: Probability of faults that are not modes, or leave no position; shape (T,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +137,7 @@ def _block(
     probability = np.where(size[None, :] <= order[:, None], probability, 0.0)
     out = np.concatenate([np.zeros((1, masks.shape[1]), dtype=bool), masks])
     kept = used[:, None, :] & ~out
-    # modes that take nothing away, or nothing else than a smaller one, are those of the faults that it has
+    # modes that remove nothing, or only what a smaller one removes, are those of their faults
     weight = np.where(kept, 1.0 / np.where(used, geometry.sigma_int_m[rows], 1.0)[:, None] ** 2, 0.0)
     gain, sigma = _gains(design, weight, components)
     acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]
@@ -181,10 +181,10 @@ def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
 
 
 def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Floats]:
-    """Return rows of S (T, F, Q, N) and sigmas (T, F, Q) of each mode; NaN sigmas where it leaves no position."""
+    """Return rows of S (T, F, Q, N) and sigmas (T, F, Q) of each mode; NaN sigmas without a position."""
     normal = np.einsum("tnp,tfn,tnr->tfpr", design, weight, design, optimize=True)
     diagonal = np.diagonal(normal, axis1=2, axis2=3)
-    # a clock without observations is left out, as if known
+    # a clock without observations is left out, as if it were known
     free = diagonal > 0.0
     normal = normal + np.where(free, 0.0, 1.0)[..., None] * np.eye(design.shape[2])
     scale = np.sqrt(np.where(free, diagonal, 1.0))
@@ -245,12 +245,12 @@ class IntegritySupport(Settings):
     """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
 
     format: Literal["railfix integrity support 1"]
-    #: Period in which the message holds [GPS time]; None: not stated. Epochs outside have no ARAIM level.
+    #: Period in which the message is valid [GPS time]; None: not stated. Epochs outside have no ARAIM level.
     valid_from: datetime | None = None
     valid_until: datetime | None = None
-    #: By letter; one without a statement is not used in the levels.
+    #: By letter; a constellation without a statement is not used in the levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
-    #: Satellites with statements of their own.
+    #: Satellites with separate statements.
     satellite: dict[Satellite, SatelliteSupport] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -263,14 +263,14 @@ class IntegritySupport(Settings):
         return self
 
     def holds(self, time: Datetimes) -> Masks:
-        """Return whether the message holds at epochs, shape (T,)."""
+        """Return whether the message is valid at epochs, shape (T,)."""
         first, last = (
             np.datetime64("NaT" if end is None else end, "ns") for end in (self.valid_from, self.valid_until)
         )
         return ~((time < first) | (time > last))
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return a sentence where the message states no end, or does not hold at all of some epochs."""
+        """Return a sentence where the message states no end, or is invalid at some epochs."""
         if self.valid_until is None:
             return ("integrity support message: it states no valid_until; whether it has expired is not known",)
         if self.holds(time).all():

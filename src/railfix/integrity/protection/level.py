@@ -1,7 +1,7 @@
 """Protection level along the track with fault hypotheses: solution separation over sets of faults.
 
 While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no part.
-The level L is where the tails of all hypotheses together use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
+The level L is reached where the tails of all hypotheses use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
@@ -27,13 +27,13 @@ from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blo
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 
-_BLOCK_SIZE: Final = 200_000  #: Numbers of a pair array that a block of epochs holds.
+_BLOCK_SIZE: Final = 200_000  #: Number of elements of a pair array of a block of epochs.
 _OF_MORE: Final = 3  #: Number of the tails of three faults and more among those of all kinds.
 _SAME: Final = 1e-9  #: Separation, over the sigma of the position, below which the two positions are the same.
 
 
 class Cause(IntEnum):
-    """Hypothesis that uses most of the risk of an epoch at its level, or why there is no level."""
+    """Hypothesis that uses most of the risk of an epoch at its level, or the reason for a missing level."""
 
     #: The noise of the position without a fault.
     FAULT_FREE = 0
@@ -41,7 +41,7 @@ class Cause(IntEnum):
     ONE_FAULT = 1
     #: Two of these at a time.
     TWO_FAULTS = 2
-    #: Infinite: faults of satellites that nothing checks are likelier than their share of the risk.
+    #: Infinite: undetectable satellite faults are likelier than their part of the risk.
     UNCHECKED = 3
     #: Infinite: more faults than can be hypotheses are likelier than the risk allows, or too many satellites excluded.
     BUDGET = 4
@@ -51,7 +51,7 @@ class Cause(IntEnum):
     THREE_FAULTS = 6
     #: Infinite: local faults cannot be bounded at this place of the line.
     UNBOUNDED = 7
-    #: As `UNCHECKED`, most of it faults of a constellation, alone or with satellites.
+    #: As `UNCHECKED`, mostly faults of a constellation, alone or with satellites.
     UNCHECKED_CONSTELLATION = 8
     #: As `UNCHECKED`, of a side of the track or of both.
     UNCHECKED_SIDE = 9
@@ -63,30 +63,30 @@ class Cause(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ProtectionLevel:
-    """Levels along the track of T epochs; NaN where there is no position."""
+    """Levels along the track of T epochs; NaN without a position."""
 
-    #: Where all tails together keep within the risk; at most the largest of the three parts, which have shares of it
-    #: that need not be used up. Infinite where `cause` says why; shape (T,).
+    #: Level at which all tails together stay within the risk; at most the largest of the three parts, whose allocations
+    #: of the risk need not be used up. Infinite for the reason in `cause`; shape (T,).
     level_m: Floats
-    #: The parts. 0 where the part's hypotheses fit into its share of the risk unchecked; shape (T,).
+    #: Parts of the level. 0 where the part's hypotheses fit into its allocation of the risk unchecked; shape (T,).
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
     sigma_m: Floats  #: Standard deviation of the position along the track, without a fault; shape (T,).
-    #: Sigmas of each part; -inf where it is not asked for; shape (T,).
+    #: Sigmas of each part; -inf where it is not required; shape (T,).
     k_fault_free: Floats
     k_one_fault: Floats
     k_two_faults: Floats
     k_false_alarm: Floats  #: Sigmas of the thresholds, shape (T,).
     separation: Floats  #: The largest ``|x_J - x|/T_J``; 0 where nothing can be left out; shape (T,).
-    #: It is at most 1. Where not the level does not hold. False where there is no position; shape (T,).
+    #: It is at most 1. Otherwise the level is invalid. False without a position; shape (T,).
     consistent: Masks
     #: Channel that sets `one_fault_m`; -1 where none does (`worst_constellation`, a side, the map); shape (T,).
     worst_one: Indices
     worst_two: Indices  #: Channels that set `two_fault_m`; -1 where none do; shape (T, 2).
     #: Letter of the constellation that sets `one_fault_m`; empty where none does; shape (T,).
     worst_constellation: Strings
-    unchecked_risk: Floats  #: Probability of the faults that are no hypotheses, taken off the risk; shape (T,).
+    unchecked_risk: Floats  #: Probability of the faults that are not hypotheses, subtracted from the risk; shape (T,).
     cause: Codes  #: `Cause`, shape (T,).
 
 
@@ -98,10 +98,10 @@ class RangeBounds(NamedTuple):
 
 
 class MapDeviation(NamedTuple):
-    """What is known of the map's error across and up besides its sigmas."""
+    """Information on the map's error across and up besides its sigmas."""
 
     bias_m: ArrayLike = 0.0  #: Offset that is not within its sigma, shape (T, 2) or (2,).
-    #: Place of the antenna without the map, and its inverse covariance (0: unknown). With it a wrong map is a
+    #: Position of the antenna without the map, and its inverse covariance (0: unknown). With it a wrong map is a
     #: hypothesis of prior `RiskBudget.map_prior`; shapes (T, 2) [m] [1/m^2].
     seen: tuple[Floats, Floats] | None = None
 
@@ -202,7 +202,7 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
-    """Return the epochs of like numbers of hypotheses together: no block is wider than it must be."""
+    """Return the epochs grouped by numbers of hypotheses: no block is wider than necessary."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
     used = model.used[rows].sum(axis=1)
@@ -227,7 +227,7 @@ class Errors(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """Hypotheses of a block of epochs: fields of `Allocation`, and where they stand in the arrays of all."""
+    """Hypotheses of a block of epochs: fields of `Allocation`, and their offsets in the arrays of all."""
 
     prior: Floats  # (T, M)
     members: Masks  # (T, B, M) satellites of each set of shared faults
@@ -240,7 +240,7 @@ class Asked(NamedTuple):
 
 
 class _Names(NamedTuple):
-    """What the hypotheses of a block leave out, and the risk of each part."""
+    """Faults outside the hypotheses of a block, and the risk of each part."""
 
     asked: Asked
     share: Floats  # (T, 4)
@@ -252,7 +252,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(model.used.sum(axis=1).max())
-    # a plan of few epochs is kept, and so is what follows from it
+    # a plan of few epochs is cached, with the data derived from it
     every = len(rows) == len(plan.beyond) <= FEW
     asked, share, letters, pairs = _names_of_few(plan, n) if every else _names(plan, rows, n)
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(model.arrays, of_block, asked)
@@ -302,7 +302,7 @@ def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: i
 
 @lru_cache(maxsize=256)
 def _places(kinds: tuple[int, ...], most: tuple[int, ...], n: int) -> tuple[Indices, Indices]:
-    """Return `Asked.first` and `Asked.bounds` of sets of shared faults with so many of n satellites at most."""
+    """Return `Asked.first` and `Asked.bounds` of sets of shared faults with at most this many of n satellites."""
     bounds, place = [], 0
     first = np.full((len(kinds), MOST_TOGETHER + 1), -1, dtype=np.intp)
     for kind in range(_OF_MORE + 1):
@@ -336,29 +336,29 @@ def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:
-    """Return channels at places side by side, shape (T, k); -1 for -1."""
+    """Return channels at adjacent positions, shape (T, k); -1 for -1."""
     return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 
 @lru_cache(maxsize=64)
 def _pairs(n: int) -> Indices:
-    """Return all pairs of n places, shape (K, 2)."""
+    """Return all pairs of n indices, shape (K, 2)."""
     return np.stack(np.triu_indices(n, 1), axis=1)
 
 
 class LevelStatus(IntEnum):
-    """Of an epoch, against an alarm limit."""
+    """Level status of an epoch, against an alarm limit."""
 
     #: The level is within the alarm limit.
     AVAILABLE = 0
-    #: The level is above the alarm limit, infinite, or there is no position.
+    #: The level is above the alarm limit or infinite, or the position is missing.
     UNAVAILABLE = 1
-    #: The ranges contradict each other: the level does not hold.
+    #: The ranges contradict each other: the level is invalid.
     ALARM = 2
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """LevelStatus of epochs, int8 of shape (T,), from protection levels [m], NaN where there is no position.
+    """LevelStatus of epochs, int8 of shape (T,), from protection levels [m], NaN without a position.
 
     An epoch with a position and without consistency (`ProtectionLevel.consistent`) alarms.
     """

@@ -1,8 +1,8 @@
-"""Other places of the line that the hypotheses of a level leave open.
+"""Other positions on the line that are possible under the hypotheses of a level.
 
-A level bounds the error along the tangent. Where the line turns away, passes itself or branches, a satellite left out
-can move the position to a place that no tangent leads to. Under each hypothesis of the level the sum of squared
-residuals, a quadratic form in the place, is evaluated along the line where a bound does not rule such places out.
+A level bounds the error along the tangent. Where the line bends, passes itself or branches, leaving out a satellite can
+move the position to a point off the tangent. Under each hypothesis of the level the sum of squared residuals, a
+quadratic form of the position, is evaluated along the line unless a bound excludes such positions.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from railfix.integrity.raim import LinearModel
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
 
-_FURTHEST_M: Final = 5000.0  #: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
-_NEGLIGIBLE: Final = 0.01  #: Share of the risk of a sample below which places are not looked for.
+_FURTHEST_M: Final = 5000.0  #: Largest distance searched [m]: the linear model of a range is off by 0.7 m there.
+_NEGLIGIBLE: Final = 0.01  #: Fraction of the risk of a sample below which no search is made.
 
 
 class Forms(NamedTuple):
-    """Sum of squared residuals in variances, over the place d from the position, under K hypotheses, T epochs.
+    """Sum of squared residuals in variances, over the offset d from the position, under K hypotheses, T epochs.
 
-    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position. The map error is taken
-    alike in all horizontal directions: another place has another tangent.
+    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position. The map error is assumed
+    equal in all horizontal directions: another position has another tangent.
     """
 
     prior: Floats  # (T, K), 0 for what is no hypothesis
@@ -39,7 +39,8 @@ class Forms(NamedTuple):
     widest_m2: Floats  # (T, K) trace of the inverse of the matrix, which is above its largest eigenvalue
 
     def radius_m(self, risk: float) -> Floats:
-        """Return the distance within which the open places of each hypothesis lie, shape (T, K); 0 without a prior.
+        """Return the distance within which the possible positions of each hypothesis lie, shape (T, K); 0 without a
+        prior.
 
         Beyond them all have 1 % of the risk, the same for each.
         """
@@ -50,7 +51,7 @@ class Forms(NamedTuple):
         return np.where(possible, np.fmin(radius, _FURTHEST_M), 0.0)
 
 
-_BOUND_SIZE: Final = 200_000  #: Numbers that a block of epochs by channels squared holds.
+_BOUND_SIZE: Final = 200_000  #: Number of elements of a block of epochs by squared channels.
 
 
 def places_beyond_the_level(
@@ -63,12 +64,12 @@ def places_beyond_the_level(
     risk: RiskBudget,
     sides: Masks,
 ) -> Masks:
-    """Return the epochs with places of the line that are open beyond the level, shape (T,).
+    """Return the epochs with possible positions on the line beyond the level, shape (T,).
 
-    Under a hypothesis J, a place that fits worse than the best by x variances is the true one with a probability of
-    ``Q(sqrt(x))`` at most. An epoch is returned where these probabilities, of the best place beyond the level, times
-    the prior of J, add up to more than the risk of a sample. `scale` is taken as 1 at least; `sides`, shape (T, S, M),
-    are the low satellites of each side.
+    Under a hypothesis J, a position that fits worse than the best by x variances is the true one with a probability of
+    at most ``Q(sqrt(x))``. An epoch is returned where these probabilities, of the best position beyond the level, times
+    the prior of J, sum to more than the risk of a sample. `scale` counts as at least 1; `sides`, shape (T, S, M), are
+    the low satellites of each side.
     """
     result = np.zeros(len(arc_m), dtype=bool)
     rows = (np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse)).nonzero()[0]
@@ -102,7 +103,7 @@ def places_beyond_the_level(
 
 
 def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Forms, risk: RiskBudget) -> Floats:
-    """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
+    """Return the probability that the true position lies beyond the level off the tangent, shape (T,)."""
     radius = forms.radius_m(risk.risk_per_sample)
     sections = _around(index, arc_m, level_m, radius.max(axis=1))
     return kernels.off_tangent.risk_beyond(forms.prior, forms.form, radius, *sections)
@@ -134,7 +135,7 @@ def _around(
     epoch, vertex = epoch[inside], vertex[inside]
     start = np.einsum("pij,pj->pi", axes[epoch], line.ecef_m[vertex] - place[epoch])
     tangent, length = np.einsum("pij,pj->pi", axes[epoch], line.tangent[vertex]), line.length_m[vertex]
-    # |start + s tangent| = level at both roots; between them is what the level reaches.
+    # |start + s tangent| = level at both roots; the level covers the part between them.
     middle = -np.einsum("pi,pi->p", start, tangent)
     square = middle**2 - np.einsum("pi,pi->p", start, start) + level_m[epoch] ** 2
     half = np.sqrt(np.maximum(square, 0.0))

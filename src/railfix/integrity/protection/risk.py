@@ -1,8 +1,8 @@
 """Integrity risk of a protection level, and its allocation to fault hypotheses.
 
-The risk of the hour (P1 2.4: 1e-7, RTCA DO-229D) is divided by the number of independent samples in it, that of an
-epoch among its hypotheses; the rest is taken off beforehand. A hypothesis is a set of faults: shared ones (a
-constellation, the low satellites of a side, a wrong map) and single satellites; those of the same shared faults and
+The risk of the hour (P1 2.4: 1e-7, RTCA DO-229D) is divided by the number of independent samples in it, and that of an
+epoch is allocated to its hypotheses; the rest is subtracted beforehand. A hypothesis is a set of faults: shared ones (a
+constellation, the low satellites of a side, a wrong map) and single satellites; those with equal shared faults and
 number of satellites are a class.
 """
 
@@ -27,14 +27,9 @@ from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 
-K_H_PA: Final = 6.0  #: RTCA DO-229D appendix J, horizontal, precision approach: one dimension, 2e-9 an approach.
-#: RTCA DO-229D appendix J, horizontal, en route to non-precision approach: two dimensions (Rayleigh), 5e-9 a sample.
-K_H_NPA: Final = 6.18
-K_V: Final = 5.33  #: RTCA DO-229D appendix J, vertical: one dimension, two-sided 1e-7.
-
-#: Probability that a satellite is faulty at a time: 1e-5 an hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
+#: Probability that a satellite is faulty at a time: 1e-5 per hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
 #: Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the Galileo service definition after it); the
-#: others as Galileo, for want of a commitment that is as old.
+#: others as Galileo, as no commitment of theirs is as old.
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
@@ -43,7 +38,7 @@ MOST_TOGETHER: Final = 4  #: Faulty satellites at a time that can be hypotheses 
 
 
 def k_factor(risk: float) -> float:
-    """Return sigmas that an error in one dimension exceeds, on either side, with this probability of one sample.
+    """Return sigmas that an error in one dimension exceeds, on either side, with this probability per sample.
 
     Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a horizontal position.
     """
@@ -61,38 +56,38 @@ Probability = Annotated[float, Field(ge=0, lt=1)]  #: A probability below 1.
 
 
 class RiskBudget(Settings):
-    """Integrity risk, its shares, and the probabilities of faults."""
+    """Integrity risk, its allocation, and the probabilities of faults."""
 
-    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 an hour.
+    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 per hour.
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s: multipath of a
     #: moving train changes within seconds, that of a standing one within tens of seconds, SBAS corrections within
-    #: minutes (DO-229D appendix J counts 10 samples an hour). More samples are the safe side; from 10 to 3600 the
+    #: minutes (DO-229D appendix J counts 10 samples per hour). More samples are the safe side; from 10 to 3600 the
     #: fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
-    #: Shares of the risk of an epoch; together at most 1. They decide the three parts, from the largest of which the
-    #: level is lowered until all tails together use their sum; a share twice as large lowers a K of 6 by 0.1, one of 3
+    #: Fractions of the risk of an epoch; together at most 1. They determine the three parts, from the largest of which
+    #: the level is lowered until all tails together use their sum; twice the fraction lowers a K of 6 by 0.1, one of 3
     #: by 0.2: thirds.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Of the risk, for faults that are not hypotheses: where they are likelier, further ones become hypotheses, up to
-    #: four satellites at a time and three shared faults (constellation, side, map).
+    #: Fraction of the risk for faults that are not hypotheses: where they are likelier, further ones become hypotheses,
+    #: up to four satellites at a time and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Of the risk, for epochs with one, and as much again with two satellites excluded.
+    #: Fraction of the risk for epochs with one excluded satellite, and the same again for two.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability that a satellite is faulty, by constellation: its own signal.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
-    #: The same of a fault by local causes, on top of that: multipath, interference. An assumption until measured on the
+    #: Additional probability of a local fault: multipath, interference. An assumption until measured on the
     #: line (P1 7).
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
     #: Probability that the map is wrong by more than its stated error: the next track, heights without the geoid,
     #: another reference frame. An assumption; 0: no such hypothesis.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)
     #: Probability that low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No data
-    #: supports a smaller one, and every output of the levels then says so; 0: no such hypothesis.
+    #: supports a smaller one, which every output of the levels then states; 0: no such hypothesis.
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
     #: Elevation up to which satellites count as low: of a wall as high as it is away.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
@@ -100,15 +95,15 @@ class RiskBudget(Settings):
     #: indicative in every output: no hourly risk is claimed. "measured" needs `local_prior` and `side_prior` to be
     #: given.
     priors: Literal["assumed", "measured"] = "assumed"
-    #: Probability of a fault that many satellites of a constellation share; a constellation that is not named has none,
-    #: and the level does not cover one.
+    #: Probability of a fault that many satellites of a constellation share; an unnamed constellation has none, and the
+    #: level does not cover it.
     constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _shares_up_to_one(self) -> Self:
         shares = (self.fault_free_share, self.one_fault_share, self.two_fault_share)
         if sum(shares) > 1.0 + 1e-12:
-            raise ValueError(f"the three shares must add up to 1 at most, got {shares}")
+            raise ValueError(f"the three fractions must add up to 1 at most, got {shares}")
         return self
 
     @model_validator(mode="after")
@@ -132,7 +127,7 @@ class RiskBudget(Settings):
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
-        """Return the fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
+        """Return the fault probability of each channel, shape (M,): of the satellite and of the antenna's surroundings.
 
         ValueError: a constellation has no prior.
         """
@@ -142,11 +137,11 @@ class RiskBudget(Settings):
         return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
 
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
-        """Return the risk of an epoch in the set that is left after exclusions, any shape.
+        """Return the risk of an epoch for the set that remains after exclusions, any shape.
 
-        More faults than are checked, of probability `beyond`, are taken off once. Every set that exclusion could have
-        left is a way to fail, so the share of the risk for e exclusions is divided by the number of sets of e among all
-        satellites. 0 beyond `MOST_EXCLUDED`, and where nothing is left.
+        The probability of faults beyond the checked ones, `beyond`, is subtracted once. Every set that exclusion could
+        have left is a possible failure, so the part of the risk for e exclusions is divided by the number of sets of e
+        among all satellites. 0 beyond `MOST_EXCLUDED`, and where nothing remains.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
@@ -176,11 +171,11 @@ def set_sums(prior: Floats, most: int) -> Floats:
     return np.stack(sums, axis=1)
 
 
-#: Shared faults at a time that may be hypotheses; the probability of more is taken off the risk.
+#: Largest number of simultaneous shared faults in a hypothesis; the probability of more is subtracted from the risk.
 _MOST_SHARED: Final = 3
 FEW: Final = 2  #: Epochs of two antennas, live: their allocation is kept.
 REMEMBERED: Final = 512  #: Such allocations: satellites come and go behind obstacles.
-_MOST_SETS: Final = 46_376  #: Sets of a class that are left out one by one at most: four of 34 satellites.
+_MOST_SETS: Final = 46_376  #: Largest number of sets of a class that are left out one by one: four of 34 satellites.
 
 
 class Shared(NamedTuple):
@@ -220,16 +215,16 @@ def allocate(
 ) -> Allocation:
     """Divide the risk of each epoch.
 
-    Satellites alone, in pairs (where these are likelier than their share) and with a wrong map, constellations with one
-    satellite, and sides are hypotheses always; so are classes likelier than what may stay unchecked. `out`, shape (T,):
-    satellites excluded; `sides`, shape (T, S, M): sets of satellites that fail together.
+    Satellites alone, in pairs (where these are likelier than their allocation) and with a wrong map, constellations
+    with one satellite, and sides are always hypotheses, as are classes likelier than the unchecked part. `out`, shape
+    (T,): satellites excluded; `sides`, shape (T, S, M): sets of satellites that fail together.
     """
     used = model.used
     sides = sides & used[:, None]
     if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
         given = (used.tobytes(), out.tobytes(), sides.tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
-    # Most epochs of a chunk have the satellites of others: each set once.
+    # Most epochs of a chunk have the satellites of others: each set is computed once.
     bits = np.packbits(np.concatenate([used, sides.reshape(len(used), -1)], axis=1), axis=1)
     keys = np.concatenate([bits, np.ascontiguousarray(out)[:, None].view(np.uint8)], axis=1)
     _, first, which = np.unique(keys.view(f"V{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
@@ -317,7 +312,7 @@ def _allocate(
 
 @lru_cache(maxsize=64)
 def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool) -> tuple[tuple[Shared, ...], Masks]:
-    """Return the B sets of up to three shared faults, smaller first, and which are those of one fault less (B, B)."""
+    """Return the B sets of up to three shared faults, smaller first, and which of them have one fault less (B, B)."""
     sets = []
     for size in range(_MOST_SHARED + 1):
         for some in combinations([*events, -1] if wrong_map else events, size):
@@ -344,14 +339,14 @@ class _Classes:
         return replace(self, each=self.each[rows], sums=self.sums[rows], further=self.further[rows])
 
     def rest(self, order: Indices) -> Floats:
-        """Return the probability of faults that are no hypotheses, shape (T,); unchosen shared sets count whole."""
+        """Return the probability of faults that are not hypotheses, shape (T,); unchosen shared sets count in full."""
         whole = (order < 0) & (self.each > 0.0)
         covered = whole.astype(np.float64) @ self.within.T > 0.0
         each = np.where(covered, 0.0, self.each * np.take_along_axis(self.sums, order + 1, axis=1))
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Return how many satellites at most are left out with each set of shared faults, shape (T, B).
+        """Return the largest number of satellites left out with each set of shared faults, shape (T, B).
 
         `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a
         satellite.

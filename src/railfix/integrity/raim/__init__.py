@@ -1,6 +1,6 @@
 """RAIM: fault detection, exclusion of up to two satellites, reliability (P1 2.3(4); P4).
 
-One `LinearModel` serves the position on the line and the one in space::
+One `LinearModel` is used for the position on the line and the one in space::
 
     detection = detect(constrained.wsse, constrained.residual_m, ranges.n_used - ranges.n_clocks - 1, scale=scale)
     failing = np.flatnonzero(detection.detected)
@@ -9,8 +9,8 @@ One `LinearModel` serves the position on the line and the one in space::
     # solve again without what `exclusion.excluded` marks, then
     level = reliability(linear_model(ranges, trajectory, constrained.arc_m), scale=scale).protection_level_m
 
-The noise scale multiplies the sigmas of the ranges after the fit: the fit itself, and with it the
-balance between ranges and map error, stays that of the weights.
+The noise scale multiplies the sigmas of the ranges after the fit: the fit itself, and with it the balance between
+ranges and map error, uses the weights.
 """
 
 import lazy_loader

@@ -29,8 +29,8 @@ class RaimLimits(Settings):
     """Limits of detection, exclusion and reliability."""
 
     mode: Literal["chi_square", "fixed"] = "chi_square"  #: False-alarm rate (P4), or P1's fixed limit.
-    #: Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own error must be over what
-    #: noise reaches with this probability (chi-square mode).
+    #: Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own error must exceed the
+    #: noise at this probability (chi-square mode).
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability of missing a fault of the minimal detectable size. P4 gives no value.
     missed_detection: float = Field(default=1e-3, gt=0, lt=1)
@@ -43,8 +43,8 @@ class RaimLimits(Settings):
     #: Probability that noise makes the true exclusion fit this much worse than another one. Chi-square, one degree of
     #: freedom. Another exclusion of as many satellites that passes and fits nearly as well makes the epoch inseparable.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: Exclusions with positions nearer than this do not compete: either way the position is the same (the two
-    #: satellites of a clock of their own). 0: they always do.
+    #: Exclusions with positions nearer than this do not compete, as the position is the same in either case (for
+    #: example the two satellites of a separate clock). 0: they always do.
     same_position_m: float = Field(default=0.0, ge=0)
     #: Two-sided probability that K sigma leaves to noise in the protection level; 1 gives K = 0, which is P4's ``HSlope
     #: sigma0 sqrt(lambda)``.
@@ -76,7 +76,7 @@ class Detection:
 
     #: WSSE over the noise scale squared; fixed mode: sum of squares [m^2]; NaN without a position; shape (T,).
     statistic: Floats
-    threshold: Floats  #: What it is compared with; NaN where not testable; shape (T,).
+    threshold: Floats  #: Threshold of the statistic; NaN where not testable; shape (T,).
     freedom: Integers  #: Degrees of freedom, shape (T,).
     detected: Masks  #: The statistic is at or over the threshold, shape (T,).
     testable: Masks  #: At least one range is redundant, shape (T,).
@@ -92,14 +92,14 @@ def detect(
 ) -> Detection:
     """Test the residuals of positions (P4: ``T >= T_D`` accepts that there is a fault).
 
-    Takes what the solvers return, or the attributes of these names of a `LinearModel`.
+    Accepts results of the solvers, or the attributes of these names of a `LinearModel`.
 
     Parameters
     ----------
     wsse : array_like, shape (T,)
-        Weighted sum of squared residuals; NaN where there is no position.
+        Weighted sum of squared residuals; NaN without a position.
     residual_m : array_like, shape (T, M) [m]
-        0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel` allow for the map error, those
+        0 (or NaN) where not used; requested in fixed mode only. Those of a `LinearModel` allow for the map error, those
         of a `Constrained` position do not: the same only where the map is taken as exact, as in P1 (a sigma of a
         millimetre).
     freedom : array_like of int, shape (T,)
@@ -143,8 +143,9 @@ def _chi_square_table(false_alarm: float, size: int) -> Floats:
     return table
 
 
-_ROUNDING: Final = 1e-9  #: Share of a WSSE within which two are the same number.
-_BLOCK_SIZE: Final = 40_000  #: Numbers of a subset array that a block of epochs holds: about what a core's cache does.
+_ROUNDING: Final = 1e-9  #: Fraction of a WSSE within which two count as equal.
+#: Number of elements of a subset array of a block of epochs: about the size of a core's cache.
+_BLOCK_SIZE: Final = 40_000
 
 
 class Outcome(IntEnum):
@@ -170,16 +171,18 @@ class Exclusion:
 
     outcome: Codes  #: `Outcome`, shape (T,).
     excluded: Masks  #: Channels to leave out; none unless the outcome is EXCLUDED_ONE or EXCLUDED_TWO; shape (T, M).
-    #: Channels of the passing subset that leaves the least statistic; -1 where none; INSEPARABLE too; shape (T, 2).
+    #: Channels of the passing subset with the least statistic; -1 where none; INSEPARABLE too; shape (T, 2).
     best: Indices
     #: The next such subset of as many channels: the closest competing exclusion; -1 where none; shape (T, 2).
     alternative: Indices
     #: Error of the channels of `best` against the rest: + where the range is too long; NaN elsewhere; shape (T, M).
     own_error_m: Floats
-    statistic_after: Floats  #: Of the rest without `best`; the statistic itself where there is none; shape (T,).
-    #: By leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 where there is none; shape (T, k).
+    #: Statistic of the rest without `best`; the statistic itself where no subset exists; shape (T,).
+    statistic_after: Floats
+    #: Position change by leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 where none; shape (T,
+    #: k).
     position_change_m: Floats
-    #: Distance between the positions without `best` and without `alternative`; NaN where either is none; shape (T,).
+    #: Distance between the positions without `best` and without `alternative`; NaN where either is missing; shape (T,).
     alternative_shift_m: Floats
     detection: Detection  #: The test before any exclusion.
 
@@ -188,7 +191,7 @@ class Exclusion:
 class _Trial:
     """Every subset of one size left out, T epochs by K subsets."""
 
-    members: Indices  # (K, 1 or 2), places in the compact arrays
+    members: Indices  # (K, 1 or 2), indices in the compact arrays
     statistic: Floats
     wsse_drop: Floats
     own: tuple[Floats, ...]  # own errors of each member [sigma]
@@ -222,7 +225,7 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     failing = np.flatnonzero(detection.detected)
     result.outcome[failing] = Outcome.UNRESOLVED
     used = np.count_nonzero(model.used[failing], axis=1)
-    # Epochs of like numbers of satellites together: no block is wider than it must be.
+    # Epochs are grouped by numbers of satellites: no block is wider than necessary.
     failing = failing[np.argsort(used, kind="stable")]
     widest = int(used.max(initial=1))
     size = max(1, _BLOCK_SIZE // (widest * widest))

@@ -1,10 +1,10 @@
 """One linear model for RAIM on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Here every range is divided by its sigma, and the receiver clocks and the map
-error across and up, unknowns with a prior, are taken out beforehand. What is left is a residual projector ``S = I - R K
-R^T - B Q B^T`` (R: 1/sigma in the column of the satellite's clock, K: covariance of the clocks at a known place, B:
-design with the clocks taken out, Q: its covariance), with ``nu = S y`` and ``WSSE = y^T S y``, chi-square distributed
-with `LinearModel.freedom` degrees of freedom.
+P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma, and the receiver clocks and the map
+error across and up, unknowns with a prior, are eliminated beforehand. The remainder is a residual projector ``S = I - R
+K R^T - B Q B^T`` (R: 1/sigma in the column of the satellite's clock, K: covariance of the clocks at a known position,
+B: design with the clocks eliminated, Q: its covariance), with ``nu = S y`` and ``WSSE = y^T S y``, chi-square
+distributed with `LinearModel.freedom` degrees of freedom.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ _BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_
 class LinearModel:
     """Ranges linearised at a position, whitened, T epochs by M channels.
 
-    The three unknowns of the place are, on the line, along, across and up; in space, east, north
-    and up. The first `interest` of them are what the position is wanted for.
+    The three unknowns of the position are, on the line, along, across and up; in space, east, north and up. The first
+    `interest` of them are the position components of interest.
     """
 
-    root_weight: Floats  #: 1/sigma of each range, 0 for what is not used; shape (T, M) [1/m].
+    root_weight: Floats  #: 1/sigma of each range, 0 for unused ones; shape (T, M) [1/m].
     clock: Indices  #: Clock of each channel: index into the groups of the ranges; shape (M,).
-    clock_covariance_m2: Floats  #: Of the clocks at a known place (K), shape (T, G, G).
-    #: Change of the whitened range with the place, clocks taken out (B); 0 where not used; shape (T, M, 3) [1/m].
+    clock_covariance_m2: Floats  #: Covariance of the clocks at a known position (K), shape (T, G, G).
+    #: Change of the whitened range with the position, clocks eliminated (B); 0 for unused ones; shape (T, M, 3) [1/m].
     design: Floats
-    #: Of the place, prior included (Q); NaN where the ranges do not determine it; shape (T, 3, 3).
+    #: Covariance of the position, prior included (Q); NaN where the ranges do not determine it; shape (T, 3, 3).
     covariance_m2: Floats
-    prior: Floats  #: Prior information on the place: the map error across and up; shape (3, 3) [1/m^2].
+    prior: Floats  #: Prior information on the position: the map error across and up; shape (3, 3) [1/m^2].
     misfit: Floats  #: Whitened code - range at the position, up to a clock (y); 0 where not used; shape (T, M).
     freedom: Integers  #: Ranges beyond the unknowns; may be negative; shape (T,).
     interest: int  #: 1 on the line, 2 (horizontal) in space.
@@ -77,7 +77,7 @@ class LinearModel:
 
     @cached_property
     def arrays(self) -> ModelArrays:
-        """The same as plain arrays, without `freedom` and `interest`."""
+        """Plain arrays of the model, without `freedom` and `interest`."""
         return ModelArrays(*(np.ascontiguousarray(getattr(self, name)) for name in ModelArrays._fields))
 
     @property
@@ -96,7 +96,7 @@ class LinearModel:
 
     @property
     def step_m(self) -> Floats:
-        """The place that fits best, from the position the model stands at, shape (T, 3) [m]; near 0 at a solution."""
+        """The best-fitting position, relative to the model's position, shape (T, 3) [m]; near 0 at a solution."""
         return self._fitted[0]
 
     @property
@@ -106,7 +106,7 @@ class LinearModel:
 
     @property
     def redundancy(self) -> Floats:
-        """Diagonal of S: the share of its own error that a range shows in its residual, shape (T, M).
+        """Diagonal of S: the fraction of its own error that a range has in its residual, shape (T, M).
 
         0 where not used, and where nothing checks the range.
         """
@@ -128,10 +128,10 @@ class LinearModel:
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
-        """Return the covariance of the wanted components, shape (T, interest, interest) [m^2].
+        """Return the covariance of the components of interest, shape (T, interest, interest) [m^2].
 
-        `scale` multiplies the sigmas of the ranges (and ties), not the map error: of the covariance
-        Q, ``Q P Q`` comes from the prior P and ``Q - Q P Q`` from the ranges.
+        `scale` multiplies the sigmas of the ranges (and ties), not the map error: of the covariance Q, ``Q P Q`` comes
+        from the prior P and ``Q - Q P Q`` from the ranges.
         """
         k = self.interest
         covariance = self.covariance_m2
@@ -141,10 +141,10 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact(RowArrays):
-    """Residuals and their projector of the used channels alone, side by side: T epochs by n."""
+    """Residuals and their projector of the used channels alone, adjacent: T epochs by n."""
 
-    channel: Indices  #: Channel of the model in each place, shape (T, n).
-    used: Masks  #: False in the places beyond the epoch's own channels, shape (T, n).
+    channel: Indices  #: Channel of the model at each index, shape (T, n).
+    used: Masks  #: False at indices beyond the epoch's own channels, shape (T, n).
     projector: Floats  #: S; 0 beyond; shape (T, n, n).
     residual: Floats  #: Shape (T, n).
     sigma_m: Floats  #: 0 beyond, shape (T, n).
@@ -196,7 +196,7 @@ def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices 
 def update_model(
     model: LinearModel, ranges: Ranges, antennas: AntennaRows, position: Constrained, epochs: Indices
 ) -> LinearModel:
-    """Return the model with that of some rising epochs made again, from other ranges and positions."""
+    """Return the model with some rising epochs recomputed, from other ranges and positions."""
     for index, own in antennas.split(epochs):
         model = model.patch(
             own, linear_model(ranges.take(own), index, position.arc_m[own], section=position.section[own])

@@ -1,8 +1,8 @@
-"""Reliability: what stays undetected, and how far it moves the position.
+"""Reliability: size of undetected faults, and their effect on the position.
 
 With noncentrality lambda the test misses a fault with the stated probability (P4). In the range of satellite i that is
-``sigma_i sqrt(lambda / r_ii)``, because only the share r_ii of its square reaches the statistic. ``slope_i`` is what
-the position moves for each unit of the statistic's root; the level is the largest slope times ``sigma0 sqrt(lambda)``
+``sigma_i sqrt(lambda / r_ii)``, because only the fraction r_ii of its square enters the statistic. ``slope_i`` is the
+change of the position per unit of the statistic's root; the level is the largest slope times ``sigma0 sqrt(lambda)``
 (P4), and K sigma for the noise of the position.
 """
 
@@ -24,7 +24,7 @@ from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.model import LinearModel, compact
 
 _NO_EFFECT: Final = 1e-6  #: Effect on the position, in its own sigmas, below which a satellite has none.
-_BLOCK_SIZE: Final = 40_000  #: Numbers of a pair array that a block of epochs holds.
+_BLOCK_SIZE: Final = 40_000  #: Number of elements of a pair array of a block of epochs.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +36,9 @@ class Reliability:
     minimal_detectable_bias_m: Floats
     #: Movement of the position for one unit of the root of the statistic; NaN where not used; shape (T, M).
     slope_m: Floats
-    #: Largest such movement by errors of two satellites; NaN unless two faults are asked for; shape (T,).
+    #: Largest such movement by errors of two satellites; NaN unless two faults are requested; shape (T,).
     pair_slope_m: Floats
-    worst: Indices  #: Channel of the largest slope; -1 where there is none; shape (T,).
+    worst: Indices  #: Channel of the largest slope; -1 without one; shape (T,).
     #: Standard deviation along the line; in space along the longest axis of the horizontal ellipse; shape (T,).
     position_sigma_m: Floats
     #: Movement by a fault that the test misses with the stated probability: slope sqrt(lambda); shape (T,).
@@ -53,8 +53,8 @@ class Reliability:
 def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Reliability:
     """Detectable biases, slopes and protection levels of the satellites that are used, of a model after exclusions.
 
-    The limits are those of the chi-square test, whatever the mode. The noise scale, shape (T,) or (), is that of
-    `detect`; it does not touch the map error in `position_sigma_m`.
+    The limits are those of the chi-square test in every mode. The noise scale, shape (T,) or (), is that of
+    `detect`; it does not affect the map error in `position_sigma_m`.
     """
     limits = limits or RaimLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(model),))
@@ -176,8 +176,8 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
     largest = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
     squared = np.where(regular, largest / np.where(regular, determinant, 1.0), 0.0)
 
-    # Errors that no residual shows at all: (sqrt c, -+ sqrt a). Without effect on the position the pair
-    # adds nothing to its single satellites.
+    # Errors that no residual shows at all: (sqrt c, -+ sqrt a). Without effect on the position the pair adds nothing to
+    # its single satellites.
     x, y = np.sqrt(np.maximum(c, 0.0)), -np.copysign(np.sqrt(np.maximum(a, 0.0)), b)
     hidden = np.linalg.norm(x[..., None] * first + y[..., None] * second, axis=2)
     blind = both & ~regular & (hidden > _NO_EFFECT * sigma[:, None] * np.hypot(x, y))

@@ -1,8 +1,8 @@
-"""Ephemerides put together from navigation subframes as they are received.
+"""Ephemerides combined from navigation subframes as they are received.
 
 A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV1,
-B-CNAV2) or ten pages (D2), GLONASS four strings. `assemble_records` takes the subframes of a piece of a stream and what
-earlier pieces left unfinished, so that a stream cut anywhere gives the same records.
+B-CNAV2) or ten pages (D2), GLONASS four strings. `assemble_records` combines the subframes of a piece of a stream with
+those left by earlier pieces, so that records do not depend on how a stream is cut.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ _FRAME_S: Final = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """What the subframes left: `latest`, what identifies the last record (`issued`), GLONASS satellites `waiting`."""
+    """Subframes of unfinished records: `latest` identifies the last record (`issued`); `waiting` are GLONASS
+    satellites.
+    """
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -78,7 +80,7 @@ def assemble_records(
     after: Datetimes,
     first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides that a piece completes, and what it leaves; `time` is before, `after` after each."""
+    """Return the ephemerides that a piece completes, and the new state; `time` is before, `after` after each."""
     builder = _EphemerisBuilder(state)
     builder.waiting = {name: first if np.isnat(at) else at for name, at in builder.waiting.items()}
     pages, counts = decode_pages(subframes)
@@ -147,7 +149,7 @@ class _EphemerisBuilder:
         return False
 
     def result(self, counts: Counter[str]) -> tuple[Assembled, Unfinished]:
-        """Return the records, with what is counted and what is left unfinished."""
+        """Return the records, counts, and the unfinished state."""
         counts.update(f"{raw.satellite[0]} {why}" for raw, why in self.rejected)
         records = Assembled(
             records=tuple(self.records),
@@ -177,7 +179,7 @@ class _EphemerisBuilder:
         self.issue(record, time)
 
     def _maker(self, letter: str, number: int) -> Callable[[str, np.datetime64], Record | None]:
-        """Return what makes a record of the message that a subframe is of."""
+        """Return the function that makes a record of a message from its subframes."""
         if number >= BCNAV1_FROM:
             return self._bcnav1
         if number > FNAV_FROM:
@@ -187,7 +189,7 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append records of GLONASS strings whose next epoch came within their frame, up to a time or all known."""
+        """Append records of GLONASS strings whose next epoch arrived within their frame, up to a time or all known."""
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):
                 del self.waiting[satellite]
@@ -244,7 +246,7 @@ class _EphemerisBuilder:
         return galileo_record(satellite, values, time) if f"E{int(values['number']):02d}" == satellite else None
 
     def _cnav_record(self, satellite: str, _: np.datetime64) -> Record | None:
-        """Record of CNAV; its three messages are of one issue where their reference times are one."""
+        """Record of CNAV; its three messages are of one issue if their reference times are equal."""
         parts = self._parts(satellite, tuple(CNAV_FROM + k for k in nav_messages.CNAV))
         if parts is None or not parts[0]["toe_sow_s"] == parts[1]["toe_sow_s"] == parts[2]["toc_s"]:
             return None
@@ -298,9 +300,9 @@ class _EphemerisBuilder:
             return None
         if self.needs_date(satellite, time):
             return None
-        # All of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1 may have come
-        # before the receiver's first epoch, so that its time of reception is not known; where epochs are lost or rare,
-        # the first one after all strings shows that no later frame can have begun.
+        # All strings are of one frame, which begins at t_k of string 1; strings follow each other every 2 s. String 1
+        # may have come before the receiver's first epoch, so that its time of reception is not known; where epochs are
+        # lost or rare, the first one after all strings shows that no later frame can have begun.
         began = frame_time(parts[0], time)
         if within is None:
             received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")

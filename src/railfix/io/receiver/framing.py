@@ -22,7 +22,7 @@ LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 _CRC24_POLYNOMIAL: Final = 0x1864CFB
-#: Whether a byte can be the first and the second of the address of an NMEA sentence; 0 stands beyond the buffer's end.
+#: Whether a byte can be the first and the second of the address of an NMEA sentence; 0 is beyond the buffer's end.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
 #: Value of each byte as a hexadecimal digit, 255 for others.
@@ -44,7 +44,7 @@ class Frames:
     end: Indices
     frame_start: Indices  #: First byte of the frame, its sync included; shape (N,).
     consumed: int  #: Bytes of the buffer that are dealt with; the rest may be the start of a frame.
-    skipped_bytes: int  #: Of those, bytes outside frames.
+    skipped_bytes: int  #: Bytes outside frames among these.
     bad_checksums: int  #: Complete candidates (sync and length plausible) outside frames whose checksum failed.
 
     def __len__(self) -> int:
@@ -56,26 +56,26 @@ class Frames:
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
     def structures(self, protocol: str, kinds: Iterable[int], layout: np.dtype) -> tuple[Indices, np.ndarray]:
-        """Return positions of the frames of some kinds that are long enough for a layout, and what they begin with."""
+        """Return positions of the frames of some kinds that are long enough for a layout, and their first fields."""
         chosen = self.of(protocol, *kinds)
         chosen = chosen[self.end[chosen] - self.start[chosen] >= layout.itemsize]
         return chosen, gather_structures(self.data, self.start[chosen], layout)
 
     @cached_property
     def _by_protocol(self) -> dict[str, Indices]:
-        """Positions of the frames of each protocol that there is: a live epoch is asked for many that there are not."""
+        """Positions of the frames of each protocol, computed once: a live epoch looks up many kinds that are absent."""
         return {name: np.flatnonzero(self.protocol == name) for name in set(self.protocol.tolist())}
 
 
 def gather_structures(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
-    """Return the structures of one layout at many places of a buffer, shape (N,)."""
+    """Return the structures of one layout at many offsets of a buffer, shape (N,)."""
     block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
     return np.ascontiguousarray(block).view(layout)[:, 0]
 
 
 @dataclass(frozen=True)
 class _FrameCandidates:
-    """Places where a frame may start, with what its header says."""
+    """Offsets where a frame may start, with the contents of its header."""
 
     name: str
     frame: Indices
@@ -136,7 +136,7 @@ def _without_overlap(start: Indices, end: Integers, valid: Masks) -> Indices:
 
 
 def _outside(places: Indices, start: Indices, end: Integers) -> int:
-    """Return how many places lie in none of the accepted frames."""
+    """Return the number of offsets outside all accepted frames."""
     if not len(start):
         return len(places)
     before = np.searchsorted(start, places, side="right") - 1
@@ -144,12 +144,12 @@ def _outside(places: Indices, start: Indices, end: Integers) -> int:
 
 
 def _at(data: Bytes, index: Indices) -> Integers:
-    """Return bytes at some places; 0 beyond the end."""
+    """Return bytes at offsets; 0 beyond the end."""
     return np.where(index < len(data), data[np.minimum(index, len(data) - 1)], 0).astype(np.int64)
 
 
 def _pairs(data: Bytes, first: int, second: int) -> Indices:
-    """Return places where two bytes follow each other."""
+    """Return offsets where two bytes follow each other."""
     return np.flatnonzero((data[:-1] == first) & (data[1:] == second)) if len(data) > 1 else np.zeros(0, np.intp)
 
 
@@ -199,7 +199,7 @@ _CRC24: Final = _crc24_table()
 
 
 def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
-    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all together."""
+    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all stretches."""
     crc = np.zeros(len(start), dtype=np.int64)
     order = np.argsort(start - end, kind="stable")  # longest first: the ones still running are a prefix
     first, length = start[order], (end - start)[order]
@@ -245,12 +245,13 @@ def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     valid[complete] = (sums[stop] ^ sums[first]) == (_HEX[data[stop + 1]] << 4 | _HEX[data[stop + 2]])
     line_end = end + 3 + (_at(data, end + 3) == ord("\r"))
     frame_end = line_end + (_at(data, line_end) == ord("\n"))
-    if not at_end:  # a sentence whose line may go on waits for the rest of it
+    if not at_end:  # a sentence whose line may continue waits for the rest of it
         frame_end = np.where(line_end >= len(data), len(data) + 1, frame_end)
     return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 
 
-_HEAD_BYTES: Final = 1 << 16  #: Bytes in which a log must show a frame with a valid checksum to be taken for one.
+#: Number of bytes in which a log must have a frame with a valid checksum to be recognised.
+_HEAD_BYTES: Final = 1 << 16
 
 
 def is_receiver_log(head: bytes) -> bool:
@@ -317,7 +318,7 @@ class Subframes(RowArrays):
     glonass_channel: Integers
     #: Words of 30 or 32 bits, right-aligned; unused ones 0; shape (N, 10).
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
-    order: Integers  #: Place in the stream, to tell which epoch came before; shape (N,).
+    order: Integers  #: Offset in the stream, which determines the preceding epoch; shape (N,).
     skipped: Mapping[str, int] = field(default_factory=dict)  #: Pages left out, by reason.
 
     def __len__(self) -> int:

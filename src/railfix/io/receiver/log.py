@@ -53,7 +53,7 @@ _NO_GAIN: Final = -128
 #: u-blox SEC-SIGLOG: bytes of an event, and how long a single trigger counts [s].
 _EVENT: Final = 8
 _TRIGGERED_S: Final = 10
-_SIMULATED: Final = 0  #: Kind of detection that counts; those of jamming begin with a warning, as in that recording.
+_SIMULATED: Final = 0  #: Kind of detection that is used; those of jamming begin with a warning, as in that recording.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple
 
 
 def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
-    """Yield place in the stream, kind, alarm bits and gain of each message."""
+    """Yield offset in the stream, kind, alarm bits and gain of each message."""
     readers = {
         ("ubx", MON_RF): _mon_rf,
         ("ubx", MON_HW): _mon_hw,
@@ -210,8 +210,8 @@ class LogPiece:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamState:
-    """What the bytes so far left; `kind` are the messages that observations are taken from, `observed` whether one
-    came, `clock` the last time of any message, `station` that of RTCM 1005 and 1006.
+    """State after the bytes so far; `kind` is the kind of message used for observations, `observed` whether one was
+    received, `clock` the last time of any message, `station` that of RTCM 1005 and 1006.
     """
 
     rest: bytes = b""
@@ -279,14 +279,16 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
 
 
 def _of_old_kinds(frames: Frames) -> dict[str, int]:
-    """Return messages with observations that are not read, counted by kind: RTCM 3 before MSM, u-blox before the M8."""
-    counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in (*range(1001, 1005), *range(1009, 1013))}
+    """Return messages with observations that are not read, by kind: RTCM 3 before MSM4, u-blox before the M8."""
+    small = (start + n for start in range(1070, 1140, 10) for n in (1, 2, 3))
+    kinds = (*range(1001, 1005), *range(1009, 1013), *small)
+    counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in kinds}
     counts["UBX RXM-RAW"] = len(frames.of("ubx", ubx.RXM_RAW))
     return {what: number for what, number in counts.items() if number}
 
 
 def _places(frames: Frames, kind: str) -> Integers:
-    """Where the messages of one kind with observations begin in the stream."""
+    """Offsets of the messages of one kind with observations in the stream."""
     chosen = {
         _RAWX: frames.of("ubx", ubx.RXM_RAWX),
         _MEAS_EPOCH: frames.of("sbf", sbf.MEAS_EPOCH),
@@ -304,7 +306,7 @@ def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Int
 
 
 def _of_other_kinds(frames: Frames, kind: str) -> dict[str, int]:
-    """Return the messages with observations of other kinds than the one taken, counted by kind."""
+    """Return the messages with observations of unused kinds, counted by kind."""
     counts = {other: len(_places(frames, other)) for other in (_RAWX, _MEAS_EPOCH, _MSM) if other != kind}
     return {f"{other} messages beside {kind}, which is taken": n for other, n in counts.items() if n}
 
@@ -316,20 +318,20 @@ class _Dated(NamedTuple):
     times: Datetimes
 
     def last_before(self, places: Integers, before: np.datetime64) -> Datetimes:
-        """Time of the last one before each place of the stream; `before` for places before the first one here."""
+        """Time of the last one before each offset of the stream; `before` for offsets before the first one here."""
         if not len(self.times):
             return np.full(len(places), before, dtype="datetime64[ns]")
         index = np.searchsorted(self.places, places) - 1
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
     def first_after(self, places: Integers) -> Datetimes:
-        """Return the time of the first one after each place of the stream; NaT where there is none."""
+        """Return the time of the first one after each offset of the stream; naT where missing."""
         times = np.append(self.times, np.datetime64("NaT", "ns"))
         return np.asarray(times[np.searchsorted(self.places, places)])
 
 
 def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
-    """Return the receiver's epochs, of messages at places; before the first one, its other messages with a date."""
+    """Return the receiver's epochs, from messages at offsets; before the first one, from other messages with a date."""
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     if observed:
         return _Dated(epochs_at, raw.time)
@@ -362,8 +364,8 @@ def _navigation(
 def scan_pieces(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[LogPiece]:
-    """Yield pieces of a receiver log; `date` within half a week is for RTCM 3 without ephemerides, whose week the log
-    does not tell; `progress` gets the share read. MismatchError: the ephemerides contradict the date.
+    """Yield pieces of a receiver log; `date` within half a week is for RTCM 3 without ephemerides, whose log does not
+    contain the week; `progress` is called with the fraction read. MismatchError: the ephemerides contradict the date.
     """
     state = StreamState(time=_week_of_log(path, date))
     with open_stream(path, content="bytes") as stream:
@@ -382,7 +384,7 @@ _SAME_WEEK: Final = np.timedelta64(5, "D")
 
 
 def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
-    """Return a time near the log for RTCM 3: that of its first ephemerides, else `date`, else NaT."""
+    """Return a time near the log for RTCM 3: of its first ephemerides, or `date`, or NaT."""
     own: np.datetime64 = np.datetime64("NaT", "ns")
     rest = b""
     with open_stream(path, content="bytes") as stream:
@@ -432,7 +434,7 @@ def scan_receiver_log(
         )
         if old:
             has = ", ".join(f"{what} ({number})" for what, number in sorted(old.items()))
-            why += f"; its {has} are of kinds that are not read: give a RINEX file made of them (RTKLIB's convbin)"
+            why += f"; its {has} are of unsupported kinds: log MSM4 to MSM7, or give a RINEX file made from them"
         raise InputFileError(path, why)
 
 

@@ -17,7 +17,10 @@ from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
 from railfix.io.rinex.navigation_records import RawRecord, list_fields
 
-_SLIP, _HALF_CYCLE = 1, 2  #: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
+_SLIP, _HALF_CYCLE = (
+    1,
+    2,
+)  #: RINEX loss-of-lock bits: lock lost since the previous epoch; half-cycle ambiguity possible.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +51,7 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """What the epochs left: the last one, and lock time [s] and polarity of the last phase of each channel."""
+    """State after the epochs: the last one, and lock time [s] and polarity of the last phase of each channel."""
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -79,7 +82,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
     slipped = slips(lock, polarity)[1:]
     indicator = _SLIP * slipped + _HALF_CYCLE * half
     counts = {
-        "epochs not after the one before": int(np.count_nonzero(~rising)),
+        "epochs not after the previous one": int(np.count_nonzero(~rising)),
         "measurements of unknown signals": int(np.count_nonzero(~known)),
     }
     skipped = dict(Counter(measurements.skipped) + Counter(counts))
@@ -103,7 +106,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
 
 
 def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDArray[Any]:
-    """Return the values of the epochs that are kept; those of a log without them."""
+    """Return the values of the accepted epochs; those of a log without them."""
     kind = np.float64 if np.isnan(absent) else np.uint8
     return np.full(int(rising.sum()), absent, dtype=kind) if values is None else values[rising]
 
@@ -176,7 +179,8 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-Record = tuple[RawRecord, tuple[float, ...]]  #: A record, and what distinguishes it from the satellite's next one.
+#: A record, and the key that distinguishes it from the satellite's next one.
+Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356
@@ -295,8 +299,8 @@ def _frame_s(values: Values) -> float:
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
     """Return the week of toe, and toc.
 
-    The week that satellites send is that of the transmission: as it ends, toe is in the next one. RTCM 3 has no time of
-    transmission; in its place stands the time of week of `time`, when the message was received.
+    The broadcast week is that of the transmission: as it ends, toe is in the next one. RTCM 3 has no time of
+    transmission; it is replaced by the time of week of `time`, when the message was received.
     """
     sent_s = values.get("tow_s", values["toe_sow_s"] if np.isnat(time) else float(to_week(time)[1]))
     sent = from_week(week, sent_s)
@@ -309,7 +313,7 @@ def _issue(values: Values, *names: str) -> tuple[float, ...]:
 
 
 def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers: Mapping[str, float]) -> RawRecord:
-    """Return a record in the order of numbers that RINEX has; what the message lacks is NaN."""
+    """Return a record in RINEX order of numbers; missing ones are NaN."""
     values = [float(numbers.get(name, np.nan)) for name in list_fields(satellite[0], message)]
     return RawRecord(
         satellite[0], satellite, message, np.asarray(epoch, dtype="datetime64[ns]").reshape(1)[0], values, 3.0

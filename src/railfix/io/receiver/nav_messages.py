@@ -1,6 +1,6 @@
 """Navigation messages, bit by bit: GPS, QZSS LNAV and CNAV, Galileo I/NAV, F/NAV, BeiDou D1, D2, B-CNAV1, 2, GLONASS.
 
-Each function takes the bits of many messages of one kind and returns their fields, scaled, as arrays.
+Each function converts the bits of many messages of one kind to their fields, scaled, as arrays.
 Angles are turned from semicircles into radians.
 
 Sources: IS-GPS-200N, 20.3.3 and 30.3.3; IS-QZSS-PNT-005, 4.1.2 and 4.3.2; Galileo OS SIS ICD 2.1, 4.2.3 and 4.3.5;
@@ -180,14 +180,49 @@ BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin
 #: Bits of subframes 2 and 3 of B-CNAV1 in each of the pages that a frame is passed on as, after PRN, number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
-BCNAV1: Final = _with_head(BCNAV1_HEAD, {
-    0: layout(_BCNAV1_CODINGS, week=24, iodc=45, iode=55, toe_sow_s=63, kind=74, delta_a=76, a_dot=102, delta_n=127,
-              delta_n_dot=144, m0=167, eccentricity=200, omega=233, omega0=266),
-    1: layout(_BCNAV1_CODINGS, i0=24, omega_dot=57, i_dot=76, cis=91, cic=107, crs=123, crc=147, cus=171, cuc=192,
-              toc_s=213, af0_s=224, af1=249, af2=271, group_delay_2_s=282, inter_signal_0=294, group_delay_1_s=306),
-    2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
-})  # fmt: skip
-#: Semi-major axes that B-CNAV1 and B-CNAV2 refer to [m]: medium orbits (kind 3), and those of the period of the Earth.
+BCNAV1: Final = _with_head(
+    BCNAV1_HEAD,
+    {
+        0: layout(
+            _BCNAV1_CODINGS,
+            week=24,
+            iodc=45,
+            iode=55,
+            toe_sow_s=63,
+            kind=74,
+            delta_a=76,
+            a_dot=102,
+            delta_n=127,
+            delta_n_dot=144,
+            m0=167,
+            eccentricity=200,
+            omega=233,
+            omega0=266,
+        ),
+        1: layout(
+            _BCNAV1_CODINGS,
+            i0=24,
+            omega_dot=57,
+            i_dot=76,
+            cis=91,
+            cic=107,
+            crs=123,
+            crc=147,
+            cus=171,
+            cuc=192,
+            toc_s=213,
+            af0_s=224,
+            af1=249,
+            af2=271,
+            group_delay_2_s=282,
+            inter_signal_0=294,
+            group_delay_1_s=306,
+        ),
+        2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
+        # Reference semi-major axes of B-CNAV1 and B-CNAV2 [m]: medium orbits (kind 3), and orbits with the Earth's
+        # period of rotation.
+    },
+)
 BCNAV_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
 CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
 BEIDOU_CODINGS: Final[dict[str, Coding]] = {
@@ -204,20 +239,58 @@ BEIDOU_CODINGS: Final[dict[str, Coding]] = {
 }
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final = layout(BEIDOU_CODINGS, tow_s=((18, 8), (30, 12)), subframe=15)
-D1: Final = _with_head(BDS_HEAD, {
-    1: layout(BEIDOU_CODINGS, health=42, aodc=43, accuracy=48, week=60, toc_s=((73, 9), (90, 8)), group_delay_1_s=98,
-              group_delay_2_s=((108, 4), (120, 6)), ion0=126, ion1=134, ion2=150, ion3=158, ion4=((166, 6), (180, 2)),
-              ion5=182, ion6=190, ion7=((198, 4), (210, 4)), af2=214, af0_s=((225, 7), (240, 17)),
-              af1=((257, 5), (270, 17)), aode=287),
-    2: layout(BEIDOU_CODINGS, delta_n=((42, 10), (60, 6)), cuc=((66, 16), (90, 2)), m0=((92, 20), (120, 12)),
-              eccentricity=((132, 10), (150, 22)), cus=180, crc=((198, 4), (210, 14)), crs=((224, 8), (240, 10)),
-              sqrt_a=((250, 12), (270, 20)), toe_high=290),
-    3: layout(BEIDOU_CODINGS, toe_low=((42, 10), (60, 5)), i0=((65, 17), (90, 15)), cic=((105, 7), (120, 11)),
-              omega_dot=((131, 11), (150, 13)), cis=((163, 9), (180, 9)), i_dot=((189, 13), (210, 1)),
-              omega0=((211, 21), (240, 11)), omega=((251, 11), (270, 21))),
-})  # fmt: skip
-#: Where each page of D2, subframe 1, begins in the 3000 bits of its ten pages put after each other: page k (1 to 10) at
-#: 300 (k - 1); fields that go over a page are given in pieces.
+D1: Final = _with_head(
+    BDS_HEAD,
+    {
+        1: layout(
+            BEIDOU_CODINGS,
+            health=42,
+            aodc=43,
+            accuracy=48,
+            week=60,
+            toc_s=((73, 9), (90, 8)),
+            group_delay_1_s=98,
+            group_delay_2_s=((108, 4), (120, 6)),
+            ion0=126,
+            ion1=134,
+            ion2=150,
+            ion3=158,
+            ion4=((166, 6), (180, 2)),
+            ion5=182,
+            ion6=190,
+            ion7=((198, 4), (210, 4)),
+            af2=214,
+            af0_s=((225, 7), (240, 17)),
+            af1=((257, 5), (270, 17)),
+            aode=287,
+        ),
+        2: layout(
+            BEIDOU_CODINGS,
+            delta_n=((42, 10), (60, 6)),
+            cuc=((66, 16), (90, 2)),
+            m0=((92, 20), (120, 12)),
+            eccentricity=((132, 10), (150, 22)),
+            cus=180,
+            crc=((198, 4), (210, 14)),
+            crs=((224, 8), (240, 10)),
+            sqrt_a=((250, 12), (270, 20)),
+            toe_high=290,
+        ),
+        3: layout(
+            BEIDOU_CODINGS,
+            toe_low=((42, 10), (60, 5)),
+            i0=((65, 17), (90, 15)),
+            cic=((105, 7), (120, 11)),
+            omega_dot=((131, 11), (150, 13)),
+            cis=((163, 9), (180, 9)),
+            i_dot=((189, 13), (210, 1)),
+            omega0=((211, 21), (240, 11)),
+            omega=((251, 11), (270, 21)),
+        ),
+        # Start of each page of D2, subframe 1, in the 3000 bits of its ten concatenated pages: page k (1 to 10) at 300
+        # (k - 1); fields that extend over two pages are given in pieces.
+    },
+)
 _PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
 D2: Final = layout(
     BEIDOU_CODINGS,
@@ -305,8 +378,8 @@ def sisa_m(index: Floats) -> Floats:
 
 def glonass_hamming(bits: Bytes) -> Masks:
     """Return whether GLONASS strings of 85 bits pass their Hamming code (ICD, 4.7), shape (N,)."""
-    # Bit 85 of the ICD is sent first. Its data bits 9 to 85 have the places of a Hamming code that are no powers of
-    # two, in this order; check bit k covers the places with bit k set. Check bits are the ICD's bits 1 to 7.
+    # Bit 85 of the ICD is sent first. Its data bits 9 to 85 have the positions of a Hamming code that are not powers of
+    # two, in this order; check bit k covers the positions with bit k set. Check bits are the ICD's bits 1 to 7.
     value = bits[:, 84::-1].astype(np.int64)
     places = np.array([place for place in range(1, 86) if place & (place - 1)])[:77]
     checks = [(value[:, 8:][:, places >> k & 1 == 1].sum(axis=1) + value[:, k]) & 1 for k in range(7)]
@@ -324,7 +397,7 @@ _UBX_E5A: Final = (3, 4)
 _CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: Signals with CNAV: L2C and L5.
 #: BeiDou signals with D1 or D2, B-CNAV1 (B1C) and B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
-#: Numbers of F/NAV pages, of CNAV messages and of pages of B-CNAV1 among those of a satellite come after these.
+#: Offsets of the numbers of F/NAV pages, of CNAV messages and of pages of B-CNAV1 among those of a satellite.
 FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
 Pages = Iterator[tuple[int, int, Values]]  #: Row, number among those of the satellite, and fields of each page.
@@ -358,7 +431,7 @@ def _of_kinds(
 def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
-    """Return the bits of pages, and which of those `here` have their preamble and CRC; the others count as `fault`."""
+    """Return the bits of pages, and which of `here` have their preamble and CRC; the others are counted as `fault`."""
     bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here

@@ -63,7 +63,7 @@ def _lock_table(bits: int) -> Floats:
 
 
 class ChannelNews(NamedTuple):
-    """Frequency channels of GLONASS as they became known: place in the stream, satellite number, channel, (N,) each."""
+    """Frequency channels of GLONASS as received: offset in the stream, satellite number, channel, (N,) each."""
 
     place: Indices
     number: Integers
@@ -74,7 +74,7 @@ class ChannelNews(NamedTuple):
         return dict(zip(self.number.tolist(), self.channel.tolist(), strict=True))
 
     def at(self, place: Indices, numbers: Integers) -> Integers:
-        """Channels of satellites known at places of the stream, shape (places, satellites); -99 where there is none."""
+        """Channels of satellites known at offsets of the stream, shape (places, satellites); -99 where unknown."""
         found = np.full((len(place), len(numbers)), -99)
         for k, number in enumerate(numbers.tolist()):
             mine = self.number == number
@@ -106,7 +106,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
         return replace(no_measurements("RTCM 3"), skipped=skipped), np.zeros(0, dtype=np.int64)
     order = np.concatenate([order for order, _, _ in parts])
     rows = join_measurements([rows for _, rows, _ in parts])
-    # Messages of one instant become one epoch; instants stay in the order of the stream.
+    # Messages of one instant form one epoch; instants stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
     letter = np.concatenate([letters for _, _, letters in parts])[by_stream]
     glonass = letter == "R"
@@ -135,7 +135,7 @@ def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int
 
 
 def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
-    """Move BeiDou times that an encoder sent in GPS time (14 s late) to the others'; return how many were moved."""
+    """Correct BeiDou times that an encoder sent in GPS time (14 s late); return the number of corrected times."""
     beidou, others = np.flatnonzero(letter == "C"), np.flatnonzero(np.isin(letter, list("GEJ")))
     if not len(beidou) or not len(others):
         return time, 0
@@ -149,7 +149,7 @@ def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move times by whole weeks to within half a week of the one before; GLONASS only in a log of its own."""
+    """Move times by whole weeks to within half a week of the preceding one; GLONASS only in a separate log."""
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()
@@ -159,7 +159,7 @@ def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move GLONASS times, whose day some encoders leave at 0 (DF416), by whole days to the message before."""
+    """Move GLONASS times, whose day some encoders leave at 0 (DF416), by whole days to the previous message."""
     others = np.flatnonzero(~glonass)
     if not len(others) or not glonass.any():
         return time
@@ -193,7 +193,7 @@ def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
 
 
 def find_unfinished_epoch(frames: Frames) -> int | None:
-    """Return the place of the first message of a last epoch of which more messages are to follow (DF393)."""
+    """Return the offset of the first message of a last epoch of which more messages are to follow (DF393)."""
     chosen = frames.of("rtcm3", *MSM_NUMBERS)
     if not len(chosen):
         return None
@@ -211,7 +211,7 @@ def find_unfinished_epoch(frames: Frames) -> int | None:
 def _of_number(
     frames: Frames, number: int, near: np.datetime64, channels: ChannelNews
 ) -> Iterator[tuple[Integers, Measurements]]:
-    """Yield measurements of one kind of message, those with equal masks together; and the places of the messages."""
+    """Yield measurements of one kind of message, grouped by equal masks; and the offsets of the messages."""
     chosen = frames.of("rtcm3", number)
     if not len(chosen):
         return
@@ -349,7 +349,7 @@ EPHEMERIDES: Final[dict[int, dict[str, Field]]] = {
 
 
 def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float]]]:
-    """Yield the fields of every ephemeris message: place in the stream, message number, values."""
+    """Yield the fields of every ephemeris message: offset in the stream, message number, values."""
     for number, sent in EPHEMERIDES.items():
         chosen = frames.of("rtcm3", number)
         needed = max(first + length for first, length, _, _ in sent.values() if isinstance(first, int))
@@ -361,7 +361,7 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
             yield place, number, {name: float(values[k]) for name, values in table.items()}
 
 
-#: Weeks of ephemeris messages: that of the origin of the system in GPS weeks, and how many weeks the field counts.
+#: Weeks of ephemeris messages: the origin of the system in GPS weeks, and the number of weeks of the field.
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 
@@ -370,10 +370,10 @@ _FIRST_MSM_WEEK: Final = 1642
 
 
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
-    """Return the time of the ephemerides of a log, which tells the week of its observations; NaT without any.
+    """Return the time of the ephemerides of a log, which determines the week of its observations; NaT without any.
 
-    The weeks of Galileo and BeiDou are unique; that of GPS, modulo 1024, is the one nearest to `near`, without it the
-    first since MSM were defined (July 2011 to February 2031): the machine's clock has no part in it.
+    The weeks of Galileo and BeiDou are unique; that of GPS, modulo 1024, is the one nearest to `near`, or without it
+    the first since MSM were defined (July 2011 to February 2031): the computer's clock is not used.
     """
     cycle_begin = _FIRST_MSM_WEEK
     if near is not None:

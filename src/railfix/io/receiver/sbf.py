@@ -69,11 +69,38 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
 _EVEN_BITS, _BDS_BITS = 114, 300  #: Bits of an even page of Galileo I/NAV without its tail, and of a page of BeiDou.
 #: Constellation and RINEX signal by signal number.
 SIGNALS: Final = {
-    0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
-    11: "R2C", 12: "R3Q", 13: "C1P", 14: "C5P", 15: "I5A", 17: "E1C", 19: "E6C", 20: "E5Q", 21: "E7Q", 22: "E8Q",
-    24: "S1C", 25: "S5I", 26: "J5Q", 28: "C2I", 29: "C7I", 30: "C6I", 32: "J1L", 33: "J1Z", 34: "C7D", 39: "J5P",
-}  # fmt: skip
-#: First and last SVID of each constellation, and what is added to it for the RINEX number.
+    0: "G1C",
+    1: "G1W",
+    2: "G2W",
+    3: "G2L",
+    4: "G5Q",
+    5: "G1L",
+    6: "J1C",
+    7: "J2L",
+    8: "R1C",
+    9: "R1P",
+    10: "R2P",
+    11: "R2C",
+    12: "R3Q",
+    13: "C1P",
+    14: "C5P",
+    15: "I5A",
+    17: "E1C",
+    19: "E6C",
+    20: "E5Q",
+    21: "E7Q",
+    22: "E8Q",
+    24: "S1C",
+    25: "S5I",
+    26: "J5Q",
+    28: "C2I",
+    29: "C7I",
+    30: "C6I",
+    32: "J1L",
+    33: "J1Z",
+    34: "C7D",
+    39: "J5P",
+}  # First and last SVID of each constellation, and the difference to the RINEX number.
 _NUMBERS: Final = (
     (1, 37, "G", 0), (38, 61, "R", -37), (63, 68, "R", -38), (71, 106, "E", -70), (120, 140, "S", -100),
     (141, 180, "C", -140), (181, 187, "J", -180), (191, 197, "I", -190), (198, 215, "S", -157), (223, 245, "C", -182),
@@ -108,8 +135,8 @@ _FRAME: Final = np.dtype(
 _PVT: Final = np.dtype(
     [("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("place", "<f8", 3), ("undulation", "<f4")]
 )
-#: RTKLIB's quality by mode of a PVT block: stand-alone, differential, fixed place, RTK fixed and float, SBAS,
-#: moving base fixed and float, PPP fixed and float.
+#: RTKLIB's quality by mode of a PVT block: stand-alone, differential, fixed position, RTK fixed and float, SBAS, moving
+#: base fixed and float, PPP fixed and float.
 _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
 _NO_WEEK: Final = 0xFFFF
@@ -119,7 +146,7 @@ _WITHOUT_OFFSET: Final = (1, 2)  #: Signals whose C/N0 has no offset of 10 dB-Hz
 
 
 def _names() -> Strings:
-    """Return the names of satellites by SVID, blank where there is none."""
+    """Return the names of satellites by SVID, blank where unknown."""
     table = np.full(256, "", dtype="<U3")
     for first, last, letter, shift in _NUMBERS:
         for number in range(first, last + 1):
@@ -163,7 +190,7 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
 
 
 def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, int]] | None:
-    """Places of the sub-blocks of one block, each with that of its first-type sub-block; None of a broken one."""
+    """Offsets of the sub-blocks of one block, each with that of its first-type sub-block; None of a broken one."""
     cursor, end = int(frames.start[index]) + _HEAD.itemsize, int(frames.end[index])
     size1, size2 = int(head["size1"]), int(head["size2"])
     places: list[tuple[int, int]] = []
@@ -179,7 +206,7 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, in
 
 
 def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
-    """Return measurements of sub-blocks: those of the first type whole, those of the second as offsets from theirs."""
+    """Return measurements of sub-blocks: those of the first type absolute, those of the second as offsets from them."""
     own = place == master
     first = gather_structures(frames.data, master, _FIRST)
     other = gather_structures(frames.data, np.where(own, 0, place), _OTHER) if len(frames.data) >= 12 else first
@@ -297,7 +324,7 @@ def _bcnav1_pages(frames: Frames) -> Subframes:
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Return the places in the stream of navigation pages with a time, and their times."""
+    """Return the offsets in the stream of navigation pages with a time, and their times."""
     chosen, rows = frames.structures("sbf", [*_PAGES, BDS_RAW_B1C], _TIME)
     dated = (rows["tow_ms"] != _NO_TIME) & (rows["week"] != _NO_WEEK)
     times = from_week(rows["week"][dated].astype(np.int64), rows["tow_ms"][dated] * 1e-3)

@@ -39,7 +39,7 @@ _LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA2
 _LNAV_WITH_D29: Final = (0, 2, 5)
 #: Last GPS week that a log may have: 2079. A date beyond it would put every later epoch out of order.
 _LAST_WEEK: Final = 5200
-#: Codes [m], phases [cycles] and Dopplers [Hz] from here on are no measurements; RINEX has no place for them.
+#: Codes [m], phases [cycles] and Dopplers [Hz] from here on are invalid; RINEX has no field for them.
 _LARGEST: Final = 1e10
 #: One measurement of RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
@@ -75,7 +75,7 @@ _LARGEST_PHASE_STD: Final = 5
 
 
 def _name_table() -> Strings:
-    """Return the names of satellites by gnssId and svId, blank where there is none; SBAS PRN 120 is S20."""
+    """Return the names of satellites by gnssId and svId, blank where unknown; SBAS PRN 120 is S20."""
     table = np.full((256, 256), "", dtype="<U3")
     for system, letter in SYSTEMS.items():
         shift = 100 if letter == "S" else 0
@@ -186,7 +186,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal"] * 1e-4, rows["vertical"] * 1e-4
         by_tow = dict(zip(pvt["tow_ms"].tolist(), np.where(fixed, quality, -1).tolist(), strict=True))
         quality = np.array([by_tow.get(tow, 5) for tow in rows["tow_ms"].tolist()], dtype=np.int64)
-        kept &= quality > 0  # before its first fix a receiver sends places that NAV-PVT calls invalid
+        kept &= quality > 0  # before its first fix a receiver sends positions that NAV-PVT marks as invalid
     else:
         rows, kept = pvt, fixed
         latitude, longitude = rows["latitude"] * 1e-7, rows["longitude"] * 1e-7
@@ -194,7 +194,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal_mm"] * 1e-3, rows["vertical_mm"] * 1e-3
     if np.isnat(near):
         kept = np.zeros(len(rows), dtype=bool)
-    # u-blox gives the error of the place in both horizontal directions together.
+    # u-blox states one error for both horizontal directions together.
     sigma = np.stack([horizontal / np.sqrt(2.0), horizontal / np.sqrt(2.0), vertical], axis=-1)
     time = np.full(len(rows), np.datetime64("NaT", "ns"))
     if kept.any():
@@ -214,13 +214,13 @@ def find_date(frames: Frames) -> np.datetime64:
 
 
 def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
-    """Return the places in the stream of NAV-PVT with a valid date, and their times."""
+    """Return the offsets in the stream of NAV-PVT with a valid date, and their times."""
     days, rows, places = _date(frames)
     return places, nearest_week(rows["tow_ms"] * 1e-3, days)
 
 
 def _date(frames: Frames) -> tuple[Datetimes, np.ndarray, Integers]:
-    """Return days (UTC), rows and places of NAV-PVT with a valid date."""
+    """Return days (UTC), rows and offsets of NAV-PVT with a valid date."""
     chosen, rows = frames.structures("ubx", [NAV_PVT], _PVT)
     valid = rows["valid"] & 3 == 3
     rows = rows[valid]

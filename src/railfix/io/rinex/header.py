@@ -1,4 +1,4 @@
-"""Header of a RINEX observation file, and header records that come in the middle of it."""
+"""Header of a RINEX observation file, and header records in the middle of a file."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
 
 
 def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: int = 1) -> RinexHeader:
-    """Parse the header of an observation file that begins at a line; `log` takes notes on what is not in its columns,
-    and unreadable records that do not matter where broken lines do not stop the reading.
+    """Parse the header of an observation file that begins at a line; `log` receives notes on missing columns, and on
+    unreadable records that do not matter where broken lines do not stop the reading.
     """
     version = read_version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
@@ -119,7 +119,7 @@ def apply_records(
 
 
 class _HeaderRecords:
-    """Reader of header records into a copy of a header: by columns, else by words, with a note."""
+    """Reader of header records into a copy of a header: by columns, otherwise by words, with a note."""
 
     def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path
@@ -229,6 +229,9 @@ class _HeaderRecords:
 
     def scale_factor(self, text: str) -> None:
         """SYS / SCALE FACTOR."""
+        if re.match(r" +[A-Z] +\d+( |$)", text):
+            self._remark("SYS / SCALE FACTOR")
+            text = f"{text.lstrip():<60}"
         names = [text[k : k + 3].strip() for k in range(11, 59, 4)]
         names = [name for name in names if name]
         if text[0] != " ":
@@ -256,7 +259,7 @@ class _HeaderRecords:
         self._scaling = (system, scale, left - len(names))
 
     def time_of_first(self, text: str) -> None:
-        """TIME OF FIRST OBS: its time system; the time itself is that of the first epoch."""
+        """TIME OF FIRST OBS: its time system; the time itself is taken from the first epoch."""
         name = text[48:51].strip()
         if name and name not in TIME_SYSTEMS:
             word = text.split()[-1]
@@ -307,7 +310,7 @@ def _interval(text: str) -> float:
     return value if value > 0.0 and math.isfinite(value) else math.nan
 
 
-#: Records that become one value of `ObservationHeader` each, and what reads it.
+#: Records that become one value of `ObservationHeader` each, and their readers.
 _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
     "APPROX POSITION XYZ": ("approximate_ecef_m", _place),
     "ANTENNA: DELTA H/E/N": ("antenna_delta_hen_m", _three),

@@ -117,7 +117,7 @@ def _header_line(line: str, label: str, content: NavigationContent) -> None:
 #: Fewest and most lines of a record, the epoch line included, by constellation (RINEX 2.11, tables A4 and
 #: A11; 3.05, tables A6 to A16: GLONASS has a fifth line since 3.05, whose flags are not needed).
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
-#: The same of the messages that came with RINEX 4 (4.02, tables A10, A11, A18 to A20).
+#: Messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
 _LINES_4: Final = {"CNAV": (9, 9), "CNV1": (10, 10), "CNV2": (10, 10), "CNV3": (9, 9)}
 #: Messages by constellation as RINEX 4 names them.
 _MESSAGES: Final = {
@@ -136,7 +136,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     """Read all records of one or several navigation files: plain, gzip, compress.
 
     A broken record stops the reading, or is counted in `skipped` and described in `notes`. InputFileError: a file is
-    missing, is no navigation file, or (with "stop") a record is broken; or no file has a usable record.
+    missing, is not a navigation file, or (with "stop") has a broken record; or no file has a usable record.
     """
     files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
@@ -283,7 +283,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
     names = list_fields(satellite[0], block.message)
     numbers: list[float] = []
     for k, name in enumerate(names):
-        # Three numbers stand on the first line, after satellite and time; four on each of the others.
+        # The first line has three numbers, after satellite and time; the others have four.
         row, place = divmod(k + 1, 4)
         text = block.text[row]
         column = shift - 15 + _WIDTH * place

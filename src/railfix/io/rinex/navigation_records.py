@@ -34,7 +34,7 @@ _CNAV: Final = _ORBIT_4.format("top") + (
 )
 _CNV: Final = _ORBIT_4.format("toe_sow_s") + "kind top sisai_oe sisai_ocb sisai_oc1 sisai_oc2 "
 _CNV_END: Final = " group_delay_1_s group_delay_2_s sismai health flags iodc transmitted spare spare iode"
-#: Numbers of the messages that came with RINEX 4 (4.02, tables A10, A11, A18 to A20).
+#: Numbers of the messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
 _MESSAGES_4: Final[Mapping[str, str]] = {
     **dict.fromkeys(("G CNAV", "J CNAV"), _CNAV + "transmitted week"),
     **dict.fromkeys(("G CNV2", "J CNV2"), _CNAV + "inter_signal_4 inter_signal_5 spare spare transmitted week"),
@@ -48,7 +48,7 @@ FIELDS: Final[Mapping[str, Sequence[str]]] = {
     "R": _GLONASS,
     **{message: names.split() for message, names in _MESSAGES_4.items()},
 }
-#: Numbers without which there is no orbit or no clock.
+#: Numbers without which orbit or clock cannot be computed.
 _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
     "clock_bias x x_velocity y y_velocity z z_velocity".split()
@@ -78,7 +78,7 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
 _BLANK: Final = float("nan")
 _UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.
-_TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times further than this from toe are invalid [s].
+_TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times farther than this from toe are invalid [s].
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,8 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     beidou = system == "C"
     gps_like = np.isin(system, ["G", "J"])
     integers = {name: _integers(column[name]) for name in ("iode", "health", "data_source")}
-    # The field of IODC is the second group delay of Galileo and BeiDou; AODC of BeiDou is in that of the fit interval.
+    # The field of IODC is the second group delay of Galileo and BeiDou; AODC of BeiDou has the position of the fit
+    # interval.
     cnv = ~np.isnan(column["iodc"])
     iodc = np.select(
         [gps_like, cnv, beidou], [column["group_delay_2_s"], column["iodc"], column["fit"]], column["iode"]

@@ -35,7 +35,7 @@ from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, spli
 
 #: Bytes of text read at a time: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: A longer line is no RINEX, not even one that a failing recorder filled with zeros.
+#: A longer line is not RINEX, not even one that a failing recorder filled with zeros.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
 _TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}  #: Other time systems are GPS time.
@@ -53,7 +53,7 @@ class Selection:
 
 
 class BlockReader:
-    """Reader of one file in the order in which its epochs stand there; knows its last tag, epochs and the share read.
+    """Reader of one file in file order; knows its last tag, number of epochs and fraction read.
 
     A cut last record is left out with a note.
     """
@@ -179,7 +179,7 @@ class BlockReader:
 #: Default number of epochs of a piece.
 DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
-#: The first piece is this part of the others.
+#: The first piece is this fraction of the others.
 _FIRST_PART: Final = 5
 _GAP_INTERVALS: Final = 1.5  #: A step between files is a gap when it is longer than this many intervals.
 
@@ -194,11 +194,11 @@ def scan_observations(
     end: np.datetime64 | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Return the observations of one receiver in pieces of `epochs` epochs at most; other arguments as
+    """Return the observations of one receiver in pieces of at most `epochs` epochs; other arguments as in
     `railfix.read_observations`.
 
-    The first piece is short (`in_pieces`). Each has the channels that occur in it; concatenated they are the log.
-    Memory is that of a piece and one block of text. `progress` is called repeatedly with the fraction of the files
+    The first piece is short (`in_pieces`). Each piece has the channels that occur in it; concatenated they are the log.
+    Memory use is that of a piece and one block of text. `progress` is called repeatedly with the fraction of the files
     that has been read, 0 to 1.
     """
     if epochs < 1:
@@ -264,7 +264,7 @@ LONGEST_GAP: Final = np.timedelta64(7, "D")
 
 
 def check_one_run(paths: Sequence[str], firsts: Sequence[np.datetime64]) -> None:
-    """Raise MismatchError where the first epochs of two files that follow each other lie more than a week apart."""
+    """Raise MismatchError where the first epochs of consecutive files are more than a week apart."""
     order = np.argsort(np.array(firsts), kind="stable")
     for before, after in pairwise(order.tolist()):
         if firsts[after] - firsts[before] > LONGEST_GAP:
@@ -297,7 +297,7 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 
 
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
-    """Yield pieces of one length from runs, the first a fifth of it, so that what takes them begins early.
+    """Yield pieces of equal length from runs, the first a fifth of it, so that processing begins early.
 
     Problems belong to the piece being collected.
     """

@@ -48,11 +48,11 @@ class Fields:
 
     value: Floats  #: NaN where blank, and where `bad`.
     lock: Bytes  #: Loss-of-lock digit, 0 where blank.
-    bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is no digit.
+    bad: Masks  #: The field is neither blank nor a number, or one of its two indicators is not a digit.
 
 
 def join_fields(parts: Sequence[Fields]) -> Fields:
-    """Return the fields of the same satellites side by side."""
+    """Return the fields of the same satellites adjacent."""
     arrays = ([getattr(part, name) for part in parts] for name in ("value", "lock", "bad"))
     return Fields(*(np.concatenate(some, axis=1) for some in arrays))
 

@@ -46,7 +46,7 @@ class FaultLog:
         self._first: tuple[int, str] | None = None
 
     def count(self, kind: str, number: int) -> None:
-        """Count skipped items that are no faults."""
+        """Count skipped items that are not faults."""
         if number:
             self.counts[kind] = self.counts.get(kind, 0) + number
 
@@ -76,7 +76,7 @@ class FaultLog:
         self.remark(message)
 
     def remark(self, message: str) -> None:
-        """Record what was read otherwise than it stands there, by its complete message."""
+        """Record a deviation from the text of the file, by its complete message."""
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)
@@ -108,7 +108,7 @@ class FaultLog:
         return taken
 
 
-#: Labels of header records that stand among epochs where files were joined or edited.
+#: Labels of header records that occur among epochs where files were concatenated or edited.
 LABELS: Final = frozenset(
     (
         "COMMENT", "RINEX VERSION / TYPE", "END OF HEADER", "PGM / RUN BY / DATE", "MARKER NAME", "MARKER NUMBER",
@@ -287,7 +287,7 @@ class _Walk:
         return bound
 
     def _other(self, position: int, k: int, *, at_end: bool) -> int:
-        """Handle a line that is no epoch line: an event without time, or a broken line."""
+        """Handle a line that is not an epoch line: an event without time, or a broken line."""
         if _is_record(self._lines, position):
             return self._header_records(position, at_end=at_end)
         event = event_line(self._lines, position)
@@ -310,7 +310,7 @@ class _Walk:
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
     def _header_records(self, position: int, *, at_end: bool) -> int:
-        """Take header records among the epochs as one event; they may go on after the end of the block."""
+        """Take header records among the epochs as one event; they may continue after the end of the block."""
         end = position
         while end < len(self._lines) and _is_record(self._lines, end):
             end += 1

@@ -1,9 +1,9 @@
 """Lines of a block of text, epoch lines, and the signals and observables of RINEX observation types.
 
 RINEX 3 and 4 name the signal themselves ("C1C" is the code of "1C"). RINEX 2 names it by band (RINEX 2.11, table A1;
-RINEX 3.05, tables 4 to 11); L1, D1 and S1 belong to C1's signal where C1 is declared, else to P1's; L2, D2 and S2 to
-P2's where P2 is declared, else to C2's; where no code of the band is declared, to those of C1 and P2. BeiDou of RINEX
-3.02 calls B1I band 1 ("C1I"): it is read as "2I", as are 1I and 1Q of any version, which have no other meaning.
+RINEX 3.05, tables 4 to 11); L1, D1 and S1 belong to C1's signal where C1 is declared, else to P1's; l2, D2 and S2 to
+P2's where P2 is declared, otherwise to C2's; where no code of the band is declared, to those of C1 and P2. BeiDou of
+RINEX 3.02 calls B1I band 1 ("C1I"): it is read as "2I", as are 1I and 1Q of any version, which have no other meaning.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
 class EpochHeads:
     """Epochs and events of a block, shape (n,), `time_ns` in the file's time system (events: 0).
 
-    Of unreadable numbers flag and count are -1; `flaw` is an index into `FLAWS`, 0 for a valid line.
+    Flag and count are -1 where unreadable; `flaw` is an index into `FLAWS`, 0 for a valid line.
     """
 
     line: Integers

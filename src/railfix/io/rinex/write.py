@@ -40,7 +40,9 @@ def detect_packing(path: FilePath) -> Packing:
 
 @contextmanager
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
-    """Open a stream packed as asked, or by the file name; the file appears where the block ends without error."""
+    """Open a stream with the requested compression, or by the file name; the file appears when the block ends without
+    error.
+    """
     kind = detect_packing(path) if packing is None else packing
     if kind not in get_args(Packing):
         raise ValueError(f"packing {kind!r} is unknown; expected one of {', '.join(get_args(Packing))}")
@@ -299,7 +301,7 @@ def _format_f14_3(value: Floats) -> Bytes:
     present = np.isfinite(value)
     thousandths = np.rint(np.abs(np.where(present, value, 0.0)) * 1e3).astype(np.int64)
     negative = present & (value < 0) & (thousandths > 0)
-    # Ten places before the point, nine of them behind a sign.
+    # Ten digits before the point, nine of them after a sign.
     if (thousandths >= np.where(negative, 10**12, 10**13)).any():
         raise ValueError("a value has too many digits for the F14.3 of RINEX")
     high, low = np.divmod(thousandths, 10**8)

@@ -18,7 +18,7 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.navigation_records import FIELDS
 from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line
 
-UNKNOWN_S: Final = 0.9999e9  #: Written for an unknown transmission time, and for what CNV1 has beside the records.
+UNKNOWN_S: Final = 0.9999e9  #: Values for an unknown transmission time, and for fields of CNV1 that the records lack.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of a constellation's Klobuchar coefficients.
 #: Messages of Keplerian records that a version has.
 _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
@@ -41,9 +41,9 @@ def write_navigation(
 ) -> None:
     """Write a RINEX navigation file; a failed write leaves no file.
 
-    Records are sorted by clock time, then satellite. Fields that `Navigation` does not have (L2 code
-    and P flags, the GLONASS status words) are written as 0, NaN as blank, an unknown transmission time
-    and what CNV1 has beside them as 0.9999E9. `precise` is not written.
+    Records are sorted by clock time, then satellite. Fields that `Navigation` lacks (L2 code and P flags, the GLONASS
+    status words) are written as 0, NaN as blank, an unknown transmission time and additional fields of CNV1 as
+    0.9999E9. `precise` is not written.
 
     Parameters
     ----------

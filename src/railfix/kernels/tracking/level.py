@@ -33,6 +33,7 @@ class Alternatives(NamedTuple):
 
     along_m: Floats  #: Distance along the line; 0 for a branch that is no bound along the line.
     straight_m: Floats  #: Straight distance.
+    forward_m: Floats  #: Part of the straight distance along the line there.
     sigma_m: Floats
     probability: Floats
 
@@ -42,33 +43,75 @@ def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
     """Return the hypotheses but the first, and the probability of those further along the line than a bound reaches."""
     count, far = state.monitors[0].hypotheses, 0.0
     along, straight = np.empty(count - 1), np.empty(count - 1)
-    sigma, probability = np.empty(count - 1), np.empty(count - 1)
+    sigma, probability, forward = np.empty(count - 1), np.empty(count - 1), np.zeros(count - 1)
     here, there, axes = np.empty(3), np.empty(3), np.empty((3, 3))
     write_point(given.vertex, given.line[0], state.x[0, ix.ARC], here, axes)
     for h in range(1, count):
         write_point(given.vertex, given.line[0], state.x[h, ix.ARC], there, axes)
         along[h - 1] = abs(state.x[h, ix.ARC] - state.x[0, ix.ARC])
         straight[h - 1] = math.sqrt(((there - here) ** 2).sum())
+        forward[h - 1] = abs(((there - here) * axes[0]).sum())
         sigma[h - 1] = math.sqrt(state.P[h, ix.ARC, ix.ARC])
         probability[h - 1] = math.exp(state.hypothesis[h].log_probability)
         if along[h - 1] > given.parameters[0].start_separation_m:
             far += probability[h - 1]
             along[h - 1] = 0.0
-    return Alternatives(along, straight, sigma, probability), far
+    return Alternatives(along, straight, forward, sigma, probability), far
 
 
 @inner
-def _find_subfilters(state: State) -> Alternatives:
-    """Return the running sub-filters."""
-    first, size = len(state.hypothesis), 0
-    most = find_others(state) + ix.ALL_IN_VIEW
-    away, sigma, probability = np.empty(most), np.empty(most), np.empty(most)
+def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple[float, float]:
+    """Return place and variance of a Gaussian with another prior sigma of the slow code error n.
+
+    The information at n changes by ``-d``, ``d = 1 / slow^2 - 1 / tilt^2``, so that the place is
+    ``s + P_sn d n / (1 - d P_nn)`` and its variance ``P_ss + P_sn^2 d / (1 - d P_nn)``.
+    """
+    less = 1.0 / slow_m**2 - 1.0 / tilt_m**2
+    gain = P[ix.ARC, ix.SLOW_CODE] * less / (1.0 - less * P[ix.SLOW_CODE, ix.SLOW_CODE])
+    return x[ix.ARC] + gain * x[ix.SLOW_CODE], P[ix.ARC, ix.ARC] + gain * P[ix.ARC, ix.SLOW_CODE]
+
+
+@inner
+def _find_subfilters(given: Given, state: State) -> Alternatives:
+    """Return the running sub-filters, and the filter where the ionosphere may be tilted."""
+    first, size, most = len(state.hypothesis), 0, find_others(state) + ix.ALL_IN_VIEW
+    away, sigma, probability = np.empty(most + 1), np.empty(most + 1), np.empty(most + 1)
     for b in range(most):
         if state.source[b].running:
             away[size] = abs(state.x[first + b, ix.ARC] - state.x[0, ix.ARC])
             sigma[size], probability[size] = math.sqrt(state.P[first + b, ix.ARC, ix.ARC]), state.source[b].prior
             size += 1
-    return Alternatives(away[:size], away[:size], sigma[:size], probability[:size])
+    slow_m, tilt_m = given.parameters[0].slow_code_m, given.line[0].tilt_m
+    if tilt_m > slow_m:
+        place, variance = widen_slow_code(slow_m, tilt_m, state.x[0], state.P[0])
+        away[size], sigma[size] = abs(place - state.x[0, ix.ARC]), math.sqrt(variance)
+        probability[size] = given.parameters[0].level_tilt_prior
+        size += 1
+    return Alternatives(away[:size], away[:size], away[:size], sigma[:size], probability[:size])
+
+
+@inner
+def _cross(branches: Alternatives, subfilters: Alternatives, risk: float, level: float) -> tuple[Alternatives, float]:
+    """Return the places on other branches where a source is faulty, and the risk spent on those that need no term.
+
+    A fault shifts the place on each branch along it as it shifts that on the first one. Without a term: those that
+    require less than the level so far.
+    """
+    most, size, spent = len(branches.sigma_m) * len(subfilters.sigma_m), 0, 0.0
+    along, straight, sigma, probability = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
+    for h in range(len(branches.sigma_m)):
+        for b in range(len(subfilters.sigma_m)):
+            shift, prior = subfilters.along_m[b], branches.probability[h] * subfilters.probability[b]
+            own = max(branches.sigma_m[h], subfilters.sigma_m[b])
+            distance = math.sqrt(branches.straight_m[h] ** 2 + shift**2 + 2.0 * branches.forward_m[h] * shift)
+            tail = prior * math.erfc((level - distance) / (math.sqrt(2.0) * own))
+            if tail < constants.PAIR_SHARE * risk:
+                spent += tail
+                continue
+            along[size] = branches.along_m[h] + shift if branches.along_m[h] > 0.0 else 0.0
+            straight[size], sigma[size], probability[size] = distance, own, prior
+            size += 1
+    return Alternatives(along[:size], straight[:size], straight[:size], sigma[:size], probability[:size]), spent
 
 
 @inner
@@ -111,7 +154,20 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
                 continue
             away[size], sigma[size], probability[size] = distance, 1.0 / math.sqrt(remaining), prior
             size += 1
-    return Alternatives(away[:size], away[:size], sigma[:size], probability[:size]), spent
+    return Alternatives(away[:size], away[:size], away[:size], sigma[:size], probability[:size]), spent
+
+
+@inner
+def find_unchecked(state: State) -> float:
+    """Return the probability of a fault common to a constellation in view without a sub-filter: the only one."""
+    source, satellites, total = state.source, len(state.code_bias), 0.0
+    for g in range(ix.CLOCK_COUNT):
+        in_view = False
+        for k in range(satellites):
+            in_view = in_view or (source[k].running and source[k].clock == g)
+        if in_view and not source[satellites + g].running:
+            total += source[satellites + g].prior
+    return total
 
 
 @inner
@@ -136,14 +192,17 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
                 apart = away if math.isnan(apart) else max(apart, away)
             start = max(start, away + source[b].k * math.sqrt(state.P[first + b, ix.ARC, ix.ARC]))
     result.level_noise_m, result.separation_m = noise, apart
+    result.unchecked_prior = find_unchecked(state)
     result.level_m = result.ground_level_m = math.inf
     if math.isnan(apart) or contradicted:
         return
     pairs, spent = _find_pairs(state, parameters.level_risk, start)
-    risk = parameters.level_risk - spent
+    subfilters = _find_subfilters(given, state)
+    crossed, spent_on_branches = _cross(branches, subfilters, parameters.level_risk, start)
+    risk = parameters.level_risk - spent - spent_on_branches
     if risk <= 0.0:
         return
-    alternatives = join(join(_find_subfilters(state), branches), pairs)
+    alternatives = join(join(join(subfilters, branches), pairs), crossed)
     result.ground_level_m = solve_level(sigma, alternatives.straight_m, alternatives, risk, start)
     if len(branches.sigma_m) == 0:
         result.level_m = result.ground_level_m
@@ -158,13 +217,11 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
 @inner
 def join(one: Alternatives, other: Alternatives) -> Alternatives:
     """Return the alternatives of both."""
-    first, size = len(one.sigma_m), len(one.sigma_m) + len(other.sigma_m)
-    both = Alternatives(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
-    for part, start in ((one, 0), (other, first)):
-        for a in range(len(part.sigma_m)):
-            both.along_m[start + a], both.straight_m[start + a] = part.along_m[a], part.straight_m[a]
-            both.sigma_m[start + a], both.probability[start + a] = part.sigma_m[a], part.probability[a]
-    return both
+    return Alternatives(
+        np.concatenate((one.along_m, other.along_m)), np.concatenate((one.straight_m, other.straight_m)),
+        np.concatenate((one.forward_m, other.forward_m)), np.concatenate((one.sigma_m, other.sigma_m)),
+        np.concatenate((one.probability, other.probability)),
+    )  # fmt: skip
 
 
 @inner

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking.layout import Record, Records
@@ -38,14 +40,8 @@ def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float
 def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: Floats) -> None:
     """Write point [m] and axes (tangent, right, up) of the line at an arc length; shapes (3,), (3, 3)."""
     arc = wrap_arc(vertex, line, arc)
-    low, high = 1, len(vertex) - 1
-    while low < high:
-        half = (low + high) // 2
-        if vertex[half].arc_m <= arc:
-            low = half + 1
-        else:
-            high = half
-    here, after = vertex[low - 1], vertex[low]
+    v = np.searchsorted(vertex["arc_m"][1:-1], arc, side="right")
+    here, after = vertex[v], vertex[v + 1]
     along = arc - here.arc_m
     share = min(max(along / (after.arc_m - here.arc_m), 0.0), 1.0)
     for k in range(3):
@@ -64,19 +60,11 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
     """Return the gradient of the line, linear between the middles of segments."""
     arc = wrap_arc(vertex, line, arc)
     segments = len(vertex) - 1
-    low, high = 0, segments
-    while low < high:
-        half = (low + high) // 2
-        if vertex[half].middle_m <= arc:
-            low = half + 1
-        else:
-            high = half
-    if low == 0:
+    if segments == 1 or arc <= vertex[0].middle_m:
         return float(vertex[0].gradient)
-    if low == segments:
-        return float(vertex[segments - 1].gradient)
-    before, after = vertex[low - 1], vertex[low]
-    share = (arc - before.middle_m) / (after.middle_m - before.middle_m)
+    v = min(np.searchsorted(vertex["middle_m"][:segments], arc, side="right"), segments - 1)
+    before, after = vertex[v - 1], vertex[v]
+    share = min((arc - before.middle_m) / (after.middle_m - before.middle_m), 1.0)
     return float((1.0 - share) * before.gradient + share * after.gradient)
 
 

@@ -1,4 +1,4 @@
-"""Carrier phase beside code (P4's observation model): slips, smoothed codes, float ambiguities.
+"""Carrier phase combined with code (P4's observation model): slips, smoothed codes, float ambiguities.
 
 The phase is precise to a few millimetres, but for an unknown constant per arc. `find_slips`
 detects where arcs end, `smooth_codes` is the Hatch filter, and `phase_positions` estimates positions

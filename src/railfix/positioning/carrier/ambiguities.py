@@ -1,9 +1,9 @@
 """Positions along the line from code and phase over a run of epochs (P4 with the map's constraint), integers fixed.
 
 The unknowns of the epochs (distance and clocks) are eliminated: the normal matrix has one row per arc of phase.
-Integers are fixed where the risk that they are wrong is bounded, by Bayes' rule: each vector with the density of the
-float ambiguities around it, against all others and against phases that are no whole cycles (multipath, half cycles), of
-prior probability `PhaseLimits.no_integer_prior` and uniform density.
+Integers are fixed where the risk of a wrong integer is bounded, by Bayes' rule: the density of the float ambiguities
+around each vector of integers is compared with all other vectors and with non-integer phases (multipath, half cycles),
+which have the prior probability `PhaseLimits.no_integer_prior` and uniform density.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ class PhaseLimits(Settings):
     correlation_s: float = Field(default=20.0, ge=0)
     #: Linearisations of `phase_positions`; each has its own state, so that results do not depend on chunks.
     passes: int = Field(default=2, ge=1)
-    #: Beside a base station: largest probability of a wrong integer with which ambiguities are fixed.
+    #: Largest probability of a wrong integer at which ambiguities are fixed, with a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
-    #: Probability that phases are no whole cycles (multipath, half a cycle).
+    #: Probability that phases are not whole cycles (multipath, half a cycle).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
     largest_sigma_m: float = Field(default=1e3, gt=0)  #: Epochs with more noise along the line have no position.
 
 
 def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
-    """Return the number of the hop that each time lies in."""
+    """Return the number of the hop that contains each time."""
     nanoseconds = (time.astype("datetime64[ns]") - GPS_EPOCH).astype(np.int64)
     return np.asarray(nanoseconds // round(limits.hop_s * 1e9), dtype=np.int64)
 
@@ -68,9 +68,9 @@ class ArcAmbiguities:
     """Ambiguities of A arcs (with a drift over a complete run: of parts of arcs within a hop)."""
 
     arc_id: Integers  #: Shape (A,).
-    #: Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With clocks of the phases'
-    #: own, known up to a constant common to all: zero in the mean of the corrections to their first values, and the
-    #: covariance is against that mean; shape (A,).
+    #: Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With separate phase clocks,
+    #: ambiguities are known up to a common constant: the mean of the corrections to their first values is zero, and the
+    #: covariance refers to that mean; shape (A,).
     ambiguity_m: Floats
     covariance_m2: Floats  #: From noise alone, without the map error; shape (A, A).
 
@@ -84,11 +84,11 @@ class PhasePositions:
     #: Standard deviation with the map's error, and of noise alone; shape (T,).
     sigma_m: Floats
     noise_sigma_m: Floats
-    clock_m: Floats  #: Receiver clock of each group; NaN where there is no position; shape (T, G).
+    clock_m: Floats  #: Receiver clock of each group; NaN without a position; shape (T, G).
     #: Observed less computed; NaN where not used; shape (T, M).
     code_residual_m: Floats
     phase_residual_m: Floats
-    #: Of the arc of each used phase, as known at the epoch; shape (T, M).
+    #: Ambiguity of the arc of each used phase, as known at the epoch; shape (T, M).
     ambiguity_m: Floats
     ambiguity_sigma_m: Floats
     #: Used, shape (T,).
@@ -97,7 +97,7 @@ class PhasePositions:
     n_fixed: Integers  #: Differences of ambiguities fixed to whole cycles, shape (T,).
     #: Probability that one of these is wrong, or of the best candidates; NaN without any; shape (T,).
     integer_risk: Floats
-    #: All arcs of a run, or those alive after the last epoch (`phase_positions`); None in results, row by row.
+    #: All arcs of a run, or those that continue after the last epoch (`phase_positions`); None in results, row by row.
     arcs: ArcAmbiguities | None
 
     iterations: int
@@ -123,7 +123,7 @@ def prepare_start(
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    A constant common to all, unobservable beside a clock of the phases' own, is fixed by a zero mean of the `held` ones
+    A common constant is unobservable with separate phase clocks. It is fixed by a zero mean of the `held` ambiguities
     (1, others 0; shape (..., A)), which changes no difference between them.
     """
     size = matrix.shape[-1]
@@ -144,7 +144,7 @@ def assemble_positions(
     fixes: tuple[Integers, Floats],
     limits: PhaseLimits,
 ) -> PhasePositions:
-    """Return the positions of a run, NaN where there is none; `ambiguity` is value [m] and variance [m^2]."""
+    """Return the positions of a run, NaN where missing; `ambiguity` is value [m] and variance [m^2]."""
     (ambiguity_m, variance_m2), has = ambiguity, started & (own.noise_sigma_m <= limits.largest_sigma_m)
     code, phase = lin.code_weight > 0, lin.phase_weight > 0
     return PhasePositions(
@@ -166,7 +166,7 @@ def assemble_positions(
 
 
 _VECTORS: Final = 12  #: Vectors compared.
-#: Shares of the differences, those of the strongest phases, that are tried one after the other.
+#: Fractions of the differences, those of the strongest phases first, that are tried in turn.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 
@@ -175,7 +175,7 @@ class Fixed:
     """Ambiguities of A arcs with those differences fixed that are certain enough."""
 
     value_m: Floats  #: Ambiguities, and their responses to a map 1 m off across and in height; shape (A, 3).
-    covariance_m2: Floats  #: Of noise alone, shape (A, A).
+    covariance_m2: Floats  #: Covariance of noise alone, shape (A, A).
     count: int  #: Differences fixed; 0: the float ambiguities are returned.
     #: Probability that one of them is wrong, or of the best ones where none is fixed; NaN without any difference.
     risk: float
@@ -264,7 +264,7 @@ def _fix_pairs(
     log_density = -0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
     peak = max(float(log_density[0]), 0.0)
     weight = (1.0 - no_integer_prior) * np.exp(log_density - peak)
-    # A density of one a cycle: phases that are no whole cycles.
+    # A density of one per cycle, for phases that are not whole cycles.
     others = weight[1:].sum() + no_integer_prior * np.exp(-peak)
     step = np.zeros((len(rows), 3))
     step[:, 0] = cycles - integers[0]

@@ -2,7 +2,7 @@
 
 Between two epochs the unknowns are the distance moved along a known line and the change of the clock; every further
 satellite is a check, precise to a centimetre. Where they disagree, the worst channels are rejected one by one until the
-others agree. The number of an arc, unique in a run, is the channel's five letters and its count of arcs so far.
+others agree. The number of an arc, unique in a run, is the channel's five letters and its count of arcs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ChannelKeys = tuple[tuple[str, str], ...]  #: Satellite and signal of each chann
 
 @dataclass(frozen=True, kw_only=True)
 class ArcState:
-    """Arcs that each channel has had so far, by channel code."""
+    """Number of arcs so far, by channel code."""
 
     count: Mapping[int, int] = field(default_factory=dict)
 
@@ -44,7 +44,9 @@ def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
 
 
 def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
-    """Return the row of each channel in the epoch before, shape (M,); -1, the NaN appended to values, for new ones."""
+    """Return the row of each channel in the previous epoch, shape (M,); -1, the NaN appended to values, for new
+    ones.
+    """
     row = {key: i for i, key in enumerate(before)}
     return np.array([row.get(key, -1) for key in now], dtype=np.intp)
 
@@ -65,7 +67,7 @@ def number_arcs(
     Returns
     -------
     ndarray of int64, shape (T, M)
-        `NO_ARC` where there is no phase.
+        `NO_ARC` without a phase.
     ArcState
     """
     before = dict(state.count) if state else {}
@@ -97,16 +99,16 @@ class ContinuityLimits(Settings):
     #: delays).
     phase_m: float = Field(default=0.012, gt=0)
     drift_mps: float = Field(default=0.008, gt=0)
-    #: Standard deviation across and up of a sudden change of place (map points).
+    #: Standard deviation across and up of a sudden change of position (map points).
     aside_m: float = Field(default=0.02, gt=0)
-    #: The same as shares of the distance moved: a position error of 5 m turns the line by 0.017 on a curve of 300 m
+    #: The same as fractions of the distance moved: a position error of 5 m turns the line by 0.017 on a curve of 300 m
     #: radius, and by 0.0025 on a vertical curve of 2000 m.
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
     sigmas: float = Field(default=4.5, gt=0)  #: Standard deviations of the channel's residual that reject it.
     #: Largest number of channels rejected; where more would be, no channel continues.
     max_rejected: int = Field(default=8, ge=0)
-    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is judged.
+    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,10 +127,10 @@ class TrackJumps:
     """Verdict on the change of each phase into its epoch, T epochs by M channels."""
 
     jump: Masks  #: True where the phase does not fit: a new arc begins; shape (T, M).
-    metric_m: Floats  #: Change of phase less that of the channels kept; NaN where not judged; shape (T, M).
+    metric_m: Floats  #: Change of phase less that of the remaining channels; NaN where not tested; shape (T, M).
     judged: Masks  #: Shape (T, M).
     moved_m: (
-        Floats  #: Distance along the line since the epoch before, from the phases; NaN where not known; shape (T,).
+        Floats  #: Distance along the line since the previous epoch, from the phases; NaN where not known; shape (T,).
     )
     moved_sigma_m: Floats  #: Shape (T,).
 
@@ -138,7 +140,7 @@ class TrackedPhases(NamedTuple):
 
     phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), NaN where not used; shape (T, M).
     sat_ecef_m: Floats  #: Satellites where there is a phase, shape (T, M, 3).
-    slip: Masks  #: Slips already known: not judged again; shape (T, M).
+    slip: Masks  #: Slips already known: not tested again; shape (T, M).
 
 
 def track_jumps(
@@ -161,7 +163,7 @@ def track_jumps(
     phases : TrackedPhases
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
-        Positions of codes alone, good to some metres; NaN: the epoch cannot judge nor be judged.
+        Positions of codes alone, good to some metres; NaN: the epoch is not used.
     state : ContinuityState, optional
     limits : ContinuityLimits, optional
 
@@ -217,7 +219,7 @@ def track_jumps(
 def _reject_jumps(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
-    """Reject the worst channels one by one until the rest agrees; with nothing to check with, all are kept.
+    """Reject the worst channels one by one until the others agree; without redundancy all are kept.
 
     Returns the mask of those kept, residuals of all, step along the line, its variance, and where the rest agrees.
     """
@@ -243,7 +245,9 @@ def _reject_jumps(
 
 @dataclass(frozen=True)
 class _ContinuityFit:
-    """Residuals of all channels, their size in sigmas (of one kept: its own; of one not: its prediction's)."""
+    """Residuals of all channels, with their size in sigmas (of the residual for kept channels, of the prediction for
+    others).
+    """
 
     residual: Floats
     size: Floats
@@ -269,7 +273,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Return channels kept after rejecting the worst one by one, and the epochs where these agree."""
+    """Return the channels that remain after rejecting the worst one by one, and the epochs where these agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

@@ -1,8 +1,8 @@
 """Positions along the line from code and phase, each epoch from the past alone.
 
-The normal matrix of the running arcs' ambiguities is what one epoch leaves to the next; at multiples of a hop the
-ambiguities walk a little. Where an arc begins, that of its channel before it is eliminated, so that the state is as
-small as there are channels.
+The state between epochs is the normal matrix of the running arcs' ambiguities; at multiples of a hop process noise is
+added to the ambiguities. Where an arc begins, the previous arc of its channel is eliminated, so that the state never
+has more arcs than channels.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from railfix.positioning.carrier.observation_model import (
 from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
-SEGMENT_EPOCHS: Final = 64  #: Epochs computed together: what bounds the memory.
+SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together; it bounds the memory.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """Information of the epochs so far on the running arcs, A of them."""
+    """Information of the epochs so far on A running arcs."""
 
-    #: Of the last epoch, NaT before the first.
+    #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     arc_id: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))  #: Shape (A,).
     seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))  #: Shape (A,).
     first_m: Floats = field(default_factory=lambda: np.empty(0))  #: First values of the ambiguities, shape (A,).
     matrix: Floats = field(default_factory=lambda: np.empty((0, 0)))  #: Shape (A, A) [1/m^2].
-    #: Of the observations, and of a map off across and in height; shape (A, 3) [1/m].
+    #: Vectors of the observations, and of map errors across and in height; shape (A, 3) [1/m].
     right: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
 
@@ -137,7 +137,9 @@ def _segment(
     memory: Memory,
     limits: PhaseLimits,
 ) -> tuple[PhasePositions, Floats, Memory]:
-    """Positions and places of one segment, and the memory it leaves; `start`: places, and epochs that have one."""
+    """Positions of one segment, and its final memory; `start`: positions, and the epochs
+    that have one.
+    """
     arc_m, started = start
     used = phases.weight > 0
     lin = linearise(ranges, phases, trajectory, arc_m, clocks=limits.clocks)
@@ -183,11 +185,11 @@ def _ambiguities(
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
     """Return ambiguities of each epoch's channels less their first values, shape (T, M, 3), and covariances (T, M, M).
 
-    From each epoch's own normal equations and those before it; then those of all arcs, and the memory after the last
-    epoch. `held`: see `inverse_of_arcs`.
+    Computed from each epoch's own normal equations and those of earlier epochs; then the ambiguities of all arcs, and
+    the memory after the last epoch. `held`: see `inverse_of_arcs`.
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
-    # One more row and column takes what has no phase.
+    # An extra row and column collects channels without a phase.
     index = np.where(arc_id == NO_ARC, count, np.searchsorted(memory.arc_id, arc_id))
     if (np.append(memory.arc_id, NO_ARC)[index] != arc_id).any():
         raise ValueError("the phases of an arc go on after a newer arc of their channel; number arcs with number_arcs")
@@ -214,7 +216,7 @@ def _ambiguities(
 def _fix_epochs(
     floats: tuple[Floats, Floats, Floats], phases: Phases, trajectory: Trajectory, limits: PhaseLimits
 ) -> tuple[Integers, Floats]:
-    """Fix ambiguities in place, epoch by epoch; return how many differences, and the risk.
+    """Fix ambiguities in place, epoch by epoch; return the number of fixed differences, and the risk.
 
     `floats`, by channel: first values of the ambiguities, corrections to them with their responses to the map, and
     covariances.
@@ -242,7 +244,7 @@ def _fix_epochs(
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
-    """Return the memory with room for new arcs, sorted by name, those of the same channels eliminated."""
+    """Return the memory with space for new arcs, sorted by name; older arcs of the same channels are eliminated."""
     if not len(ids):
         return memory
     memory = _without(memory, np.isin(decode_channel(memory.arc_id), decode_channel(ids)))
@@ -263,7 +265,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """Return the memory at a later hop: arcs not seen for long forgotten, the others a little less certain."""
+    """Return the memory at a later hop: long-absent arcs are dropped, the others get process noise."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)
@@ -280,7 +282,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
 
 
 def _without(memory: Memory, ends: Masks) -> Memory:
-    """Return the normal equations with some arcs eliminated; their information on the others is kept."""
+    """Return the normal equations with some arcs eliminated; the information on the others is unchanged."""
     runs = ~ends
     if runs.all():
         return memory
@@ -300,7 +302,7 @@ def _without(memory: Memory, ends: Masks) -> Memory:
 
 
 def _join(pieces: list[PhasePositions]) -> PhasePositions:
-    """Return segments as a whole; the arcs are those of the last."""
+    """Concatenate segments; the arcs are those of the last segment."""
     arrays: dict[str, Any] = {
         item.name: np.concatenate([getattr(p, item.name) for p in pieces])
         for item in fields(PhasePositions)

@@ -1,15 +1,15 @@
 """P4's observation equations, linearised, the unknowns of each epoch eliminated.
 
-Per epoch t and channel i, around a place on the line::
+Per epoch t and channel i, around a position on the line::
 
     code  - range = -u.e d + (-u.c m1 - u.h m2) + b_g
     phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
 
 with d along the section, m1 and m2 the map's error across the track and in height, b_g the clock of the constellation.
 P4 writes b = b_g (`clocks="shared"`); telephones do not keep that, and a clock of the phases' own leaves the N known up
-to a constant common to all. With ``L`` the normal matrix of an epoch's own unknowns and ``C`` what couples them to the
-N, the epoch adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). What the ionosphere's model
-misses is taken up by N at the arc's begin and drifts by twice its change.
+to a constant common to all. With ``L`` the normal matrix of an epoch's own unknowns and ``C`` their coupling to the N,
+the epoch adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement). Residual ionospheric errors
+are absorbed by N at the arc's begin and drift by twice their change.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ class IntegerChannels:
     """Which channels have ambiguities that differ by whole cycles."""
 
     wavelength_m: Floats  #: Shape (M,).
-    group: Integers  #: The same for channels of one clock and signal; -1 for those without integers; shape (M,).
+    group: Integers  #: Index of channels with one clock and signal; -1 for those without integers; shape (M,).
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phases:
-    """Corrected phases of an antenna beside its `Ranges`: T epochs by M channels."""
+    """Corrected phases of an antenna for its `Ranges`: T epochs by M channels."""
 
     #: Phase times wavelength, corrected like the code (`corrected_phase_m`); any value where the weight is 0; (T, M).
     phase_m: Floats
-    #: 1/sigma^2, 0 for what is not used; else `Ranges.sat_ecef_m` is the satellite; shape (T, M) [1/m^2].
+    #: 1/sigma^2, 0 for unused ones; otherwise `Ranges.sat_ecef_m` is the satellite; shape (T, M) [1/m^2].
     weight: Floats
-    #: The same number along an unbroken stretch of one channel's phase, and nowhere else; shape (T, M).
+    #: Equal within an unbroken stretch of one channel's phase, and different elsewhere; shape (T, M).
     arc_id: Integers
-    integers: IntegerChannels | None = None  #: None leaves all ambiguities real numbers.
+    integers: IntegerChannels | None = None  #: None: all ambiguities are real numbers.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
         """Return the phases of some epochs."""
@@ -74,7 +74,7 @@ def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """Epochs around their places, own unknowns ``x = [along, across, up, clocks]`` (P of them)."""
+    """Linearised epochs, with own unknowns ``x = [along, across, up, clocks]`` (P of them)."""
 
     #: Shape (T, M, P).
     code_design: Floats
@@ -86,20 +86,20 @@ class Linearised:
     #: Observed less computed, less `clock_m`; shape (T, M).
     code_m: Floats
     phase_m: Floats
-    #: First values of the epoch's clocks, taken off codes and phases; shape (T,).
+    #: First values of the epoch's clocks, subtracted from codes and phases; shape (T,).
     clock_m: Floats
     phase_clock_m: Floats
     known: Floats  #: Prior information: errors of the map, ties between clocks; shape (T, P, P).
     inverse: Floats  #: Inverse of the normal matrix of the own unknowns, shape (T, P, P).
     right: Floats  #: Right-hand side of the own unknowns, of the codes until `shift_phases`; shape (T, P).
     coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
-    prior: Floats  #: Of the map's errors, shape (2,) [1/m^2].
+    prior: Floats  #: Information of the map's errors, shape (2,) [1/m^2].
 
 
 def linearise(
     ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats, *, clocks: PhaseClocks = "own"
 ) -> Linearised:
-    """Linearise the observation equations around places on the line, finite, shape (T,) [m]."""
+    """Linearise the observation equations at positions on the line, finite, shape (T,) [m]."""
     section, along = trajectory.segment_at(arc_m)
     place = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
     distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
@@ -164,12 +164,12 @@ def _ties(ties: InterSystemBiases) -> tuple[Floats, Floats]:
 
 
 def own_clock(lin: Linearised) -> bool:
-    """Return whether the phases have a clock of their own."""
+    """Return whether the phases have a separate clock."""
     return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Take first values of the ambiguities (T, M), and what is left in common, off the phases.
+    """Subtract first values of the ambiguities (T, M), and the common remainder, from the phases.
 
     Only then they join the right-hand side: first values of 1e7 m would leave it with rounding errors of millimetres.
     """
@@ -189,8 +189,8 @@ def reduce(lin: Linearised) -> tuple[Floats, Floats]:
     prior this leaves ``prior_k C^T L^-1 e_k`` on the right.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
-    # As a sum of squares of what the own unknowns leave: never negative, and errors of the inverse
-    # enter squared; diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
+    # Computed as a sum of squares of the residuals of the own unknowns: never negative, and errors of the inverse enter
+    # squared; diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
     left = [
         (lin.code_weight, -np.matmul(lin.code_design, gain)),
         (lin.phase_weight, np.eye(gain.shape[2]) - np.matmul(lin.phase_design, gain)),
@@ -209,7 +209,7 @@ def reduce(lin: Linearised) -> tuple[Floats, Floats]:
 class OwnUnknowns:
     """Each epoch's own unknowns, given the ambiguities."""
 
-    step_m: Floats  #: Along the line from the place of linearisation, shape (T,).
+    step_m: Floats  #: Distance along the line from the point of linearisation, shape (T,).
     #: From noise alone, and with the map's error; shape (T,).
     noise_sigma_m: Floats
     sigma_m: Floats
@@ -225,8 +225,8 @@ def own_unknowns(
     """Solve for each epoch's own unknowns by back-substitution.
 
     `ambiguity_m`, shape (T, M, 3), is of each channel, and its response to a map 1 m off across and in height. A map
-    off by the same over a run does not average, so the sigma takes that response in place of an epoch's share.
-    `repeats`, shape (T,): epochs with the same code errors, by which the ambiguities' variance is larger.
+    error that is constant over a run does not average out, so the sigma uses the response to it in place of the single
+    epoch's part. `repeats`, shape (T,): epochs with the same code errors, by which the ambiguities' variance is larger.
     """
     used = lin.phase_weight > 0
     known = np.where(used[..., None], ambiguity_m, 0.0)
@@ -235,7 +235,7 @@ def own_unknowns(
     row = -np.matmul(lin.inverse[:, :1], lin.coupling)[:, 0]
     from_arcs = np.einsum("ti,tij,tj->t", row, covariance_m2, row)
     from_noise = lin.inverse[:, 0, 0] + from_arcs
-    # With the same errors again and again the phases help no more than not at all.
+    # With fully correlated errors the phases do not reduce the sigma.
     by_codes = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
     most = np.maximum(np.linalg.inv(by_codes + lin.known)[:, 0, 0], from_noise)
     from_noise = np.minimum(lin.inverse[:, 0, 0] + repeats * from_arcs, most)

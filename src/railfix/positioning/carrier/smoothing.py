@@ -1,11 +1,11 @@
 """Cycle slips and gaps of the phase, and carrier-smoothed codes (Hatch filter).
 
-The phase's change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, else with
-the change of the code, less the median of the channels, so that a clock step is no slip. A clock step is common to all
-channels of an epoch; codes follow the time tags, so that the true interval is the tags' less the step seen in the
-codes; phases step with the codes or run on, then by whole milliseconds, which `Slips.phase_m` adds.
+The phase's change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or
+without Dopplers with the change of the code, less the median of the channels, so that a clock step is no slip. A clock
+step is common to all channels of an epoch; codes follow the time tags, so that the true interval is the tags' less the
+step seen in the codes; phases step with the codes or run on, then by whole milliseconds, which `Slips.phase_m` adds.
 
-The mean of code less phase over the arc so far, put back on the phase, is a code with less noise. The ionosphere makes
+The mean of code less phase over the arc so far, added to the phase, is a code with less noise. The ionosphere makes
 it drift by twice the change of its delay, which the window limits: at 1 mm/s one of 100 s leaves up to 0.2 m.
 """
 
@@ -29,44 +29,45 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
 #: A common change of the codes from which on the interval is corrected for it [m]; below, it is noise.
 _CLOCK_STEP_M: Final = 1e4
-_COMMON: Final = 3  #: Channels needed for a median to stand for the clock.
+_COMMON: Final = 3  #: Channels required for a median to represent the clock.
 
 
 class SlipReason(IntFlag):
-    """Why the phase of an epoch and channel restarts. 0 = joined to the epoch before."""
+    """Why the phase of an epoch and channel restarts. 0 = joined to the previous epoch."""
 
     JOINED = 0
     NO_PHASE = 1 << 0  #: No phase at this epoch: nothing begins.
-    FIRST = 1 << 1  #: A phase, but none of this channel at the epoch before.
+    FIRST = 1 << 1  #: A phase, but none of this channel at the previous epoch.
     LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator.
-    HALF_CYCLE = 1 << 3  #: Bit 1 of it (half a cycle not resolved) is not what it was at the epoch before.
+    HALF_CYCLE = 1 << 3  #: Its bit 1 (half-cycle ambiguity) differs from the previous epoch.
     GAP = 1 << 4  #: The epoch before is longer ago than the limit.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
-    DOPPLER = 1 << 6  #: The phase's change is not that of the Dopplers.
-    CODE = 1 << 7  #: The phase's change is not that of the code, where Dopplers cannot judge.
+    DOPPLER = 1 << 6  #: The phase's change disagrees with the Dopplers.
+    CODE = 1 << 7  #: The phase's change disagrees with the code, where there are no Dopplers.
 
 
 class CycleSlipLimits(Settings):
     """Limits of the tests, in metres for an interval dt in seconds.
 
-    The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise
-    of the phases, noise of the mean Doppler, and what the trapezoid of the Dopplers misses of a
-    motion with that jerk. One cycle on L1 (0.19 m) is seen up to intervals of about 1 s, two to
-    1.5 s; a test on the track (`continuity.track_jumps`) has no such end.
+    The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise of the phases,
+    noise of the mean Doppler, and the error of the trapezoidal rule for a motion with that jerk. One cycle on L1 (0.19
+    m) is detected up to intervals of about 1 s, two to 1.5 s; a test on the track (`continuity.track_jumps`) has no
+    such limit.
     """
 
-    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is bridged: that of a station's log of 30 s.
+    #: Longest interval that is bridged: the interval of a station's log, 30 s.
+    max_gap_s: float = Field(default=31.0, gt=0)
     #: Limit of the phase against its Doppler, constant and by the interval. On real receivers at 1 Hz the median of the
     #: metric is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
     doppler_mps: float = Field(default=0.05, gt=0)
-    jerk_mps3: float = Field(default=0.5, gt=0)  #: Of the antenna; passenger trains stay below 0.5.
+    jerk_mps3: float = Field(default=0.5, gt=0)  #: Jerk of the antenna; passenger trains stay below 0.5.
     code_m: float = Field(default=10.0, gt=0)  #: Limit of code less phase where Dopplers are absent or less sharp.
 
 
 @dataclass(frozen=True, kw_only=True)
 class CycleSlipState:
-    """The last epoch of a chunk, by channel ("G05", "1C"), and the steps so far."""
+    """The last epoch of a chunk, by channel ("G05", "1C"), and the clock steps so far."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
@@ -82,16 +83,16 @@ class CycleSlipState:
 class Slips:
     """Phases and where their arcs begin, T epochs by M channels."""
 
-    slip: Masks  #: True where there is a phase that may not be joined to the epoch before, shape (T, M).
+    slip: Masks  #: True where there is a phase that may not be joined to the previous epoch, shape (T, M).
     reason: Integers  #: `SlipReason` bits, shape (T, M).
     #: Phase times wavelength on the clock of the codes: whole milliseconds that only the codes stepped are added. NaN
-    #: where there is no phase or its wavelength is unknown; shape (T, M).
+    #: where the phase is missing or its wavelength is unknown; shape (T, M).
     phase_m: Floats
-    #: Metrics of the two tests; NaN where they cannot judge; shape (T, M).
+    #: Metrics of the two tests; NaN where they cannot be used; shape (T, M).
     doppler_metric_m: Floats
     code_metric_m: Floats
     doppler_limit_m: Floats  #: Shape (T,).
-    #: Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen; shape (T,).
+    #: Step of the receiver's clock into the epoch from the codes; 0 where none is detected; shape (T,).
     clock_step_m: Floats
     half_cycle: Masks  #: The receiver reports an unresolved half cycle: harmless to a float ambiguity; shape (T, M).
 
@@ -102,7 +103,7 @@ def median_or_zero(values: Floats) -> Floats:
 
 
 def _before(values: Floats, last: Floats) -> Floats:
-    """Return the values of the epoch before each one; the first comes from the state."""
+    """Return the values of the preceding epoch; for the first epoch from the state."""
     return np.concatenate([last[None], values[:-1]])
 
 
@@ -123,7 +124,7 @@ def find_slips(
     observations : Observations
         T epochs, M channels.
     state : CycleSlipState, optional
-        Left by the chunk before; None at the start of a log.
+        Left by the previous chunk; None at the start of a log.
     frequency_hz : ndarray, shape (M,), optional [Hz]
         Carrier of each channel; by default from the log's header alone, where GLONASS may lack its
         channels.
@@ -195,8 +196,8 @@ def slip_metrics(
 ) -> tuple[Floats, Integers, Floats, Floats]:
     """Compute the clock step of the codes [m], its whole milliseconds that phases lack, and the metrics of both tests.
 
-    `dt`, shape (T,), is the time since the epoch before; `code_m` and `phase_m`, shape (T, M), are changes since then,
-    `range_mps` the range rate by the Dopplers.
+    `dt`, shape (T,), is the time since the previous epoch; `code_m` and `phase_m`, shape (T, M), are changes since
+    then, `range_mps` the range rate by the Dopplers.
     """
     moved = np.where(np.isnan(range_mps), 0.0, range_mps) * dt[:, None]
     step = median_or_zero(code_m - moved)
@@ -213,7 +214,7 @@ def linear_recursion(gain: Floats, drive: Floats) -> Floats:
 
     Pairs (gain, drive) are composed over strides of 1, 2, 4, ...; gains in [0, 1] are stable.
     """
-    total, factor = drive.copy(), gain.copy()  # gains may have fewer elements, those of `drive` broadcast
+    total, factor = drive.copy(), gain.copy()  # gains may have fewer elements, `drive` is broadcast
     stride = 1
     while stride < len(total):
         total[stride:] = total[stride:] + factor[stride:] * total[:-stride]
@@ -248,18 +249,18 @@ class SmoothingState:
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: Last code less phase, for `clocks="own"`; shape (M,).
     last_m: Floats = field(default_factory=lambda: np.empty(0))
-    clock_m: float = 0.0  #: Mean change of the codes against the phases so far.
+    clock_m: float = 0.0  #: Mean change of the codes relative to the phases so far.
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
-    """Return values at the marked epochs held until the next mark, `first` before any; shapes (T, M) and (M,)."""
+    """Return values at the marked epochs, constant until the next mark, `first` before any; shapes (T, M) and (M,)."""
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
     return np.asarray(np.take_along_axis(np.concatenate([first[None], values]), rows, axis=0))
 
 
 def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
-    """Return the mean change of code less phase over the channels that run on, 0 where there is none; shape (T,)."""
+    """Return the mean change of code less phase over the continuing channels, 0 without any; shape (T,)."""
     change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
     number = np.isfinite(change).sum(axis=1)
     return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))
@@ -296,8 +297,8 @@ def smooth_codes(
     Returns
     -------
     ndarray, shape (T, M) [m]
-        Smoothed codes: the raw code where there is no phase, and at the first epoch of an arc; NaN where there is no
-        code, unless the arc of its phase continues: then the smoothed code continues.
+        Smoothed codes: the raw code where there is no phase, and at the first epoch of an arc; NaN where the code is
+        missing, unless the arc of its phase continues: then the smoothed code continues.
     SmoothingState
         Division into chunks does not change the result beyond rounding (1e-9 m).
     """

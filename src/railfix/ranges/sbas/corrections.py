@@ -1,4 +1,4 @@
-"""Corrections of satellites at any epochs from the messages of one GEO (DO-229D, A.4.4 and A.4.5)."""
+"""Corrections of satellites at any epochs from one GEO's messages (DO-229D, A.4.4 and A.4.5)."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
     """Return the PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
 
-    The choice looks at all messages: make it on recorded messages before the positioning begins. What is
-    received while a train runs cannot be judged in advance; there the PRN is given.
+    The choice uses all messages: make it on recorded messages before the positioning begins. Live messages cannot
+    be judged in advance; there the PRN is given.
     """
     limits, scores = limits or SbasLimits(), []
     for number in messages.prns:
@@ -70,9 +70,9 @@ def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[
 class SbasCorrections:
     """Corrections by one GEO's messages at any epochs; the tables are built once, then searched.
 
-    A message counts from the moment it had been received (`SbasMessages.time`), never before. Nothing depends on the
-    other epochs or satellites of a call, nor on messages received later. Messages of other PRNs than `prn`, which is
-    chosen beforehand (`best_prn`), are left out; `notes` on their origin are put before those of the corrections.
+    A message counts from the moment it had been received (`SbasMessages.time`), never before. Results are independent
+    of the other epochs or satellites of a call, and of messages received later. Messages of other PRNs than `prn`,
+    which is chosen beforehand (`best_prn`), are left out; `notes` on their origin precede those of the corrections.
     """
 
     def __init__(
@@ -92,15 +92,15 @@ class SbasCorrections:
         self.unused: Mapping[str, int] = {
             kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
-        #: Corrections asked for and used, one sentence each; of a whole log (`from_log`) also what of it is not used.
+        #: Corrections requested and used, one sentence each; for a whole log (`from_log`) also its unused messages.
         self.notes: tuple[str, ...] = (*notes, self._settings_note())
 
     @classmethod
     def from_log(
         cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best", limits: SbasLimits | None = None
     ) -> SbasCorrections:
-        """Corrections from recorded messages, of the PRN asked for or of `best_prn`; ValueError: there is no message of
-        it.
+        """Corrections from recorded messages of the requested PRN or of `best_prn`; ValueError: no message of that PRN
+        exists.
         """
         prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.describe_choice(prn))
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
@@ -117,7 +117,7 @@ class SbasCorrections:
         )
 
     def _leave_out(self, messages: SbasMessages) -> list[str]:
-        """Return the notes on what of a whole log is not used."""
+        """Return notes on the unused messages of a whole log."""
         notes = []
         zeros = int((messages.type == 0).sum())
         if zeros:
@@ -132,8 +132,8 @@ class SbasCorrections:
         """Return the fast and long-term corrections of T epochs by K satellites; those that the mask does not know are
         NOT_IN_MASK.
 
-        A long-term correction is taken only if a record of `navigation` has its issue of data; the one before it, of
-        another issue, is tried next. Without navigation data the newest is taken as it is.
+        A long-term correction is applied only if a record of `navigation` has its issue of data; otherwise the previous
+        correction, of another issue, is tried. Without navigation data the newest correction is applied unchecked.
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]
@@ -173,7 +173,7 @@ class SbasCorrections:
         inflated: Masks,
         covariance: Integers,
     ) -> SatelliteCorrections:
-        """Put the parts together; NaN where the state is not OK."""
+        """Combine the parts; NaN where the state is not OK."""
         used = state == SatelliteState.OK
         table = self._tables.long_term
         has = used & (long.row >= 0)
@@ -220,7 +220,8 @@ class SbasCorrections:
         latitude_deg: Floats,
         longitude_deg: Floats,
     ) -> Floats:
-        """Factor on sigma UDRE at a place, from the service region (type 27) or the covariance (type 28), shape (T, K).
+        """Factor on sigma UDRE at a position, from the service region (type 27) or the covariance (type 28), shape (T,
+        K).
 
         `corrections` are of these epochs, `line_of_sight`, shape (T, K, 3), unit vectors to the satellites in the
         Earth-fixed frame, coordinates of the receiver (T,). 1 where the GEO sends neither; NaN where the service
@@ -234,7 +235,7 @@ class SbasCorrections:
     def ionosphere(
         self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> IonosphereDelays:
-        """Slant delays on L1 from the grid at T places, shape (T,), towards K satellites, angles of shape (T, K)."""
+        """Slant delays on L1 from the grid at T positions, shape (T,), towards K satellites, angles of shape (T, K)."""
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
         )
@@ -242,7 +243,7 @@ class SbasCorrections:
 
 @dataclass(frozen=True, kw_only=True)
 class SbasState:
-    """Messages of one GEO received so far: a value that new messages are added to as they arrive.
+    """Messages of one GEO received so far; an immutable value, to which new messages are added as they arrive.
 
     Corrections at an epoch are the same as from the whole log, however it was cut: a message counts from its
     reception on, and `drop_before` drops only messages that no later epoch can use.
@@ -257,7 +258,8 @@ class SbasState:
 
     prn: int  #: Chosen beforehand: which GEO is best is known only after all messages were received.
     limits: SbasLimits = field(default_factory=SbasLimits)
-    messages: SbasMessages = field(default_factory=SbasMessages.none)  #: Of that PRN, in the order of reception.
+    #: Messages of that PRN, in the order of reception.
+    messages: SbasMessages = field(default_factory=SbasMessages.none)
     band: Band = "L1"  #: Frequency of the messages.
 
     def add_messages(self, messages: SbasMessages) -> SbasState:

@@ -1,6 +1,6 @@
 """SBAS messages decoded by tables of bit fields (RTCA DO-229D, A.4.4), in SI units; nothing is applied here.
 
-Every decoder returns arrays by name, all with n rows, among them `row`: the row of the messages that each comes from.
+Every decoder returns arrays by name, all with n rows, among them `row`: the message that each row comes from.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class BitField(NamedTuple):
 
     first: int
     length: int
-    #: Unit of the number; None leaves an integer.
+    #: Unit of the number; None: an integer.
     scale: float | None = None
     signed: bool = False
     number: int | None = None
@@ -186,14 +186,14 @@ def decode(messages: SbasMessages, kind: int) -> Decoded:
 
 
 def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
-    """Return the instants with a time of day that lie nearest to other instants; NaT where it is NaN."""
+    """Return the instants with a given time of day that are nearest to other instants; NaT where it is NaN."""
     midnight = near.astype("datetime64[D]").astype("datetime64[ns]")
     offset = time_of_day_s - seconds(near - midnight)
     return np.asarray(near + timedelta(offset - SECONDS_PER_DAY * np.rint(offset / SECONDS_PER_DAY)), "datetime64[ns]")
 
 
 def prn_masks(messages: SbasMessages) -> Decoded:
-    """Type 1: `iodp` (n,), and `number` (n, 51), the number of the PRN mask by slot, 0 where there is none."""
+    """Type 1: `iodp` (n,), and `number` (n, 51), the number in the PRN mask by slot, 0 where empty."""
     decoded = decode(messages, 1)
     message, bit = np.nonzero(decoded.pop("member"))
     slot = np.arange(len(message)) - np.searchsorted(message, message)
@@ -234,7 +234,7 @@ def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
 
 
 def _join(parts: Sequence[Decoded]) -> Decoded:
-    """Return the rows of several decoders in the order of the messages, without those of empty slots."""
+    """Return the rows of several decoders in the order of the messages, without empty slots."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     kept = np.flatnonzero((joined["slot"] >= 0) & (joined["slot"] < SLOTS))
     order = kept[np.argsort(joined["row"][kept], kind="stable")]
@@ -242,7 +242,7 @@ def _join(parts: Sequence[Decoded]) -> Decoded:
 
 
 def long_term(messages: SbasMessages) -> Decoded:
-    """Return both halves of type 25 and that of type 24, one row a satellite; `reference` is NaT without velocity."""
+    """Return both halves of type 25 and that of type 24, one row per satellite; `reference` is NaT without velocity."""
     parts: list[Decoded] = []
     for kind, start in ((25, 14), (25, 120), (24, 120)):
         row = find_rows(messages, kind)

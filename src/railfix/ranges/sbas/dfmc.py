@@ -7,17 +7,16 @@ of B1C and B2a, less the group delays of B-CNAV1. GLONASS has slots, but is corr
 read.
 
 The standard was not at hand. Layouts are those of cssrlib (sbas.py), least values and degradation those of MAAST
-(L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots those of both and of Wireshark (packet-sbas_l5.c). By an
-hour of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) slot and share of the rate have 8 and 4 bits, as in cssrlib, and the
-issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group delays differ by
-metres: they are not in its corrections.
+(L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), slots those of both and of Wireshark (packet-sbas_l5.c). An hour
+of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that slot and fraction of the rate have 8 and 4 bits, as in cssrlib,
+and that the issue of BeiDou is the IODE of B-CNAV1. BDSBAS corrects clocks of BeiDou-3 by decimetres, where group
+delays differ by metres: they are not in its corrections.
 
 Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), serve a note alone.
 Layouts and scales are those that cssrlib and MAAST (L5_decodeMT39.m, 40, 47) share. Messages of SouthPAN of three days
-(`test_sbas_orbits.py`) settle what they do not: the semi-major axis is counted from 6370 km, and the node from the
-meridian of Greenwich at midnight of GPS time. Open: a step of the inclination rate is 7 pi / 6 or 7 pi times 2^-21 1e-6
-rad/s; SouthPAN sends 0, and an orbit with another rate has no position here. BDSBAS has a layout of its own and is left
-out.
+(`test_sbas_orbits.py`) determine the rest: the semi-major axis is counted from 6370 km, and the node from the meridian
+of Greenwich at midnight of GPS time. Open: a step of the inclination rate is 7 pi / 6 or 7 pi times 2^-21 1e-6 rad/s;
+SouthPAN sends 0, and an orbit with another rate has no position here. BDSBAS has a different layout and is left out.
 """
 
 from __future__ import annotations
@@ -41,14 +40,14 @@ from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import first_that_holds, system_name
 
 AUGMENTED: Final = 92  #: Satellites of one mask.
-FIRST: Final = 53  #: Of which type 35 has the first ones, type 36 the others.
+FIRST: Final = 53  #: The first ones are in type 35, the others in type 36.
 DO_NOT_USE: Final = 15  #: Indicators without a sigma: not monitored is left out of type 32, 15 is do not use.
 #: Sigma by indicator 0 to 14: least value and step [m].
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 10.0)
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
 _ONE_MORE: Final = -2
 _DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations of type 37 in order.
-#: A mask, and an indicator, is valid for so long [s]; type 0 stops the sender for so long.
+#: Validity of a mask, and of an indicator [s]; type 0 stops the use of its sender for the last value.
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
 #: Time, covariance and indicator, where types 32 and 40 have them.
@@ -150,7 +149,7 @@ def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
 
 
 class DfmcService:
-    """Corrections by the L5 messages of one SBAS satellite at any epochs; a message counts from its reception on.
+    """Corrections by the L5 messages of one SBAS satellite at any epochs; a message is used from its reception on.
 
     Messages of other PRNs are left out; `notes` on their origin are put before those of the corrections.
     """
@@ -173,9 +172,10 @@ class DfmcService:
 
     @classmethod
     def from_log(cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best") -> DfmcService:
-        """Return the corrections of recorded messages, of the PRN asked for or of that with the most of type 32.
+        """Return the corrections of recorded messages, of the requested PRN or of the PRN with the most messages of
+        type 32.
 
-        ValueError: there is no message of that PRN.
+        ValueError: no message of that PRN exists.
         """
         if prn == "best":
             numbers, count = np.unique(messages.prn[messages.type == 32], return_counts=True)
@@ -191,7 +191,7 @@ class DfmcService:
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
         """Return the corrections of K satellites at T epochs.
 
-        With navigation data a correction is used only if a record has its issue of data; without, as it is.
+        With navigation data a correction is applied only if a record has its issue of data; otherwise unchecked.
         """
         shape = (len(time), len(satellite))
         names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
@@ -268,7 +268,7 @@ class DfmcService:
         return (mask >= 0) & (member[:, slot - 1] == 1), member[:, : slot - 1].sum(axis=1)
 
     def _all_indicators(self) -> tuple[Datetimes, Integers, Integers]:
-        """Times, issue of the mask and indicators of all satellites of types 34 to 36; -1 where one says nothing.
+        """Times, issue of the mask and indicators of all satellites of types 34 to 36; -1 where not transmitted.
 
         Type 34: 0 nothing new, 1 an indicator of its own, 2 one more than before (`_ONE_MORE`), 3 do not use.
         """
@@ -363,8 +363,8 @@ _ALMANACS_AT: Final = (10, 116)  #: First bits of the two satellites of type 47.
 class SbasOrbits:
     """Orbits of SBAS satellites, n rows."""
 
-    row: Integers  #: Of the last message of each, shape (n,).
-    prn: Integers  #: Of the satellite, as the message has it; shape (n,).
+    row: Integers  #: Time of the last message of each, shape (n,).
+    prn: Integers  #: Issue of data of the satellite, as in the message; shape (n,).
     provider: Integers  #: Number of the service, 8 for SouthPAN; shape (n,).
     reference: Datetimes  #: Shape (n,).
     orbits: Orbits
@@ -386,7 +386,7 @@ class SbasOrbits:
 
 
 def ephemerides(messages: SbasMessages, valid_s: float) -> SbasOrbits:
-    """Return the ephemerides that messages of one sender make: types 39 and 40 of one issue within `valid_s`."""
+    """Return the ephemerides in messages of one sender: types 39 and 40 of one issue within `valid_s`."""
     rows = {kind: np.flatnonzero(messages.type == kind) for kind in (39, 40)}
     sent = {kind: read_fields(messages.bits[at], _ORBIT_LAYOUTS[kind]) for kind, at in rows.items()}
     newest: dict[tuple[int, int], int] = {}
@@ -412,7 +412,7 @@ def almanacs(messages: SbasMessages) -> SbasOrbits:
 
 
 def _orbits(messages: SbasMessages, row: Integers, sent: Decoded) -> SbasOrbits:
-    """Return decoded orbits in the order of their messages, without empty ones and those of BDSBAS."""
+    """Return decoded orbits in the order of their messages, without empty ones and without BDSBAS."""
     order = np.argsort(row, kind="stable")
     order = order[(sent["number"][order] > 0) & (sent["provider"][order] != _BDSBAS)]
     row, sent = row[order], {name: values[order] for name, values in sent.items()}

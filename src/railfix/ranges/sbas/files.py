@@ -206,17 +206,17 @@ def read_sbas(
         RXM-SFRBX of SBAS, SBF with GEORawL1 or GEORawL5), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
         A line that is no message stops the reading, or is counted under "line" in `rejected` and
-        named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
-        left out and counted in either case.
+        named in `notes`. A message with a wrong parity or preamble was damaged: it is left out and counted in either
+        case.
 
     band : {"L1", "L5"}
-        Frequency of the messages; those of the other have another preamble, and are left out as such.
+        Frequency of the messages; messages of the other band have another preamble, and are left out for that reason.
 
     Returns
     -------
     SbasMessages
-        In the order of reception. Times of RTKLIB and EMS files are taken as the ends of the
-        messages, those of RINEX, which are of the first bit, become so by adding 1 s.
+        In the order of reception. Times of RTKLIB and EMS files are used as the ends of the messages; times of RINEX,
+        which are of the first bit, are increased by 1 s.
 
     Raises
     ------

@@ -85,7 +85,7 @@ POINT_OF_BIT, CELLS_OF_POINT = _layout()
 
 
 class GridTables:
-    """Masks and delays of the grid by point and time, the spans in which it does not change, and what no mask fits.
+    """Masks and delays of the grid by point and time, the spans in which it is constant, and delays that match no mask.
 
     `delays`: by grid point the vertical `delay_m`, NaN for do not use; `givei`; `issue` of the mask (4 band + IODI).
     """
@@ -157,10 +157,10 @@ def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indi
 
     Points are from -1 to below `points`.
     """
-    # Runs of one span have one number; that a span has two where it comes twice does no harm.
+    # Runs of one span have one number; a span that occurs twice may have two numbers.
     key = np.cumsum(np.r_[False, span[1:] != span[:-1]])[: len(span)].astype(np.int64)
     pairs = (point[:, ::2] + 1) * (points + 1) + point[:, 1::2] + 1
-    # Numbered again half-way, so that the keys stay small however long the log is.
+    # Renumbered half-way, so that the keys stay small for logs of any length.
     _, key = np.unique(key * (points + 1) ** 2 + pairs[:, 0], return_inverse=True)
     _, first, which = np.unique(key * (points + 1) ** 2 + pairs[:, 1], return_index=True, return_inverse=True)
     return first, which
@@ -243,7 +243,7 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return the corner points (M, 4), -1 where not used, and the place in the cell (M,), (M,) below 75 degrees."""
+    """Return the corner points (M, 4), -1 where not used, and the position in the cell (M,), (M,) below 75 degrees."""
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
@@ -378,7 +378,9 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Return the weights of the corners (M, 4), and where they do: four good ones, or three around the place."""
+    """Return the weights of the corners (M, 4), and where they are valid: four good corners, or three around the
+    position.
+    """
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)

@@ -12,13 +12,13 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, freeze_rows, join_rows
 from railfix.io.receiver.framing import crc24q
 
-Band = Literal["L1", "L5"]  #: Frequency that messages are sent on, and corrections made for.
+Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections.
 #: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.
 PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
-#: Preamble, type and data; bytes a message takes in `SbasMessages.bits`.
+#: Preamble, type and data; bytes of a message in `SbasMessages.bits`.
 DATA_BITS: Final = 226
 ROW_BYTES: Final = 32
-#: The same message twice within this time was passed on by two receivers.
+#: The same message twice within this time was forwarded by two receivers.
 _REPEATED_WITHIN: Final = np.timedelta64(1, "s")
 
 
@@ -51,7 +51,7 @@ def with_parity(bits: Bytes) -> Bytes:
 
 
 def preamble_number(bits: Bytes, band: Band) -> Integers:
-    """Place of each preamble among those in turn, -1 for anything else, shape (N,)."""
+    """Index of each preamble in the cycle of three, -1 for anything else, shape (N,)."""
     number = np.full(len(bits), -1, dtype=np.int64)
     first = bits[:, 0] if band == "L1" else bits[:, 0] >> 4
     for i, preamble in enumerate(PREAMBLES[band]):
@@ -97,7 +97,7 @@ class SbasMessages(RowArrays):
         return tuple(int(prn) for prn in np.unique(self.prn))
 
     def describe_choice(self, prn: int) -> str:
-        """Return a sentence on a PRN that was asked for; ValueError where none of the messages is of it."""
+        """Return a sentence on a requested PRN; ValueError where none of the messages is of it."""
         known = ", ".join(map(str, self.prns))
         if prn not in self.prns:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
@@ -133,7 +133,7 @@ class SbasMessages(RowArrays):
         return joined.take(np.argsort(both.time, kind="stable"))
 
     def repeated(self) -> Masks:
-        """Return messages that another receiver has passed on before: the same bits of one PRN within 1 s, shape (N,).
+        """Return messages that another receiver has forwarded before: the same bits of one PRN within 1 s, shape (N,).
 
         The preambles of messages that follow each other differ, so that no GEO sends the same 250 bits twice in a row.
         """

@@ -17,7 +17,8 @@ from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S, SERVICE_FACTOR, TIMEOUT_S, SbasLimits
 from railfix.ranges.sbas.tables import ALARM, SatelliteTables, Series
 
-#: A rate may carry a fast correction this many times the time between the two it was made of.
+#: A rate may be applied to a fast correction for this multiple of the time between the two corrections it was computed
+#: from.
 _RATE_REACH: Final = 8.0
 _ACCELERATION: Final = np.array(FAST_DEGRADATION_MPS2)
 _FACTOR: Final = np.array(SERVICE_FACTOR)
@@ -27,7 +28,7 @@ _FACTOR: Final = np.array(SERVICE_FACTOR)
 class FastInForce:
     """Fast corrections in force, all (T, K)."""
 
-    #: No fast correction; too old, or of a mask no longer in force; no type 7; a rate is needed and not available.
+    #: No fast correction; too old, or of an inactive mask; no type 7; a rate is needed and not available.
     missing: Masks
     timed_out: Masks
     no_factor: Masks
@@ -35,9 +36,9 @@ class FastInForce:
     udrei: Integers  #: -1 without one.
     correction_m: Floats
     rate_mps: Floats
-    growth_m: Floats  #: Of the fast correction (A.4.5.1.1).
-    #: a Ifc / 4, or its replacement after an alarm, and the time between the two corrections; 0 and infinite where the
-    #: rate does not degrade (A.4.5.1.2).
+    #: Age of the fast correction (A.4.5.1.1). a Ifc / 4, or its replacement after an alarm, and the time between the
+    #: two corrections; 0 and infinite where the rate does not degrade (A.4.5.1.2).
+    growth_m: Floats
     rate_growth_mps: Floats
     rate_span_s: Floats
     since_s: Floats  #: Since the time of applicability.
@@ -100,9 +101,9 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return the range-rate correction, degradation per second, time between its corrections, and where there is none.
+    """Return the range-rate correction, degradation per second, time between its corrections, and where it is missing.
 
-    After an alarm (IODF 3) the earlier of the two is the one nearest to half the time-out before.
+    After an alarm (IODF 3) the earlier of the two is the correction nearest to half the time-out before.
     """
     zero = np.zeros(row.shape)
     if limits.range_rate == "off":
@@ -136,7 +137,7 @@ def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> In
 
 @dataclass(frozen=True, kw_only=True)
 class LongTermInForce:
-    """Long-term corrections in force, all (T, K): row of the table, of the record; why there is none."""
+    """Active long-term corrections, all (T, K): row in the table, row of the record; reason where missing."""
 
     row: Integers
     record: Integers
@@ -156,7 +157,7 @@ def long_term_in_force(
 ) -> LongTermInForce:
     """Find the newest long-term corrections whose issue of data a record has; satellites of SBAS itself need none.
 
-    `number`, shape (K,), is that of the PRN mask. Without `navigation` the newest correction is taken as it is.
+    `number`, shape (K,), is the number in the PRN mask. Without `navigation` the newest correction is used unchecked.
     """
     table, limit = tables.long_term, limits.timeout_s("long_term")
     newest = table.newest(number[None, :], time[:, None])
@@ -276,7 +277,7 @@ def delta_udre_covariance(tables: SatelliteTables, time: Datetimes, row: Integer
 
 
 class ServiceTable:
-    """Messages of type 27 of one GEO: the regions where sigma UDRE holds (A.4.4.13)."""
+    """Messages of type 27 of one GEO: the regions in which sigma UDRE is valid (A.4.4.13)."""
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits) -> None:
         self.values: Decoded = service(messages)
@@ -285,9 +286,10 @@ class ServiceTable:
         self._reject = limits.incomplete == "reject"
 
     def factor(self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Masks]:
-        """Return the factor on sigma UDRE at places, NaN without type 27, and where a set is incomplete, shapes (T,).
+        """Return the factor on sigma UDRE at positions, NaN without type 27, and where a set is incomplete, shapes
+        (T,).
 
-        The newest complete set of one issue counts; inside several regions the highest priority, of equal ones the
+        The newest complete set of one issue is used; inside several regions the highest priority, of equal ones the
         smallest factor; outside all, the factor outside.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
@@ -327,7 +329,9 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return whether places lie in a region: the rectangle of two corners, or its half at (latitude 1, longitude 2)."""
+    """Return whether positions lie in a region: the rectangle of two corners, or its half at (latitude 1,
+    longitude 2).
+    """
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

@@ -63,7 +63,7 @@ TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
     "service": (86_400.0, 86_400.0),
     "covariance": (240.0, 360.0),
 }
-#: The same for fast corrections by degradation indicator ai (DO-229D, table A-8).
+#: Time-outs of fast corrections by degradation indicator ai (DO-229D, table A-8).
 FAST_TIMEOUT_S: Final[dict[str, tuple[float, ...]]] = {
     "precision": (120, 120, 102, 90, 90, 78, 66, 54, 42, 30, 30, 18, 18, 18, 12, 12),
     "en_route": (180, 180, 153, 135, 135, 117, 99, 81, 63, 45, 45, 27, 27, 27, 18, 18),
@@ -88,7 +88,7 @@ SERVICE_FACTOR: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 #: UDREI from which a satellite is not monitored, and must not be used.
 NOT_MONITORED: Final = 14
 DO_NOT_USE: Final = 15
-STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for so long [s] (DO-229D, A.4.4.1).
+STOP_S: Final = 60.0  #: A message of type 0 stops the use of its sender for this time [s] (DO-229D, A.4.4.1).
 #: No message older than this counts, however long type 6 renews a fast correction: the longest time-out but for regions
 #: of service [s].
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
@@ -100,7 +100,7 @@ INFLATION_M: Final = 8.0  #: Added to sigma UDRE where degradation data are miss
 class SbasLimits(Settings):
     """How SBAS messages are used."""
 
-    #: Time-outs: those of precision approach (shorter, the default), or of en route to non-precision approach.
+    #: Time-outs: for precision approach (shorter, the default), or for en route to non-precision approach.
     mode: Literal["precision", "en_route"] = "precision"
     type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops its sender for 60 s, or has fast corrections.
     range_rate: Literal["mops", "off"] = "mops"  #: Fast corrections change with their rate (DO-229D, A.4.4.3).
@@ -123,11 +123,11 @@ class SbasLimits(Settings):
 
 
 class SatelliteState(IntEnum):
-    """Whether a satellite may be used, and why not; the first that holds of those listed."""
+    """Whether a satellite may be used; the first reason that applies, in this order."""
 
     OK = 0
     GEO_STOPPED = 1  #: Type 0 was received within the last 60 s.
-    NO_MASK = 2  #: There is no PRN mask, or it timed out.
+    NO_MASK = 2  #: The PRN mask is missing or has timed out.
     NOT_IN_MASK = 3
     NO_FAST = 4
     DO_NOT_USE = 5  #: UDREI 15.
@@ -153,7 +153,7 @@ class IonosphereState(IntEnum):
 
 
 def first_that_holds(cases: Sequence[tuple[Masks | np.bool_, int]], otherwise: int) -> Integers:
-    """Return the value of the first condition that holds, any shape."""
+    """Return the value of the first condition that is true, any shape."""
     conditions, values = zip(*cases, strict=True)
     return np.asarray(np.select(conditions, values, otherwise), dtype=np.int64)
 
@@ -204,7 +204,9 @@ class IonosphereDelays(FrozenArrays):
     """Delays of T epochs by K satellites from the grid."""
 
     state: Integers  #: `IonosphereState`, shape (T, K).
-    delay_m: Floats  #: Slant delay on L1, to be taken off the code; other carriers scale by (f1/f)^2; shape (T, K).
+    delay_m: (
+        Floats  #: Slant delay on L1, to be subtracted from the code; other carriers scale by (f1/f)^2; shape (T, K).
+    )
     sigma_uire_m: Floats  #: Shape (T, K).
     #: Pierce point, shape (T, K).
     latitude_deg: Floats

@@ -39,7 +39,7 @@ _NO_SERIES: Final = 2**19  #: Series of the placeholder row of an empty table, w
 class Series:
     """Rows of many series (satellites, grid points ...) sorted by series and time of reception.
 
-    An empty table holds one row that is never used, so that `columns` can be indexed with -1. A row's time is rounded
+    An empty table has one row that is never used, so that `columns` can be indexed with -1. A row's time is rounded
     up to the millisecond, an instant's down: no row is used before it was received.
     """
 
@@ -63,7 +63,7 @@ class Series:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no row."""
+        """Whether the table is empty."""
         return bool(self.series[0] == _NO_SERIES)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -176,7 +176,7 @@ class SatelliteTables:
         self.degradation = Series.of(np.zeros(len(row), dtype=np.int64), messages.time[row], ten)
 
     def _by_satellite(self, kind: str, messages: SbasMessages, decoded: Decoded) -> Series:
-        """Return the rows of satellites that an active mask names; the others are counted."""
+        """Return the rows of satellites in an active mask; the others are counted."""
         time = messages.time[decoded["row"]]
         number = self.masks.resolve(decoded["iodp"], decoded["slot"], time)
         self.unused[f"{kind} without a mask of their IODP"] += int((number < 0).sum())
@@ -203,7 +203,7 @@ class SatelliteTables:
         )
 
     def _fast_degradation(self, messages: SbasMessages) -> Series:
-        """Type 7, one row a satellite."""
+        """Type 7, one row per satellite."""
         seven = decode(messages, 7)
         count = len(seven["row"])
         rows = {name: np.repeat(seven[name], SLOTS) for name in ("row", "iodp", "latency_s")}
@@ -224,7 +224,7 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """Add the row where each series begins: the first of its satellite, or one after a row that was not monitored."""
+    """Add the row where each series begins: the first of its satellite, or one after per row that was not monitored."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))

@@ -1,8 +1,8 @@
 """Pictures, of numbers in tables and arrays.
 
-Each picture comes twice: the function that makes a `Chart` (`error_over_time`), and the one that draws it with
-matplotlib (`plot_error_over_time`): into the axes that are given as `ax`, or into a new figure, as pandas does. Both
-return the axes. The report of `railfix.report` shows the same charts.
+Each chart has two functions: one makes a `Chart` (`error_over_time`), the other draws it with matplotlib
+(`plot_error_over_time`), into the axes given as `ax` or into a new figure, like pandas. Both return the axes. The
+report of `railfix.report` shows the same charts.
 
 matplotlib is imported when a picture is drawn, never with the package.
 """

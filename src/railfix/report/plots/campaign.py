@@ -1,4 +1,4 @@
-"""Charts of whole runs: those of a campaign, the time that a run took, where satellites can serve on a line."""
+"""Charts of whole runs: of a campaign, of processing time, of satellite service along a line."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.axes import Axes
 
-#: Quantities by their column: what the legend says, limits of the classes [m], and the colour of bars.
+#: Quantities by their column: text of the legend, limits of the classes [m], and the colour of bars.
 _QUANTITIES = {
     "error_m": ("error", ERROR_CLASSES, CONSTRAINED),
     "protection_level_m": ("level", LEVEL_CLASSES, FILTERED),
@@ -40,7 +40,7 @@ _QUANTITIES = {
 
 
 def campaign_plan(places: pl.DataFrame, quantity: str) -> Chart:
-    """Plan of the places (``x_m``, ``y_m``, ``z_m``) of all runs, coloured by a quantity, the largest last."""
+    """Plan of the positions (``x_m``, ``y_m``, ``z_m``) of all runs, coloured by a quantity, the largest last."""
     named, edges, _ = _QUANTITIES[quantity]
     placed = points(places, *ECEF)
     rows = np.isfinite(placed[:, 0])
@@ -104,7 +104,7 @@ _GREEN: Final = "#2e7d32"
 
 
 def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str, limit_m: float) -> None:
-    """Draw satellites, reflections, shares and levels of `compute_service` by chainage."""
+    """Draw satellites, reflections, fractions and levels of `compute_service` by chainage."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 10), layout="constrained")
@@ -131,7 +131,7 @@ def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str
 
 
 def _steps(axes: Axes, service: pl.DataFrame, columns: dict[str, tuple[str, str]]) -> None:
-    """Draw columns as constant by stretch; a gap where there is no number."""
+    """Draw columns as constant by stretch, with gaps where values are missing."""
     begin, end = service["from_m"].to_numpy(), service["to_m"].to_numpy()
     for name, (label, colour) in columns.items():
         value = service[name].cast(float).fill_null(float("nan")).to_numpy()

@@ -133,7 +133,7 @@ class Marks(_Layer):
     x: Floats
     y: Floats
     words: tuple[str, ...]  #: Lines separated by line feeds.
-    place: Literal["beside", "on"] = "beside"  #: Beside a cross at the point, or centred on it without a cross.
+    place: Literal["beside", "on"] = "beside"  #: Text beside a cross at the point, or centred on it without a cross.
 
 
 Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
@@ -194,7 +194,7 @@ class SkyEpochs:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no satellite."""
+        """Whether it has no satellites."""
         return not len(self.satellite)
 
 
@@ -217,7 +217,7 @@ __all__ = ["find_start", "floats", "nice_step", "points", "since", "words"]
 
 
 def points(table: pl.DataFrame, *names: str) -> Floats:
-    """Return columns side by side, shape (rows, columns)."""
+    """Return columns adjacent, shape (rows, columns)."""
     return np.stack([floats(table, name) for name in names], axis=1)
 
 

@@ -103,7 +103,7 @@ def new_axes(size: tuple[float, float], **axes: Any) -> Axes:
 
 
 def draw_sky(sky: SkyEpochs, time: np.datetime64, *, ax: Axes | None = None) -> Axes:
-    """Draw the satellites at the epoch nearest to a GPS time into polar axes; ValueError: there is no epoch."""
+    """Draw the satellites at the epoch nearest to a GPS time into polar axes; ValueError: no epoch exists."""
     if sky.empty:
         raise ValueError("there are no satellites to draw")
     polar: Any = new_axes((6.0, 6.0), projection="polar") if ax is None else ax

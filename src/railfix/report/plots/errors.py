@@ -1,6 +1,6 @@
 """Charts of errors, and of errors against their protection levels.
 
-The tables have one row per epoch of one antenna, as `railfix.evaluate.Evaluation.epochs` has them:
+The tables have one row per epoch of one antenna, as in `railfix.evaluate.Evaluation.epochs`:
 ``time_gpst``, ``chainage_m`` (of the reference), ``error_m`` and ``conventional_error_m`` (+ toward the end of the
 line), and optionally ``along_sigma_m``, ``reference_good`` and columns of protection levels.
 """
@@ -224,14 +224,14 @@ def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
 #: Parts of the level, and the level itself.
 _PARTS: Final = (
     ("fault-free part", "protection_fault_free_m"),
-    ("part of one fault", "protection_one_fault_m"),
+    ("one-fault part", "protection_one_fault_m"),
     ("part of two faults", "protection_two_faults_m"),
     ("RAIM's level", "raim_level_m"),
     ("level", "protection_level_m"),
 )
 
 
-#: Regions with the words that stand in the picture, and where: from 0 to the alarm limit, and on to the end (1 to 2).
+#: Regions with their labels and extents: from 0 to the alarm limit, and on to the end (1 to 2).
 _REGIONS: Final = (
     (Region.NOMINAL, "nominal", 0.35, 0.78),
     (Region.MISLEADING, "misleading", 0.7, 0.24),
@@ -244,7 +244,7 @@ _REGIONS: Final = (
 def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
     """Protection level over the size of the error, counted in cells, with the epochs of each region written into it.
 
-    Values beyond the axes stand in their last cells. The darkness of a cell grows with the logarithm of its epochs.
+    Values beyond the axes are counted in the last cells. The darkness of a cell grows with the logarithm of its epochs.
     """
     width = diagram.edges_m[1] - diagram.edges_m[0]
     edges = np.append(diagram.edges_m[:-1], diagram.edges_m[-2] + width)
@@ -312,7 +312,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     """Return levels over the time since `start`, or over the chainage without one."""
     layers: list[Layer] = []
     shown = total = 0
-    # levels matter near the alarm limit: a few far beyond it do not set the axis
+    # levels are of interest near the alarm limit: a few far beyond it do not set the axis
     top = 2.0 * alarm_limit_m
     epoch = since(positions, find_start(positions))
     x = floats(positions, "chainage_m") if start is None else epoch
@@ -333,7 +333,8 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     caption[1] += f", {infinite:,} levels are infinite and not drawn." if infinite else "."
     if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
-            "Each part spends its share of the risk alone; the level spends the whole and can be below a part."
+            "Each part is computed with its own part of the risk; the level uses the whole risk and can be below a "
+            "part."
         )
     return Chart(
         name="levels-chainage" if start is None else "levels",
@@ -350,7 +351,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
 def _count(positions: pl.DataFrame) -> str:
     """Return the epochs by status and cause of the level, in words."""
     sentences = []
-    for column, what in (("protection_status", "Epochs"), ("protection_cause", "What sets the level")):
+    for column, what in (("protection_status", "Epochs"), ("protection_cause", "Largest contribution to the level")):
         if column in positions.columns:
             counts = Counter(words(positions, column).tolist())
             listed = ", ".join(f"{word or 'none'} {count:,}" for word, count in counts.most_common())

@@ -63,10 +63,10 @@ def plan(
     """Return the positions of one antenna and line in local metres, with marks of the kilometrage (P1 figure 6).
 
     No layers without a position. The positions are coloured by `error_m` or `level_m`, shape (rows,), by the size of
-    the first that is given, and by their status without either. Of `filtered`, by the filter along the track, those of
-    epochs without a position of their own are drawn. Without `track` the line is drawn through the positions.
-    `tunnels_m` are chainages between which the line runs in a tunnel; `background` are longitudes and latitudes of
-    lines to draw below, each of shape (P, 2) [deg].
+    the first that is given, and by their status without either. With `filtered`, epochs without a single-epoch position
+    are drawn at the filter's position. Without `track` the line is drawn through the positions. `tunnels_m` are
+    chainages between which the line runs in a tunnel; `background` are longitudes and latitudes of lines to draw below,
+    each of shape (P, 2) [deg].
     """
     ecef, conventional = points(positions, *ECEF), points(positions, *(f"conventional_{name}" for name in ECEF))
     has = np.isfinite(ecef[:, 0])
@@ -99,7 +99,7 @@ def plan(
     if filtered is not None:
         layers += _filter_points(positions.filter(pl.Series(has)), filtered, frame, cell, find_start(positions))
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
-    thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
+    thinned = "" if shown == total else f" Positions too close to distinguish are drawn once ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
     far = f" {outside:,} conventional positions lie outside." if outside else ""
     return chart(
@@ -142,7 +142,7 @@ class LocalFrame:
 
     @classmethod
     def at(cls, latitude_deg: float, longitude_deg: float) -> LocalFrame:
-        """Return the frame at a place on the ellipsoid."""
+        """Return the frame at a point on the ellipsoid."""
         origin, axes = ecef_from_geodetic(latitude_deg, longitude_deg, 0.0), enu_axes(latitude_deg, longitude_deg)
         return cls(
             origin_ecef_m=origin, axes=axes, latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=0.0
@@ -229,7 +229,7 @@ def _line_of_positions(here: Floats, chainage_m: Floats) -> Curve:
 
 
 def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
-    """About a dozen marks at round values of the kilometrage, or of the chainage where there is none."""
+    """About a dozen marks at round values of the kilometrage, or of the chainage without one."""
     along = floats(positions, "kilometrage_m")
     label = "kilometrage"
     if not np.isfinite(along).any():
@@ -247,7 +247,9 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Return chainage and distance [m] from the position before, while the train moved; `prefix` begins the columns."""
+    """Return chainage and distance [m] from the previous position, while the train moved; `prefix` begins the
+    columns.
+    """
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
         moved = distance > 0.0
@@ -312,7 +314,7 @@ def interval_distribution(table: pl.DataFrame) -> Chart:
 def _by(table: pl.DataFrame) -> str:
     if "interval_m" in table.columns:
         return "Distances travelled by the reference; intervals at standstill are left out."
-    return "Without a reference the distances are those of the positions, with their noise."
+    return "Without a reference the distances are between the positions, including their noise."
 
 
 def satellites_over_time(positions: pl.DataFrame) -> Chart:

@@ -110,7 +110,7 @@ def _view(frame: LocalFrame, log: PlanLog) -> tuple[tuple[float, float], tuple[f
 def _names_beside(
     network: Network, frame: LocalFrame, matched: Matched, view: tuple[tuple[float, float], tuple[float, float]]
 ) -> Marks:
-    """Names of the tracks that a run has passed, beside the middle of its positions there, on alternating sides."""
+    """Names of the tracks that a run has passed, next to the middle of its positions there, on alternating sides."""
     passed = dict.fromkeys(matched.track[matched.track >= 0].tolist())
     places = [np.flatnonzero(matched.track == track) for track in passed][:_NAMED]
     rows = np.array([own[len(own) // 2] for own in places], dtype=np.intp)
@@ -156,7 +156,7 @@ def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]
 
 _COLOURS: Final = {"error": "#c1272d", "warning": "#e08e0b"}
 _LINE: Final = "#1f4e79"
-#: Panel along the line in which each kind of finding is marked; those not named stand in the plan only.
+#: Panel along the line in which each kind of finding is marked; other kinds are marked in the plan only.
 _PANELS: Final = {
     "mid-chord": "mid-chord",
     "duplicate": "spacing",

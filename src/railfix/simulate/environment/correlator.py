@@ -32,8 +32,8 @@ class TrackedCode:
     #: Delay beyond the unobstructed direct signal.
     code_m: Floats
     phase_m: Floats
-    rate_mps: Floats  #: Of the phase, at constant amplitudes of the paths.
-    gain_db: Floats  #: Of the prompt correlator relative to the unobstructed direct signal.
+    rate_mps: Floats  #: Correlation time of the phase, at constant amplitudes of the paths.
+    gain_db: Floats  #: Amplitude of the prompt correlator relative to the unobstructed direct signal.
     main: Indices  #: Path that the loops lock to.
 
 
@@ -107,10 +107,10 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
         away = np.abs(x)
         triangle = _triangle(x)
         carrier, quadrature = (real * triangle).sum(axis=0), (imaginary * triangle).sum(axis=0)
-        # Part of each path in phase with the sum: its own square stands, the rest swings.
+        # Part of each path in phase with the sum: its own square is constant, the rest oscillates.
         in_phase = follow * (real * carrier + imaginary * quadrature) + own * triangle
         near = away < half
-        # Early less late of a path at x: -2 x when near, else a plateau that falls to 0 past a chip.
+        # Early less late of a path at x: -2 x when near, otherwise a plateau that falls to 0 past a chip.
         far = np.copysign(np.clip(1.0 + half - away, 0.0, spacing), -x)
         push = np.where(near, 2.0 * late, far) * in_phase
         slope = 2.0 * (near * in_phase).sum(axis=0)
@@ -122,7 +122,9 @@ CLEAR_V: Final = -0.78  #: Below this the loss of an edge is 0 by the formula of
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
-    """Fresnel parameter of a clearance of 1 m [1/m] at an edge so far away, the source at infinity (P.526-15, 4.1)."""
+    """Fresnel parameter of a clearance of 1 m [1/m] at an edge at this distance, the source at infinity (P.526-15,
+    4.1).
+    """
     return np.sqrt(2.0 / (wavelength_m * np.maximum(distance_m, 0.1)))
 
 
@@ -174,6 +176,6 @@ def reflection_amplitude(cosine: Floats, sine_elevation: Floats, antenna: Antenn
 
 
 def cross_polar_gain(sine_elevation: Floats | float, antenna: AntennaSettings) -> Floats:
-    """Return the amplitude received of left-handed signals over that of right-handed ones."""
+    """Return the ratio of received amplitudes of left-handed to right-handed signals."""
     horizon_db, zenith_db = antenna.cross_polar_horizon_db, antenna.cross_polar_zenith_db
     return np.asarray(10.0 ** (-(horizon_db + sine_elevation * (zenith_db - horizon_db)) / 20.0))

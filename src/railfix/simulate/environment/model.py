@@ -66,7 +66,9 @@ class Conductor:
     width_m: float
 
     def obstruction(self, wavelength_m: Floats) -> Complexes:
-        """Field that the conductor removes from the direct signal, shape (N,): a strip's, by share and cosine."""
+        """Field that the conductor removes from the direct signal, shape (N,): a strip's, by obstructed fraction and
+        cosine.
+        """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
         toward = (self.p * self.ray_p + self.q * self.ray_q) / plane
@@ -98,7 +100,7 @@ class Conductor:
         return amplitude * behind, away * plane * (1.0 - cosine), plane * self.p / away, plane * self.q / away
 
     def _share(self, at_m: Floats, scale: Floats) -> Floats:
-        """Return the share of the conductor that obstructs: 1 between its ends, 0 beyond."""
+        """Return the fraction of the conductor that obstructs: 1 between its ends, 0 beyond."""
         inside = np.minimum(at_m - self.low_m, self.high_m - at_m) * scale
         return 1.0 - edge_amplitude(inside)
 
@@ -287,7 +289,7 @@ class Environment:
         return np.stack([field.astype(np.complex128) for field in fields]), np.stack(extra_m), np.stack(growth)
 
     def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
-        """Return reflections by side streets, by both sides one after the other, and by vehicles on parallel tracks."""
+        """Return reflections by side streets, by both sides in sequence, and by vehicles on parallel tracks."""
         settings, antenna = self.settings, self.settings.antenna
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = []
         if (streets := settings.side_streets) is not None:
@@ -306,7 +308,7 @@ class Environment:
         return rows
 
     def _direct(self, rays: Rays, clock_s: Floats) -> tuple[Complexes, Floats]:
-        """Direct field and excess of the diffracted path; of several walls the one that obstructs most counts."""
+        """Direct field and excess of the diffracted path; of several walls the most obstructing one counts."""
         v = np.full(len(rays.x), FREE_V)
         for row in self.structures.walls:
             v = np.maximum(v, shadow(row, rays))

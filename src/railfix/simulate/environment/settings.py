@@ -1,4 +1,4 @@
-"""Settings of the structures along a line that block, reflect and scatter signals; by default there are none.
+"""Settings of the structures along a line that block, reflect and scatter signals; none by default.
 
 In a scenario file::
 
@@ -10,7 +10,8 @@ In a scenario file::
     to_m = 900.0
     kind = "urban"
 
-or, instead of the sections, ``[environment.shares]`` of each kind from which they are drawn for the line's length.
+or, instead of the sections, ``[environment.shares]``: the fraction of each kind, from which they are drawn for the
+line's length.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ KINDS: Final[tuple[str, ...]] = get_args(Kind)  #: Kinds of section.
 class ElectrificationSettings(ScenarioSettings):
     """Masts, beams across the tracks, and the wires over the track."""
 
-    #: Masts stand at chainages first_m + k spacing_m.
+    #: Masts are at chainages first_m + k spacing_m.
     spacing_m: Positive = 50.0
     first_m: Finite = 10.0
 
@@ -73,7 +74,7 @@ class RowSettings(ScenarioSettings):
     #: Along the line, and to the next.
     length_m: Between = (10.0, 30.0)
     gap_m: Between = (2.0, 10.0)
-    share: Share = 1.0  #: Share of the plots that are built upon.
+    share: Share = 1.0  #: Fraction of the plots with buildings.
     #: Amplitude reflection coefficient, the antenna's polarisation included (0 nothing, 1 all).
     reflection: Between = (0.2, 0.7)
     roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
@@ -176,8 +177,8 @@ class TreeSettings(ScenarioSettings):
     #: Width of a crown, and distance to the next.
     length_m: Between = (4.0, 9.0)
     gap_m: Between = (0.0, 6.0)
-    share: Share = 1.0  #: Share of the places with a tree.
-    #: Specific attenuation, largest loss, and share of the lost amplitude that is scattered forward.
+    share: Share = 1.0  #: Fraction of the places with a tree.
+    #: Specific attenuation, largest loss, and fraction of the lost amplitude that is scattered forward.
     attenuation_db_per_m: NotNegative = 1.0
     most_db: NotNegative = 12.0
     scatter: Share = 0.5
@@ -190,7 +191,7 @@ class NeighbourSettings(ScenarioSettings):
     #: Distance of their side from the track's axis, and their top over the rails.
     lateral_m: Positive = 2.5
     height_m: Positive = 4.3
-    #: Of a vehicle, and from front to front.
+    #: Length of a vehicle, and spacing from front to front.
     length_m: Positive = 100.0
     spacing_m: Positive = 5000.0
     speed_mps: Finite = -20.0  #: Toward rising chainage.
@@ -210,7 +211,7 @@ class EnvironmentSettings(ScenarioSettings):
 
     electrification: ElectrificationSettings | None = None
     sections: tuple[SectionSettings, ...] = ()  #: Rising, without overlap; between them the line is open.
-    #: Instead of sections: share of the line's length by kind; the sections are drawn at random.
+    #: Instead of sections: fraction of the line's length by kind; the sections are drawn at random.
     shares: dict[Kind, Share] = Field(default_factory=dict)
     section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)  #: Lengths of the drawn sections.
     antenna_height_m: Positive = 4.0  #: Over the rails.
@@ -219,7 +220,7 @@ class EnvironmentSettings(ScenarioSettings):
     receiver: CorrelatorSettings = CorrelatorSettings()
     #: None: walls reflect with the amplitude `reflection`, whatever the polarisation.
     antenna: AntennaSettings | None = None
-    #: "opposite": signals reflected by both nearest rows, one after the other.
+    #: "opposite": signals reflected by both nearest rows in sequence.
     second_reflections: Literal["none", "opposite"] = "none"
     side_streets: SideStreetSettings | None = None  #: All along the line.
     trees: tuple[TreeSettings, ...] = ()  #: All along the line.
@@ -252,7 +253,7 @@ class EnvironmentSettings(ScenarioSettings):
 
     @property
     def empty(self) -> bool:
-        """Whether there is no structure along the line."""
+        """Whether the line has no structures."""
         parts = (self.electrification, self.side_streets)
         lists = (self.sections, self.shares, self.trees, self.neighbours, self.equipment)
         return all(part is None for part in parts) and not any(lists)
@@ -267,7 +268,7 @@ class SightGeometry:
     #: Shape (M,).
     satellite: Strings
     signal: Strings
-    chainage_m: Floats  #: Of the centreline point abeam the antenna, shape (T,).
+    chainage_m: Floats  #: Chainage of the centreline point abeam the antenna, shape (T,).
     speed_mps: Floats  #: Negative toward falling chainage, shape (T,).
     antenna_ecef_m: Floats  #: Shape (T, 3).
     heading_deg: Floats  #: Azimuth of the vehicle's forward axis, shape (T,).

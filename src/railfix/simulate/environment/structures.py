@@ -72,9 +72,9 @@ TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, los
 def draw_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
-    """Return sections with exactly the given shares of a line, which add up to 1, in random order from 0 to its end.
+    """Return sections with exactly the given fractions of a line, which add up to 1, in random order from 0 to its end.
 
-    `section_length_m` is the approximate range of their lengths; a small share gives one shorter section.
+    `section_length_m` is the approximate range of their lengths; a small fraction gives one shorter section.
     """
     rng = np.random.default_rng([seed, 7101])
     low, high = section_length_m
@@ -97,7 +97,7 @@ def draw_sections(
     )
 
 
-BEYOND_M: Final = 500.0  #: The first and the last section go on so far beyond the line [m].
+BEYOND_M: Final = 500.0  #: The first and the last section extend this far beyond the line [m].
 SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arrays.
 
 
@@ -187,7 +187,7 @@ def tree_rows(settings: Sequence[TreeSettings], line_length_m: float, seed: int)
 def _spans(
     length_m: Between, gap_m: Between, low: float, high: float, rng: np.random.Generator
 ) -> list[tuple[float, float]]:
-    """Return plots between two chainages, one after the other."""
+    """Return plots between two chainages in sequence."""
     spans = []
     at = low + rng.uniform(0.0, 1.0) * gap_m[1]
     while at < high:

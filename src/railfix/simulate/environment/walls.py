@@ -1,6 +1,6 @@
 """Vertical walls along the line, side streets, trees, vehicles: shadowing and specular reflection.
 
-Frame of the antenna: x along the line (rising chainage), y to the right, z up; near it the line is taken as straight.
+Frame of the antenna: x along the line (rising chainage), y to the right, z up; the line is assumed straight near it.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _LEAST_LATERAL: Final = 1e-3  #: Least component of a direction: rays along the 
 
 @dataclass(frozen=True, kw_only=True)
 class Rays(RowArrays):
-    """N directions to satellites from one antenna's places."""
+    """N directions to satellites from one antenna's positions."""
 
     chainage_m: Floats  #: Shape (N,).
-    height_m: float  #: Of the antenna over the rails.
+    height_m: float  #: Height of the antenna over the rails.
     #: Unit vector to the satellite, shape (N,).
     x: Floats
     y: Floats
@@ -92,11 +92,11 @@ class Reflections:
     #: Horizontal direction of arrival.
     back_x: Floats
     back_y: Floats
-    cosine: Floats  #: Of the angle of incidence from the wall's normal.
+    cosine: Floats  #: Cosine of the angle of incidence from the wall's normal.
 
 
 def reflections(row: Strips, rays: Rays) -> Reflections:
-    """Reflect each satellite in the row on the other side: extra path 2 D (-n . u), n the normal of its plane."""
+    """Mirror each satellite in the row on the other side: extra path 2 D (-n . u), n the normal of its plane."""
     sign = np.where(rays.y > 0.0, -1.0, 1.0)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     wall = wall_met(row, (sign > 0.0).astype(np.intp), rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
@@ -105,7 +105,7 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
     sine = slope * cosine
     middle = 0.5 * (row.start_m[wall] + row.end_m[wall])
     distance = (row.value["distance_m"][wall] + (rays.chainage_m - middle) * slope) * cosine
-    # Normal (-sine, cosine) in (x, lateral); the satellite stands at (x, -lateral).
+    # Normal (-sine, cosine) in (x, lateral); the satellite is at (x, -lateral).
     facing = sine * rays.x + cosine * lateral
     back_x = rays.x - 2.0 * facing * sine
     back = -lateral + 2.0 * facing * cosine
@@ -129,7 +129,7 @@ def roof_amplitude(row: Strips, rays: Rays) -> Floats:
     """Return the amplitude left by the level roofs of a row, shape (N,)."""
     side = (rays.y > 0.0).astype(np.intp)
     least = np.maximum(rays.z, 0.02)
-    # Roofs of one row are at one height nearly always: the one overhead gives the first guess.
+    # Roofs of one row are nearly always at one height: the one overhead gives the first guess.
     roof = row.nearest(side, rays.chainage_m)
     for _ in range(2):
         far = (row.value["height_m"][roof] - rays.height_m) / least
@@ -148,7 +148,7 @@ def roof_amplitude(row: Strips, rays: Rays) -> Floats:
     return np.where(over, np.maximum(edge_amplitude(v), np.where(v > 0.0, row.value["through"][roof], 0.0)), 1.0)
 
 
-_LEAST_TWICE: Final = 0.05  #: The same for rays that are reflected twice.
+_LEAST_TWICE: Final = 0.05  #: Path of rays that are reflected twice.
 
 
 def second_reflection(
@@ -189,7 +189,7 @@ _LEAST_SIDE: Final = 0.02  #: Least lateral and longitudinal component of a dire
 class SideStreets:
     """Side streets on one side of the line, n of them, by rising chainage."""
 
-    #: Chainages of the street's edges; the walls stand there; shape (n,).
+    #: Chainages of the street's edges, where the walls are; shape (n,).
     start_m: Floats
     end_m: Floats
     #: Distance of the street's mouth from the track's axis, and length of the street's walls; shape (n,).
@@ -231,7 +231,7 @@ def street_reflections(
             rows = np.flatnonzero((rays.y > 0.0) == (side == 1))
             reach = float(street.front_m.min()) * along[rows] / lateral[rows]
             chainage = rays.chainage_m[rows]
-            # The wall ahead stands at the far edge of its street, the wall behind at the near one.
+            # The wall ahead is at the far edge of its street, the wall behind at the near one.
             forward = np.searchsorted(street.end_m, chainage + reach) + k
             backward = np.searchsorted(street.start_m, chainage - reach) - 1 - k
             number = np.where(ahead[rows] > 0.0, forward, backward)
@@ -285,7 +285,7 @@ _SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of the lateral component of
 
 
 def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
-    """Return the Fresnel parameter of the vehicles on a parallel track, positive where in the way, shape (N,)."""
+    """Return the Fresnel parameter of the vehicles on a parallel track, positive where obstructing, shape (N,)."""
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     far = settings.lateral_m / lateral
     spacing = settings.spacing_m
@@ -310,7 +310,7 @@ def neighbour_reflection(settings: NeighbourSettings, rays: Rays, time_s: Floats
 
 
 def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Floats:
-    """Return the amplitude left of the direct signal by equipment on the vehicle's own roof, shape (N,)."""
+    """Return the remaining amplitude of the direct signal after equipment on the vehicle's own roof, shape (N,)."""
     amplitude = np.ones(len(rays.x))
     for part in equipment:
         along = np.maximum(np.abs(rays.x), _LEAST_LATERAL)

@@ -14,8 +14,8 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
-#: Standard deviation of the bend of the line against the reference line at a point [m]; at corners, where moving the
-#: line sideways bends it, larger by so much for a turn of one radian, squared.
+#: Standard deviation of the bend of the line against the reference line at a point [m]; larger at corners, where moving
+#: the line sideways bends it, by this much for a turn of one radian, squared.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
 
@@ -28,7 +28,7 @@ class ReferenceLine:
     ecef_m: Floats
     across: Floats
     up: Floats
-    closed: bool = False  #: The last point goes on at the first.
+    closed: bool = False  #: The last point is joined to the first.
 
     def __len__(self) -> int:
         return len(self.ecef_m)
@@ -41,7 +41,7 @@ class Equations:
     matrix: sp.csr_array  #: Shape (n * size, unknowns).
     value: Floats  #: Shape (n * size,).
     size: int
-    share: Floats  #: Share of an observation in an independent one; 1 where none is given; shape (n,).
+    share: Floats  #: Weight of an observation as a fraction of an independent one; 1 where not given; shape (n,).
     robust: bool = True  #: Whether outliers lose their weight.
     scaled: bool = False  #: Whether the standard deviations are scaled by the residuals.
 
@@ -147,7 +147,7 @@ def change_equations(
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:
-    """Return the median of the group of each value: without it what is left of a clock is small."""
+    """Return the median of the group of each value: the residual clock without it is small."""
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
     middle = np.minimum((first[:-1] + first[1:]) // 2, len(value) - 1)
@@ -188,7 +188,7 @@ def tie_equations(
     line: ReferenceLine, ties: Ties, runs: Sequence[RunColumns], start: int, origin: Floats, limits: SurveyLimits,
     unknowns: int,
 ) -> Equations:  # fmt: skip
-    """Passes: across and above, a run is where the line is; its distance from it repeats over some way."""
+    """Passes across and above: a run is on the line; its distance from it is correlated over some length."""
     share = np.full(len(ties.point), min(1.0, limits.spacing_m / max(limits.correlation_m, 1e-9)))
     white = np.stack([line.across[ties.point], line.up[ties.point]], axis=1) / limits.apart_m
     first = np.array([columns.row[0] for columns in runs])[ties.run]

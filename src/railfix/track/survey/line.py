@@ -38,7 +38,8 @@ _ADJUSTMENT_ROUNDS: Final = 15
 _SETTLED_M: Final = 0.02
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Scales of the stated standard deviations that residuals may show; they do not show errors that satellites share.
+#: Scales of the stated standard deviations that residuals may indicate; they do not indicate errors that satellites
+#: share.
 _SCALES: Final = (0.5, 10.0)
 _ANYWHERE_M: Final = 1e5  #: Loose prior for conditioning: standard deviation of every unknown [m].
 #: Points of the line whose standard deviation is computed at most, others are interpolated, and columns at a time.
@@ -50,8 +51,8 @@ _COLUMNS: Final = 20
 class Adjusted:
     """Result of an adjustment."""
 
-    ecef_m: tuple[Floats, ...]  #: Positions of each run, its offset taken off; shape (n, 3).
-    #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not asked for.
+    ecef_m: tuple[Floats, ...]  #: Positions of each run without its offset; shape (n, 3).
+    #: Points of the line across and above the reference line, and their sigmas, shape (J, 2); (0, 2) if not requested.
     line_m: Floats
     line_sigma_m: Floats
     #: Mean weight of the positions or codes of each row, about 1 without outliers; 0 without any; shape (n,).
@@ -106,7 +107,9 @@ def adjust(
 
 
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
-    """Return the share of each row in an independent position, by time and distance since the last row, shape (n,)."""
+    """Return the weight of each row as a fraction of an independent position, by time and distance since the last row,
+    shape (n,).
+    """
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
     by_time = since / np.maximum(2.0 * limits.correlation_s, 1e-9)
@@ -194,12 +197,12 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
 
 
 _ROUNDS: Final = 3  #: Adjustments with the line; after each of them the passes are found again.
-#: The directions have a track each where they lie apart by more than so many standard deviations of what a run may be
-#: off: three of the difference of two.
+#: The directions are on separate tracks where they are apart by more than this many standard deviations of a run's
+#: offset: three of the difference of two.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Way over which a change of direction is looked for [m].
+_TURN_M: Final = 40.0  #: Way over which a change of direction is searched for [m].
 _END_POINTS: Final = 8  #: Points that show the direction at an end of the line.
-_OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that is that of the whole map.
+_OF_THE_MAP: Final = 95.0  #: Quantile of the standard deviations along the line that represents the whole map.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,12 +216,12 @@ class Survey:
     passes: Integers  #: Number of passes at each point, shape (V,).
     runs_ecef_m: tuple[Floats, ...]  #: Adjusted positions of each run, shape (n, 3).
     scale: tuple[float, ...]  #: Standard deviation of the positions or codes of each run against those stated.
-    beside_m: float  #: Way of the runs that does not lie on the line.
+    beside_m: float  #: Length of the runs off the line.
     closed: bool
 
 
 def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None, name: str = "survey") -> Survey:
-    """Adjust runs to the map of one line, alone, then as passes. ValueError: they never move, or lie apart."""
+    """Adjust runs to the map of one line, individually, then as passes. ValueError: they never move, or are apart."""
     limits = limits or SurveyLimits()
     origin = np.nanmean(np.concatenate([run.ecef_m for run in runs]), axis=0)
     axes = axes_at(origin)
@@ -250,7 +253,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     assert adjusted is not None
     assert course is not None
     order, count = _points_of_line(course, ties)
-    sigma = adjusted.line_sigma_m[order]
+    sigma = np.hypot(adjusted.line_sigma_m[order], _unseen_sigma(runs))
     sigma_plan, sigma_height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
     notes = _notes(runs, legs, passes, count, moved[order], (sigma_plan, sigma_height), beside, apart)
     track = Track.from_ecef(
@@ -272,6 +275,15 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     )
 
 
+def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
+    """Return the standard deviations in plan and height of what all positions of a single run share, shape (2,) [m].
+
+    In addition to `SurveyRun.common_sigma_m`, which is twice as large where no other run shows it: the sigmas that
+    single runs of low-cost receivers had without were half of their errors.
+    """
+    return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
+
+
 def _interpolate_positions(run: SurveyRun) -> Floats:
     """Return positions with those that lack interpolated in time, shape (n, 3) [m]."""
     known = np.isfinite(run.ecef_m[:, 0])
@@ -286,7 +298,7 @@ def _reference_line(course: Course, origin: Floats, axes: Floats) -> ReferenceLi
 
 
 def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
-    """Return how often each run passes the place of each of its rows, shape (n,) each."""
+    """Return how often each run passes each of its rows, shape (n,) each."""
     found = []
     for r, run in enumerate(runs):
         mine = ties.run == r
@@ -298,7 +310,9 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return points of an open line without those at its ends that do not lead on: noise of runs that stand there."""
+    """Return points of an open line without points at its ends that do not lead on, which are noise of
+    standing runs.
+    """
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:
@@ -311,7 +325,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Return points that lead on from the last by half a spacing or more: where runs stand, noise makes others."""
+    """Return points that lead on from the last by half a spacing or more: standing runs add others by noise."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]
@@ -362,6 +376,18 @@ def _notes(
         f"{against:.0%} of it against its direction; each point is passed {count.min()} to {count.max()} times",
         f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height: 95th percentiles along it",
     ]
+    steps = np.concatenate([np.diff(leg.arc_m) for leg in legs])
+    if len(bridged := steps[steps > _TURN_M]):
+        notes.append(
+            f"{plural(bridged, 'gap')} in the runs bridged by a curve, the longest {bridged.max():.0f} m: the accuracy "
+            "there is that of its ends"
+        )
+    if len(runs) == 1:
+        plan, height = (2.0 * value for value in runs[0].common_sigma_m)
+        notes.append(
+            f"one run does not show the error that all its positions share: {plan:.1f} m in plan and {height:.1f} m in "
+            "height are in the accuracy for it; add runs of other days"
+        )
     if beside > 0.02 * driven:
         notes.append(
             f"{beside:,.0f} m of the runs do not lie on the line and are not used: branches, or wrong positions"

@@ -1,4 +1,6 @@
-"""The line that the passes of several runs share: its course without repetitions, and where each pass lies on it."""
+"""The line that the passes of several runs share: its course without repetitions, and the position of each
+pass on it.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,13 @@ from railfix.track.survey.runs import SurveyLimits
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one line.
 #: Parts of a leg nearer than this many widths (`same_line_m`) along it are no repetition of each other.
 _APART_WIDTHS: Final = 3.0
-_MOSTLY: Final = 0.8  #: Share of the points of a stretch that lie on the line where the stretch does.
+_MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must lie on the line.
 _SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is evened out [m].
-_GAP_S: Final = 10.0  #: Longer without any row a run is not followed [s].
+#: Longer without any row [s] a run is followed over no more than a distance [m], and where it goes on in the direction
+#: of that distance: cosine of the largest angle.
+_GAP_S: Final = 10.0
+BRIDGED_M: Final = 500.0
+_GOES_ON: Final = 0.9
 _NEIGHBOURS: Final = 24  #: Neighbouring vertices that a point is compared with.
 
 
@@ -58,7 +64,7 @@ class Leg:
 
 @dataclass(frozen=True, kw_only=True)
 class Course:
-    """The line as a polyline, J points; the last one of a closed line goes on at the first."""
+    """The line as a polyline, J points; the last point of a closed line is joined to the first."""
 
     point_m: Floats
     closed: bool = False
@@ -114,8 +120,8 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
     ]
     legs = []
     gap = np.flatnonzero((np.diff(time_s) > _GAP_S) & (np.linalg.norm(np.diff(point_m, axis=0), axis=1) > turn_m))
-    gaps = np.searchsorted(kept, gap, side="right")
-    edges = sorted([(0, 0), *((c, 0) for c in cuts), *((int(g), 1) for g in gaps), (len(kept) - 1, 0)])
+    gaps = [g for g in np.searchsorted(kept, gap, side="right").tolist() if not _goes_on(plan, g, reach)]
+    edges = sorted([(0, 0), *((c, 0) for c in cuts), *((g, 1) for g in gaps), (len(kept) - 1, 0)])
     for (first, _), (last, broken) in pairwise(edges):
         part = kept[first : last + 1 - broken]
         if len(part) >= 2:
@@ -123,6 +129,20 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
             arc = np.concatenate([[0.0], np.cumsum(step)])
             legs.append(Leg(run=run, row=part, arc_m=arc, point_m=point_m[part]))
     return legs
+
+
+def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
+    """Return whether a run goes on in its direction over the gap before a point."""
+    if not 0 < after < len(plan_m) - 1:
+        return False
+    gap = plan_m[after] - plan_m[after - 1]
+    length = float(np.linalg.norm(gap))
+    ways = (
+        plan_m[after - 1] - plan_m[max(after - 1 - reach, 0)],
+        plan_m[min(after + reach, len(plan_m) - 1)] - plan_m[after],
+    )
+    straight = all(way @ gap > _GOES_ON * length * np.linalg.norm(way) for way in ways)
+    return bool(straight and length <= BRIDGED_M)
 
 
 def _sample(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
@@ -149,7 +169,7 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
 
 
 def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
-    """Return the beginning of a polyline up to where it lies beside itself for some widths."""
+    """Return the beginning of a polyline up to where it runs parallel to itself for some widths."""
     least = int(_APART_WIDTHS * width_m / spacing_m)
     way = directions(points)
     tree = cKDTree(points[:, :2])
@@ -173,7 +193,9 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Return one turn of a closed line: from point `start` to `end`, which is the same place; the gap is evened out."""
+    """Return one turn of a closed line: from point `start` to `end`, which is the same point; the gap is
+    distributed.
+    """
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
@@ -226,7 +248,9 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Return the fractional point of the course, direction (0: beside) and distance to its right [m], shapes (q,)."""
+    """Return the fractional point of the course, direction (0: off the course) and distance to its right [m], shapes
+    (q,).
+    """
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
     count = min(_NEIGHBOURS, len(course))
@@ -253,7 +277,7 @@ def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats
 
 
 def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tuple[list[Pass], float]:
-    """Find the pieces of all legs that lie on the course, and the way that does not [m]."""
+    """Find the pieces of all legs that lie on the course, and the length that does not [m]."""
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     passes: list[Pass] = []
     beside = 0.0
@@ -295,7 +319,9 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
 def without_other_track(
     course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
 ) -> tuple[list[Pass], float]:
-    """Return the passes of the direction with more, where both have a track each, and how far apart, else 0 [m]."""
+    """Return the passes of the direction with more, where each has a separate track, and the distance of the tracks,
+    otherwise 0 [m].
+    """
     across: dict[int, Floats] = {}
     for sign in (1, -1):
         found = [
@@ -321,7 +347,7 @@ class Ties:
 
     run: Indices  #: Shape (m,).
     row: Indices  #: Rows of the run about the point, shape (m, 4).
-    weight: Floats  #: Of these rows, with the sum 1; shape (m, 4).
+    weight: Floats  #: Weights of these rows, with the sum 1; shape (m, 4).
     point: Indices  #: Shape (m,).
     number: Indices  #: Number of the pass, shape (m,).
 

@@ -17,7 +17,7 @@ from railfix.io.position_log import PositionLog
 from railfix.track.from_positions import SIGMA_OF_QUALITY
 
 #: Standard deviation of the error that all positions of a run share, by their quality (RTKLIB), plan and height [m]:
-#: orbits, ionosphere and reference frame, which no averaging over the run takes away.
+#: orbits, ionosphere and reference frame, which averaging over the run does not reduce.
 COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
@@ -30,7 +30,7 @@ class SurveyLimits(Settings):
     """Assumptions of a survey."""
 
     interval_s: float = Field(default=1.0, gt=0)  #: Least time between the positions used; faster logs are thinned.
-    #: Errors of positions repeat over so long at standstill and over so much way: together they count as one.
+    #: Correlation of position errors in time at standstill and in distance: positions within it count as one.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)
     #: Standard deviation of the change of the horizontal velocity in a second, east and north: over five seconds, as
@@ -45,7 +45,8 @@ class SurveyLimits(Settings):
         gt=0,
     )
     apart_m: float = option(
-        "Standard deviation of the distance of a pass from the line: lanes, antennas on other places of the vehicle.",
+        "Standard deviation of the distance of a pass from the line: lanes, antennas at other positions on the "
+        "vehicle.",
         0.5,
         name="--apart",
         metavar="M",
@@ -82,9 +83,9 @@ class SurveyRun(FrozenArrays):
 
     name: str
     time: Datetimes  #: Shape (n,).
-    ecef_m: Floats  #: NaN where there is no position, shape (n, 3).
+    ecef_m: Floats  #: NaN without a position, shape (n, 3).
     sigma_m: Floats  #: Standard deviations east, north, up; shape (n, 3).
-    #: What the positions come from: used in place of them, with several epochs to judge by.
+    #: Observations behind the positions: used instead of them, with several epochs at a time.
     signals: RunSignals | None = None
     #: Standard deviation, plan and height, of the error that all positions share.
     common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]

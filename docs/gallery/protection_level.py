@@ -1,23 +1,15 @@
----
-jupytext:
-  text_representation:
-    extension: .md
-    format_name: myst
-kernelspec:
-  display_name: Python 3
-  language: python
-  name: python3
----
+"""
+Protection level with a faulty satellite
+========================================
 
-# A bound one can believe
+A protection level bounds the error of a position at a stated risk, faults of satellites included. This example
+compares the levels of the demonstration with its errors, without a fault and with one.
+"""
 
-A protection level says how wrong one position may be, at a stated risk, also when a
-satellite is faulty. Here levels are compared with errors on the demonstration, without and with a fault.
+# %%
+# Levels and errors
+# -----------------
 
-## Levels and errors
-
-```{code-cell} ipython3
-%matplotlib inline
 import dataclasses
 
 import numpy as np
@@ -37,7 +29,7 @@ alarm_limit_m = railfix.Config().alarm_limit_m
 
 
 def run_with_errors(log):
-    """Result of a log, and its positions with their errors along the line."""
+    """Return the result of a log, and its positions with their errors along the line."""
     processor = railfix.EpochProcessor(railfix.Config(), trajectory, navigation=navigation)
     result, _ = processor.process({"front": log})
     table = railfix.positions_table(result).join(truth, on=["time_gpst", "antenna"], maintain_order="left")
@@ -46,11 +38,11 @@ def run_with_errors(log):
 
 result, errors = run_with_errors(log)
 plots.plot_levels_over_time(errors, alarm_limit_m)
-```
 
-```{code-cell} ipython3
+
+# %%
 def counts(table):
-    """Epochs with a finite level, those within the alarm limit, and those with an error over the level."""
+    """Count epochs with a finite level, those within the alarm limit, and those whose error exceeds the level."""
     error, level = pl.col("error_m").abs(), pl.col("protection_level_m")
     return table.filter(level.is_finite() & error.is_finite()).select(
         epochs=pl.len(),
@@ -62,35 +54,35 @@ def counts(table):
 
 
 counts(errors)
-```
 
-## With a fault
+# %%
+# With a fault
+# ------------
+#
+# For 20 seconds, 40 m are added to the pseudoranges of the satellite that is used most often then.
 
-The satellite that is used most in a stretch of 20 seconds measures 40 m too much there:
-
-```{code-cell} ipython3
 stretch = slice(200, 400)
 used = (result.reason[stretch] == 0).sum(axis=0)
 channel = int(np.argmax(used))
 fault_m = np.zeros(log.code_m.shape)
 fault_m[stretch, channel] = 40.0
 str(log.satellite[channel]), int(used[channel])
-```
 
-```{code-cell} ipython3
+# %%
 faulty, faulty_errors = run_with_errors(dataclasses.replace(log, code_m=log.code_m + fault_m))
 rejected = int((faulty.reason[stretch, channel] != 0).sum())
 table = pl.concat([counts(errors[stretch]), counts(faulty_errors[stretch])])
 print(f"{rejected} of 200 faulty ranges rejected")
 table.insert_column(0, pl.Series("fault", ["none", "40 m"]))
-```
 
-## What it rests on
+# %%
+# Assumed probabilities
+# ---------------------
+#
+# The levels of this run are *indicative*: the probabilities of faults are assumed, not measured on this line.
 
-The levels of this run are *indicative*: the probabilities of faults are assumed, not measured on this line.
-
-```{code-cell} ipython3
 railfix.Config().risk
-```
 
-A model of the errors of a line (`railfix error-model`) takes the place of the assumption. More: [protection level](../protection-level.md), [recordings](../level-results.md#levels-on-recordings).
+# %%
+# ``railfix error-model`` fits a model of the pseudorange errors of a line, which replaces the assumption. See
+# :doc:`protection level </protection-level>` and the :doc:`levels on recordings </level-results>`.

@@ -1,22 +1,16 @@
----
-jupytext:
-  text_representation:
-    extension: .md
-    format_name: myst
-kernelspec:
-  display_name: Python 3
-  language: python
-  name: python3
----
+"""
+Make a track map from positions
+===============================
 
-# Making a map
+One run with accurate positions (RTK) is enough for a map. Here the ground truth of the demonstration, with noise of
+two centimetres, stands in for RTK positions. ``railfix map from-positions`` and ``railfix map check`` do this with
+files.
+"""
 
-One run with accurate positions (RTK) makes a map; here the ground truth of the demonstration, with noise of two
-centimetres, takes their place. The commands for files are `railfix map from-positions` and `railfix map check`.
+# %%
+# From positions to a map
+# -----------------------
 
-## From positions to a map
-
-```{code-cell} ipython3
 import numpy as np
 import polars as pl
 
@@ -37,32 +31,31 @@ made = from_positions(
     sigma_height_m=0.03,
 )
 made
-```
 
-The train stands at both ends and comes back; the map is made from one way, without the positions at a stand. It is the path of the antenna, not the
-centreline of the track.
+# %%
+# The train runs along the line and back, and stands at both ends. The map is made from the outward run, without the
+# positions at a stand. It is the path of the antenna, not the centreline of the track.
+#
+# Check the map
+# -------------
 
-## Check it
-
-```{code-cell} ipython3
 for finding in railfix.check_track(made).findings:
     print(finding)
-```
 
-The distance from its points to the path of the antenna on the map that comes with the demonstration:
+# %%
+# These are the distances of its points from the antenna's path on the map that comes with the demonstration.
 
-```{code-cell} ipython3
 vehicle = railfix.read_vehicle(files["vehicle"])
 shipped = railfix.antenna_trajectory(railfix.read_track(files["track"]), vehicle, "front")
 _, offset_m = shipped.nearest(made.ecef_m)
 print(f"median {np.median(offset_m):.3f} m, largest {np.max(offset_m):.3f} m")
-```
 
-## Position on it
+# %%
+# Compute positions on the map
+# ----------------------------
+#
+# The map is the antenna's own path, so no vehicle file is needed.
 
-The map is the antenna's own path, so it needs no vehicle file:
-
-```{code-cell} ipython3
 trajectory = railfix.Trajectory.from_antenna_path(made)
 navigation = railfix.read_navigation(files["nav"])
 processor = railfix.EpochProcessor(railfix.Config(), {"front": trajectory}, navigation=navigation)
@@ -70,7 +63,7 @@ result, _ = processor.process({"front": railfix.read_observations(files["front"]
 true_arc_m, _ = trajectory.nearest(true_ecef_m)
 passed = railfix.positions_table(result)["status"].to_numpy() == "ok"
 error_m = np.abs(result.antennas["front"].arc_m - true_arc_m)[passed]
-print(f"{len(error_m)} epochs ok, error along the line: median {np.median(error_m):.2f} m, largest {np.max(error_m):.2f} m")
-```
+print(f"{len(error_m)} epochs ok; error along the line: median {np.median(error_m):.2f} m, max {np.max(error_m):.2f} m")
 
-Maps keep the chords between their points within 0.3 m of the curve.
+# %%
+# The points of a map are chosen so that the chords between them stay within 0.3 m of the curve.

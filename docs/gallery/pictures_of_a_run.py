@@ -1,20 +1,11 @@
----
-jupytext:
-  text_representation:
-    extension: .md
-    format_name: myst
-kernelspec:
-  display_name: Python 3
-  language: python
-  name: python3
----
+"""
+Charts of a run
+===============
 
-# Pictures
+``railfix.report.plots`` draws tables of a run with matplotlib. Each ``plot_*`` function draws into the axes ``ax``, or
+into a new figure, and returns the axes. The :doc:`report </report>` shows the same charts in an interactive page.
+"""
 
-What `railfix.report.plots` draws, on the demonstration. The [report](report.md) shows the same charts in a page that zooms.
-
-```{code-cell} ipython3
-%matplotlib inline
 import tempfile
 from pathlib import Path
 
@@ -33,40 +24,39 @@ evaluation = evaluate_run(out, demo_truth())
 errors = evaluation.epochs.filter(is_front)
 positions = pl.read_parquet(out / "positions.parquet").filter(is_front)
 observations = pl.scan_parquet(out / "observations.parquet").filter(is_front)
-```
 
-Plan of the line, positions coloured by protection level:
 
-```{code-cell} ipython3
+# %%
+# The plan of the line shows positions coloured by their protection level.
+
 plots.plot_plan(positions, level_m=positions["protection_level_m"].to_numpy())
-```
 
-Errors over time:
 
-```{code-cell} ipython3
+# %%
+# Errors over time, of positions on the line and of conventional ones.
+
 plots.plot_error_over_time(errors)
-```
 
-Protection level over chainage:
 
-```{code-cell} ipython3
+# %%
+# Protection level over chainage, with the alarm limit.
+
 plots.plot_levels_over_chainage(positions, railfix.Config().alarm_limit_m)
-```
 
-Satellites over time:
 
-```{code-cell} ipython3
+# %%
+# Satellites used and rejected over time.
+
 plots.plot_satellites_over_time(positions)
-```
 
-C/N0 over elevation:
 
-```{code-cell} ipython3
+# %%
+# C/N0 over elevation of one signal, with its mean.
+
 plots.draw_chart(plots.cn0_over_elevation(observations)[0])
-```
 
-Range of the errors:
 
-```{code-cell} ipython3
+# %%
+# Smallest, mean and largest error.
+
 plots.plot_error_ranges({"front": errors})
-```

@@ -1,22 +1,15 @@
----
-jupytext:
-  text_representation:
-    extension: .md
-    format_name: myst
-kernelspec:
-  display_name: Python 3
-  language: python
-  name: python3
----
+"""
+What each screen measures and changes
+=====================================
 
-# Why each screen
+This example draws the metric of each :doc:`screen </screens>` against its limit, and compares the positioning rate and
+the errors with and without each screen.
+"""
 
-What each [screen](../screens.md) measures on the demonstration, and what each changes in rate and accuracy.
+# %%
+# Metric and limit of each screen
+# -------------------------------
 
-## What each measures
-
-```{code-cell} ipython3
-%matplotlib inline
 import tempfile
 from pathlib import Path
 
@@ -38,59 +31,65 @@ positions, observations = railfix.positions_table(result), railfix.observations_
 shown = plots.list_screens(config, positions, observations.lazy())
 screens = {screen.name: screen for screen in shown if screen.antenna == "front"}
 list(screens)
-```
 
-**Elevation.** The mask is 20 degrees.
 
-```{code-cell} ipython3
+# %%
+# **Elevation.** Satellites below the mask of 20 degrees are rejected.
+
 plots.plot_screen_over_time(screens["elevation"].picture, screens["elevation"].time)
-```
 
-**Doppler.** The change of a pseudorange from epoch to epoch, against its Doppler, which multipath disturbs far less.
 
-```{code-cell} ipython3
+# %%
+# **Doppler.** The change of a pseudorange between epochs is compared with its Doppler, which multipath disturbs far
+# less.
+
 plots.plot_screen_over_time(screens["doppler"].picture, screens["doppler"].time)
-```
 
-**Pair of antennas.** The difference of the ranges of two antennas on one roof beyond what their spacing explains is multipath at one of them.
 
-```{code-cell} ipython3
+# %%
+# **Antenna pair.** The pseudoranges of two antennas on one roof differ by what their spacing explains. A larger
+# difference is multipath at one of them.
+
 plots.plot_screen_over_chainage(screens["antenna_pair"].picture, screens["antenna_pair"].chainage_m)
-```
 
-By default these two do not reject: a suspected observation gets a larger standard deviation by what the screen measured (`verdict = "weigh"`), which
-keeps the geometry where few satellites are left.
 
-**RAIM.** Where the sum of squares of the residuals is beyond its distribution without a fault, up to two satellites are excluded.
+# %%
+# By default these two screens do not reject (``verdict = "weigh"``): they increase the standard deviation of a
+# suspected observation by what they measured. This keeps the geometry where few satellites are left.
+#
+# **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds its fault-free distribution.
 
-```{code-cell} ipython3
 plots.plot_screen_over_chainage(screens["raim"].picture, screens["raim"].chainage_m)
-```
 
-**Spacing of the antennas.** The two positions must be as far apart along the line as the antennas are. The screen of **C/N0** needs a curve of
-antenna and receiver under an open sky (`railfix cn0-curve`), and is inactive here.
 
-## Which observations were rejected
+# %%
+# **Antenna spacing.** The two positions must be as far apart along the line as the antennas are. The **C/N0** screen
+# needs the open-sky curve of antenna and receiver (``railfix cn0-curve``); it is not run here.
+#
+# Rejected observations
+# ---------------------
 
-```{code-cell} ipython3
 (
     observations.filter(pl.col("reason") != 0)
     .group_by("antenna", "reason_text")
     .agg(pl.len().alias("pseudoranges"), pl.col("satellite").n_unique().alias("satellites"))
     .sort("antenna", "pseudoranges", descending=[False, True])
 )
-```
 
-## What each changes
 
-All screens, none, each alone, and all but each, on one reading of the log:
+# %%
+# Effect on rate and errors
+# -------------------------
+#
+# ``ablate_files`` reads the log once, and positions it with all screens, with none, with each alone, and with all but
+# each.
 
-```{code-cell} ipython3
 inputs = demo_inputs().replaced(truth=demo_truth())
 ablation = ablate_files(inputs, config, out=Path(tempfile.mkdtemp()) / "effects")
 effects = pl.DataFrame([effect.as_row() for effect in ablation.effects], infer_schema_length=None)
 columns = ["choice", "rate", "ok_rate", "n_used", "coordinates_p95_m", "coordinates_max_m", "ok_p95_m", "ok_max_m"]
 effects.filter(pl.col("antenna") == "front").select(columns)
-```
 
-`coordinates`: all positions; `ok`: those that passed every check.
+
+# %%
+# The columns ``coordinates_*`` are of all positions, the columns ``ok_*`` of those that passed every check.
