@@ -126,7 +126,7 @@ def _prepare_worker() -> None:
 
 
 def _end(number_of_signal: int, frame: object) -> None:
-    """End by way of an exception, which a second signal does not disturb."""
+    """End by an exception, which a second signal does not interrupt."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
     raise_exit(number_of_signal, frame)
@@ -134,7 +134,7 @@ def _end(number_of_signal: int, frame: object) -> None:
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
-    """Yield the executor, and the errors by which it reports that a worker process is gone.
+    """Yield the executor, and the errors that report a lost worker process.
 
     SettingsError: the scheduler does not exist, or `distributed` is not installed.
     """
@@ -232,9 +232,9 @@ def ablate(
 ) -> None:
     r"""Compare choices of screens on a log: all screens, none, each alone, all but each.
 
-    The logs are read once. Screens that are off in the settings stay off, and inactive ones
-    (no second antenna, no C/N0 curve) are left out and named. Validity and health of the satellites are
-    checked in every case; `none` is these checks alone, without an elevation mask.
+    The logs are read once. Screens that are off in the settings stay off, and screens that cannot be run (no second
+    antenna, no C/N0 curve) are left out and named. Validity and health of the satellites are checked in every case;
+    `none` is these checks alone, without an elevation mask.
 
     With `--filter track` there are rows for the filter along the track too: with every available source (codes, phases,
     Dopplers, and the sensors given), and without each of them except codes, all screens on.

@@ -188,7 +188,7 @@ def run_program(app: typer.Typer) -> NoReturn:
 
 
 def raise_exit(number: int, _frame: object) -> None:
-    """End by way of an exception, so that staging folders are removed."""
+    """End by an exception, so that staging folders are removed."""
     raise SystemExit(SIGNALLED + number)
 
 

@@ -22,9 +22,9 @@ from railfix.cli.options import (
 )
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.tables import plain_table, plural
-from railfix.evaluate.inputs import TABLES, list_position_tables, read_run
+from railfix.evaluate.evaluation_inputs import TABLES, list_position_tables, read_run
 from railfix.io.positions_export import style_file, write_positions
-from railfix.pipeline.tables import round_floats
+from railfix.pipeline.result_tables import round_floats
 from railfix.run.convert import write_mcap
 from railfix.run.inputs import LogReading, input_path
 from railfix.run.locate import LocateInputs, locate_files
@@ -86,7 +86,7 @@ def which_track(
     Each track of the map within 60 m is a hypothesis; one more is a track missing from the map (`none`). The
     codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with
     a base station carrier phases count, too. The decision is taken when the probability of all other hypotheses
-    together is below `--risk`; else all probabilities are printed.
+    together is below `--risk`; otherwise all probabilities are printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 

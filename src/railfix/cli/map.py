@@ -65,7 +65,7 @@ def check(
     """Check a track map and print its faults.
 
     Checked: spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
-    where given, else from the circle through neighbouring points), kinks, jumps and reversals of the
+    where given, otherwise from the circle through neighbouring points), kinks, jumps and reversals of the
     kilometrage, gradients and height spikes, cant, and curve attributes against the points.
 
     Example: `railfix map check line.csv --out report`
@@ -123,9 +123,9 @@ def features(
 ) -> None:
     """List the features of a line: the positions where its gradient or curvature changes.
 
-    A train that measures the same change knows where it is (`railfix.motion.features`). Changes are taken over 15 m,
-    about the distance of two bogies. With `--run` the features are those that several runs measured consistently: their
-    positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
+    A train that measures the same change knows its position (`railfix.motion.features`). Changes are computed over 15
+    m, about the distance of two bogies. With `--run` the features are those that several runs measured consistently:
+    their positions by run, the spread (as in P2's table 1), and the distance from the map's feature.
 
     Example:
 

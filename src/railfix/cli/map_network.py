@@ -35,7 +35,7 @@ MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "
 
 
 class RouteChoice(Settings):
-    """The way of a route through a network."""
+    """Selection of a route through a network."""
 
     tracks: str | None = option("Tracks to pass, in order; others between are found.", None, metavar="NAME,NAME...")
     via: tuple[str, ...] = option("A point to pass; repeat it in the order of travel.", (), metavar="LAT,LON")

@@ -49,7 +49,7 @@ class SimulateOptions(Settings):
 
     @property
     def words(self) -> list[str]:
-        """Options that make the same run again."""
+        """Options that reproduce the run."""
         sets = [("--set", text) for text in self.setting]
         given = [("--out", self.out), ("--seconds", self.seconds), ("--seed", self.seed), *sets]
         words = [word for name, value in given if value is not None for word in (name, str(value))]

@@ -65,7 +65,7 @@ def freeze_arrays(instance: DataclassInstance) -> None:
 
 
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
-    """Freeze the arrays of a dataclass that has one row of each; ValueError where one is longer or shorter."""
+    """Freeze the arrays of a dataclass with one row per item; ValueError where one is longer or shorter."""
     rows = len(vars(instance)[first])
     for name, value in vars(instance).items():
         if isinstance(value, np.ndarray) and len(value) != rows:
@@ -116,7 +116,7 @@ def patch_rows(result: Rows, rows: Indices, part: Rows) -> Rows:
 
 
 class RowArrays:
-    """Base of dataclasses whose arrays have one row for each of the same things."""
+    """Base of dataclasses whose arrays have one row per item of a common axis."""
 
     def take(self, rows: NDArray[Any] | slice) -> Self:
         """Return selected rows, by mask, index or slice, with the other fields unchanged."""

@@ -1,7 +1,7 @@
 """State per channel across chunks, stored by channel key and age, independent of the channels of a chunk.
 
 A chunk has the channels that were observed in it: a live epoch may lack a satellite that the previous epoch had and the
-next one has again. A stage with a state by channel works on the channels of the chunk and of its state together.
+next one has again. A stage with a state per channel operates on the channels of the chunk and of its state.
 """
 
 from __future__ import annotations

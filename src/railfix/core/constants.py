@@ -54,7 +54,7 @@ FAN_OUT: Final = 8
 LEAST_REDUNDANCY: Final = 1e-9
 #: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
 ALONG: Final = 0.9945
-#: Distance up to which the line is looked over for parts off the tangent before anything else [m].
+#: Distance over which the line is searched first for parts off the tangent [m].
 CLEAR_M: Final = 200.0
 #: Points this near to a tangent are not off it beyond any level [m].
 ON_TANGENT_M: Final = 1e-3

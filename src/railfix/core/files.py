@@ -394,8 +394,8 @@ FROM_BUILD: Final = Path(__file__).parents[1] / "_commit.txt"
 def source_commit() -> str:
     """Return the commit of the source, "unknown" where neither the build nor a checkout has it.
 
-    "+changed" follows where files were not as committed when the package was built. For a checkout
-    (``pip install -e``) git's files are read; changes since its commit are not seen.
+    "+changed" follows where files were not as committed when the package was built. For a checkout (``pip install -e``)
+    git's files are read; changes since its commit are not detected.
     """
     if FROM_BUILD.is_file():
         return FROM_BUILD.read_text(encoding="ascii").strip()

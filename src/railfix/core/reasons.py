@@ -73,8 +73,8 @@ class Status(IntEnum):
 
     #: A position along the line.
     OK = 0
-    #: A position, but another place on the line fits the ranges equally well, or, at the level's risk, one beyond the
-    #: protection level.
+    #: A position, but another position on the line fits the ranges equally well, or, at the level's risk, one beyond
+    #: the protection level.
     AMBIGUOUS = 1
     #: A position, but the ranges put it far beyond an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2

@@ -103,7 +103,9 @@ def gpst_to_utc(time: ArrayLike) -> Datetimes:
 
 
 def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indices:
-    """Return the row of rising times nearest to each wanted one, the earlier of two; -1 where none is near enough."""
+    """Return the row of rising times nearest to each requested one, the earlier of two; -1 where none is
+    near enough.
+    """
     have, want = (np.asarray(each, dtype="datetime64[ns]").astype(np.int64) for each in (time, wanted))
     if not len(have):
         return np.full(len(want), -1, dtype=np.intp)

@@ -24,10 +24,10 @@ from railfix.core.files import fingerprint, read_bytes, write_whole
 from railfix.core.geodesy import sigma_along
 from railfix.core.reasons import Status
 from railfix.core.timescale import nearest_rows, seconds
+from railfix.evaluate.accuracy import ALL, FIGURE_COLUMNS, has_position
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
-from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, has_position
-from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, list_position_tables, read_run
+from railfix.evaluate.evaluation_inputs import CONVENTIONAL, POSITIONS_TABLE, floats, list_position_tables, read_run
 from railfix.evaluate.integrity import STANFORD_COLUMNS
 from railfix.evaluate.place import TrackFiles, find_trajectory
 from railfix.io.file_kind import find_kind
@@ -177,7 +177,7 @@ BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, own limit)" for name in _OF_STANFORD},
     "error": "reason for a missing result",
 }
-#: Names in the table that people read: column, head, feature of EN 16803-1, decimals, factor.
+#: Names in the table for readers: column, head, feature of EN 16803-1, decimals, factor.
 _SHOWN: Final = (
     ("observed", "epochs", "", 0, 1),
     ("rate", "rate %", "Availability", 1, 100),
@@ -207,8 +207,9 @@ def run_benchmark(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """Run the cases of a folder with one configuration, and judge them and other programs; return `BENCHMARK_COLUMNS`
-    and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out cases.
+    """Run the cases of a folder with one configuration, and evaluate them with other programs; return
+    `BENCHMARK_COLUMNS` and notes. InputFileError: a wrong hash. MismatchError: settings that were made from held-out
+    cases.
     """
     cases = read_cases(folder)
     check_not_fitted(config, cases)
@@ -300,12 +301,12 @@ def _time_to_first(epochs: pl.DataFrame, kind: str) -> float | None:
 
 
 def heads() -> tuple[list[str], list[str]]:
-    """Return the heads of the table that people read, and the performance feature of EN 16803-1 of each column."""
+    """Return the heads of the table for readers, and the performance feature of EN 16803-1 of each column."""
     return ["case", "position", *(head for _, head, *_ in _SHOWN)], ["", "", *(name for _, _, name, *_ in _SHOWN)]
 
 
 def shown_rows(table: pl.DataFrame) -> list[list[str]]:
-    """Return the rows of the table that people read; "-" where a column has no value."""
+    """Return the rows of the table for readers; "-" where a column has no value."""
     return [
         [
             f"{row['case']}{' (held out)' if row['held_out'] else ''}",

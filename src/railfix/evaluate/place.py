@@ -19,7 +19,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.timescale import seconds
-from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder
+from railfix.evaluate.evaluation_inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.track import ANOTHER_PLACE_M
@@ -171,7 +171,7 @@ class PlaceErrors:
     error_m: Floats
     conventional_error_m: Floats
     #: Straight distance between the position on the map and the reference: its point on the map where the trajectory is
-    #: read, else its own position; shape (T,).
+    #: read, otherwise its own position; shape (T,).
     distance_m: Floats
     reference_chainage_m: Floats  #: Chainage of the reference; from the map where the reference has none; shape (T,).
     files: tuple[tuple[str, Path], ...] = ()  #: Track and vehicle, if they were read.

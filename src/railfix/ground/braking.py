@@ -1,8 +1,7 @@
 """Braking curves: how fast a train may run so that it stops before an end, on a line with gradients.
 
-After the shape of SUBSET-026 chapter 3.13, in its simplest form: one deceleration of the train with a safety factor,
-gradients as steps, no rotating mass, no adhesion, no service brake, no display of its own. Positions are distances in
-running direction.
+A simplified form of SUBSET-026 chapter 3.13: one deceleration of the train with a safety factor, gradients as steps, no
+rotating mass, no adhesion, no service brake, no display. Positions are distances in running direction.
 """
 
 from __future__ import annotations

@@ -85,7 +85,8 @@ class ReferenceCurve:
     def progress(self, chainage_m: float) -> tuple[int, float]:
         """Return the section, by its first station, and the progress in it in running direction [%].
 
-        P5 3.1: a train reports the station at a station, else the section and the progress, its length being 100 %.
+        P5 3.1: a train reports the station at a station, otherwise the section and the progress, its length being 100
+        %.
         """
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
@@ -160,7 +161,7 @@ class Rejection(Enum):
     TOO_OLD = "position too old when it was sent, or later than the train's clock; set that clock"
 
 
-#: Starts on board that are remembered.
+#: Number of earlier starts on board that are stored.
 _RETIRED = 16
 
 

@@ -111,7 +111,7 @@ def _refused_overlap(
 
 
 def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[PointName, PointState]:
-    """Return points that a train locks no more."""
+    """Return points that a train no longer locks."""
     return {
         name: replace(point, locked={n: since for n, since in point.locked.items() if n != train})
         if train in point.locked
@@ -134,7 +134,7 @@ def remove_train(state: Interlocking, train: int, layout: Layout) -> Changed:
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # a station as a whole only where its points are occupied: its tracks are sections of their own
+        # a station as a whole only where its points are occupied: its tracks are separate sections
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None

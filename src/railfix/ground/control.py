@@ -74,7 +74,7 @@ class ControlCentre:
     send: Callable[[int, bytes], None]  #: Sends bytes to a train.
     clock: Callable[[], float]  #: Centre's clock, which never runs backwards [s].
     wall_ns: Callable[[], int]  #: Time for the log [ns].
-    monitor: MonitorState | None = None  #: Of satellite positioning; None where nothing judges it.
+    monitor: MonitorState | None = None  #: Of satellite positioning; None without a triangle.
     times: MonitorLimits = field(default_factory=MonitorLimits)
     lines: list[str] = field(default_factory=list)
     reports: int = 0
@@ -103,7 +103,7 @@ class ControlCentre:
         """Return the centre with the state stored by an earlier process; at the first start as in `supervision`.
 
         Trains are unknown until they report; the detection of all points is requested from the field. Where a triangle
-        judges satellite positioning, the first start is a stop, to be released by hand; a stop of before lasts.
+        monitors satellite positioning, the first start is a stop, to be released by hand; an earlier stop remains.
         """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         asked: tuple[PointName, ...] = ()
@@ -138,7 +138,7 @@ class ControlCentre:
         self.store.note(self.wall_ns(), text, train=train)
 
     def report(self, number: int, payload: bytes) -> None:
-        """Take a report that came over the links of a train."""
+        """Process a report received over the links of a train."""
         try:
             message = decode(payload)
         except MessageError:
@@ -328,7 +328,7 @@ class ControlCentre:
         return release_train(self.supervision.state, train, self.supervision.layout)
 
     def changed(self, state: Interlocking) -> None:
-        """Take a state in which an order has changed trains; of those that are gone nothing is kept."""
+        """Set a state in which an order has changed trains; data of removed trains are dropped."""
         self.supervision.forget([number for number in self.supervision.state.trains if number not in state.trains])
         self.supervision.state = state
 
@@ -337,7 +337,7 @@ class ControlCentre:
         return self.supervision.set_route(train)
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train by hand to give its route to the next station back; return the reason of a refusal."""
+        """Request a train by hand to return its route to the next station; return the reason of a refusal."""
         return self.supervision.ask_route_back(train)
 
     def _monitor(self, now: float) -> None:

@@ -195,7 +195,7 @@ class LinkedTraffic(Traffic):
         self.links[message.train].send(encode(message), chainage_m=train.front_m, direction=train.direction)
 
     def exchange(self) -> None:
-        """Let the centre judge satellite positioning and work."""
+        """Run the centre's monitoring and supervision."""
         if self.now_s == FAULT_S:
             self.control.log("simulated fault: the clock of a satellite drifts away")
         self.control.judge(*self.verdicts[min(int(self.now_s), len(self.verdicts) - 1)])

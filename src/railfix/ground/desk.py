@@ -22,7 +22,7 @@ from railfix.ground.web import Order
 
 #: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
-#: A train that was not heard for so long runs by no authority any more (`OnBoardLimits.fresh_s`) and stands [s].
+#: A train that was silent for this time runs by no authority any more (`OnBoardLimits.fresh_s`) and stands [s].
 SILENT_S: Final = 60.0
 #: Longest reason that is taken [characters].
 LONGEST_REASON: Final = 200
@@ -75,7 +75,7 @@ class OrderedCentre(Protocol):
         """Set a train's route to the next station."""
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train to give its route to the next station back."""
+        """Request a train to return its route to the next station."""
 
 
 @dataclass(kw_only=True)
@@ -83,7 +83,7 @@ class OrderDesk:
     """Orders of one centre."""
 
     centre: OrderedCentre
-    #: Orders that have been given once, by name and values: when and by whom.
+    #: Orders that have been given once, by name and values: time and author.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
 
     def given(self, name: str, order: Callable[[Values, str], str | None], values: Values, by: str = "") -> str | None:
@@ -260,7 +260,7 @@ class OrderDesk:
         return None
 
     def orders(self) -> dict[str, Order]:
-        """Return the orders by name; each takes its values and who gives it."""
+        """Return the orders by name; each is called with its values and its author."""
         centre = self.centre
 
         def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:

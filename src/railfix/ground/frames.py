@@ -100,7 +100,7 @@ class Echo(NamedTuple):
 class ReceiverLimits(Settings):
     """Limits of a receiver."""
 
-    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest one seen.
+    delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed one.
     #: Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
     drift: float = Field(default=1e-4, ge=0)
     #: A sequence number may be further ahead of the newest by so many, and by so many a second since then.
@@ -151,7 +151,7 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return a frame to be answered and the same to be used; each None where it is not.
+        """Return a frame to be answered and the frame to be used; each None where it does not apply.
 
         A second copy is answered, so that both links are measured, but not used.
         """

@@ -261,7 +261,7 @@ class TrainLinks:
         idle_s = self.meters[name].limits.idle_s
         while True:
             try:
-                # read each time: new certificates are taken over by the next connection
+                # read each time, so that the next connection uses new certificates
                 settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
                 async with connection(
                     self._bearers[name].centre,

@@ -17,7 +17,7 @@ from railfix.ground.positions import Clock
 
 #: Backward distance of the safe front end that is not an error of two positions [m].
 ROLLED_M: Final = 50.0
-#: Reports of which the time of sending is remembered.
+#: Number of reports whose time of sending is stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
 

@@ -54,7 +54,7 @@ async def read_positions(
 
 
 async def standard_input() -> AsyncIterator[str]:
-    """Yield lines as they come; a reader that waits does not hold the end of the program up.
+    """Yield lines as they arrive; a waiting reader does not delay the end of the program.
 
     A line longer than `LONGEST_LINE` is cut to its beginning, which is no message.
     """

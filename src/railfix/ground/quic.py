@@ -28,7 +28,7 @@ from railfix.ground.keys import name_of
 
 #: Name of the protocol in the handshake.
 PROTOCOL: Final = "railfix-link/1"
-#: A connection without any packet ends after this time [s], or earlier where the train wants so (`LinkLimits.idle_s`).
+#: A connection without any packet ends after this time [s], or earlier at the train's request (`LinkLimits.idle_s`).
 IDLE_S: Final = 10.0
 #: Longest delay of a centre's answers to frames, to be sent with an authority [s].
 WAIT_S: Final = 0.2

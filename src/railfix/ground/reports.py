@@ -1,6 +1,6 @@
 """Effect of a position report on the interval of its train: pure functions.
 
-Nothing here proves a report right: `CHECKS` find reports that cannot be right together with those before. Undetected
+Nothing here proves a report right: `CHECKS` find reports that cannot be right given the earlier ones. Undetected
 errors (within the train's own bounds) are assumed away in ``docs/ground.md``.
 
 The safe rear end moves to the position that two reports in a row confirm, of a complete train of its configured length.

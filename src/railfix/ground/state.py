@@ -26,7 +26,8 @@ class InterlockingLimits(Settings):
     overlap_m: float = Field(default=0.0, ge=0)
     #: Points are released this long after the safe rear end has passed them.
     release_s: float = Field(default=3.0, ge=0)
-    #: The field answers the question for the detection of points within this time; else the trains on them are stopped.
+    #: The field answers a request for the detection of points within this time; otherwise the trains on them are
+    #: stopped.
     answer_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration, between two reports with speeds.
@@ -114,7 +115,7 @@ class PointState:
 
     @property
     def lies(self) -> bool:
-        """Whether the points are detected where they are wanted."""
+        """Whether the points are detected in their commanded position."""
         return self.detected == self.wanted
 
 
@@ -201,7 +202,7 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
             values = json.loads(text or "")
             station, side = map(int, name.removeprefix(_POINTS).split())
             points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
-    # in the order of the line, whatever the order of the texts
+    # in the order of the line, in any order of the texts
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
         granted=head["granted"], bars=frozenset((name, kind) for name, kind in head["bars"]),

@@ -72,11 +72,11 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
-        self.abandoned = False  #: A commit hangs in another thread: the connection is left to it.
+        self.abandoned = False  #: A commit hangs in another thread, which keeps the connection.
         self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:
-        """Make this process the only one that writes: a centre in charge before cannot commit any more.
+        """Make this process the only writer: an earlier centre cannot commit any more.
 
         InputFileError: when another process on this machine has the database of SQLite.
         """
@@ -103,7 +103,7 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Commit the lines of the log that are left, where the database takes them, and close it."""
+        """Commit the remaining lines of the log, where the database accepts them, and close it."""
         if self.abandoned:
             return
         if self._notes and not self._connection.invalidated:

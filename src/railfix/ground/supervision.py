@@ -103,7 +103,7 @@ class Supervision:
         sent_s, first = self.ordered.get(number, (0.0, 0))
         if number in self.ordered and is_obeyed(message, first):
             self.ordered[number] = math.inf, first
-        elif sent_s == math.inf:  # a start on board since has forgotten it
+        elif sent_s == math.inf:  # a start on board since then has reset it
             self.ordered[number] = -math.inf, first
         elif held is not None and held not in self.issued.get(number, ()):
             reason = "the train obeys an order to brake from before this start"
@@ -156,7 +156,7 @@ class Supervision:
         return tuple(points)
 
     def set_section_detected(self, section: str, occupied: bool | None) -> None:
-        """Process the detection of a section; None where it is not known any more."""
+        """Process the detection of a section; None where it is unknown."""
         self.detected[section] = occupied
         cleared = SWEPT if occupied is False else {UNKNOWN}
         bars = {bar for bar in self.state.bars if bar[0] != section or bar[1] not in cleared}
@@ -177,7 +177,7 @@ class Supervision:
         return reason
 
     def ask_route_back(self, train: int) -> str | None:
-        """Ask a train to give its route to the next station back; return the reason of a refusal."""
+        """Request a train to return its route to the next station; return the reason of a refusal."""
         self.state, reason = ask_route_back(self.state, train, self.layout, limits=self.limits)
         return reason
 

@@ -18,7 +18,7 @@ from railfix.ground.on_board import REPORT_S, OnBoard, OnBoardLimits
 from railfix.ground.positions import Clock, read_positions, standard_input
 from railfix.io.train_message import MessageError, TrainMessage, encode
 
-#: Time between two looks at the age of the authority and the braking curve [s].
+#: Interval between checks of the age of the authority and of the braking curve [s].
 LOOK_S = 0.1
 #: Longest wait for the answer to the last report, after the end of the positions [s].
 ANSWER_S: Final = 5.0

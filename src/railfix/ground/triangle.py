@@ -1,9 +1,9 @@
 """Reference triangle: verdict on satellite positioning from the fixes of three receivers at known points; its monitor.
 
 P3 (reference triangle): each fix is compared with its point by a circle of allowable error, and the vectors between
-neighbouring fixes (distance and bearing) with those between the points. P3 takes a fix inside its circle as the point
-itself, so that a drift inside the circle cannot be seen. Here the vectors are between raw fixes: errors common to the
-three receivers cancel in them, their limit can be far below the radius, and such a drift is detected.
+neighbouring fixes (distance and bearing) with those between the points. P3 treats a fix inside its circle as the point
+itself, so that a drift inside the circle cannot be detected. Here the vectors are between raw fixes: errors common to
+the three receivers cancel in them, their limit can be far below the radius, and such a drift is detected.
 
 The monitor is a pure state machine, suspension of satellite positioning with a latched stop and release by hand:
 `advance` takes the state and one sample, and returns the new state with the orders to be sent.
@@ -44,7 +44,7 @@ class TriangleVerdict(IntEnum):
     SATELLITES_OR_JAMMING = 3
     #: The fixes coincide: one false signal for all three receivers.
     SPOOFING = 4
-    #: Any other combination: the ground side cannot judge.
+    #: Any other combination: the ground side cannot decide.
     GROUND_LOST = 5
     #: A fix is absent.
     MONITOR_LOST = 6
@@ -206,7 +206,7 @@ def _verdicts(
 class Order(Enum):
     """Order of the monitor to the trains, in the order they are sent."""
 
-    #: Satellite positioning is suspended: positions from it count no more.
+    #: Satellite positioning is suspended: its positions are not used any more.
     SUSPEND = "suspend satellite positioning"
     #: Trains that depend on it stop.
     STOP = "stop"
@@ -393,7 +393,7 @@ class LiveMonitor:
     state: MonitorState = field(default_factory=lambda: MonitorState(stopped=False))
 
     def judge(self, fixes: StationFixes, now_s: float) -> tuple[MonitoredLog, tuple[Order, ...]]:
-        """Take one epoch; return it judged, and the orders to be sent; SettingsError as `monitor_log`."""
+        """Process one epoch; return its verdict, and the orders to be sent; SettingsError as `monitor_log`."""
         triangle = judge_fixes(fixes, self.limits)
         verdict, receiver = TriangleVerdict(int(triangle.verdict[0])), int(triangle.receiver[0])
         self.state, orders = advance(self.state, now_s, verdict, receiver=receiver, limits=self.times)

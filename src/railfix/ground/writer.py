@@ -14,7 +14,7 @@ from typing import Final, Protocol
 from railfix.ground.store import DatabaseError
 
 #: A commit that takes longer is an alarm [s].
-HANGS_S: Final = 2.0
+HANGS_S: Final = 1.0
 #: Time between attempts to write to a database that fails [s].
 RETRY_S: Final = 1.0
 
@@ -37,7 +37,7 @@ class DirectWriter:
 
 
 class ThreadWriter:
-    """Writer with a thread of its own, which does not keep the process from ending.
+    """Writer with a separate thread, which does not keep the process from ending.
 
     `done` is called, in that thread, after each work.
     """
@@ -55,7 +55,7 @@ class ThreadWriter:
         return outcome
 
     def stop(self, wait_s: float) -> bool:
-        """End the thread after the work that was begun; return whether it has ended in time."""
+        """End the thread after the work in progress; return whether it has ended in time."""
         self._queue.put(None)
         self._thread.join(wait_s)
         return not self._thread.is_alive()
@@ -79,7 +79,7 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> None:
 class Commits:
     """Commits of the centre, one at a time, and their fault.
 
-    `alarm`: why the store does not take the state; nothing is granted meanwhile, and stops go out all the same.
+    `alarm`: why the store rejects the state; nothing is granted meanwhile, but stops are sent.
     """
 
     writer: Writer = field(default_factory=DirectWriter)

@@ -139,7 +139,7 @@ def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices 
 
 
 def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
-    """Exclude the ranges that the robust fit rejects where no exclusion is believed."""
+    """Exclude the ranges that the robust fit rejects where no exclusion is accepted."""
     pair = raim.outcome[failing] == Outcome.EXCLUDED_TWO
     contradicted = pair & (raim.excluded[failing] & agreeing[failing]).any(axis=1)
     unresolved = contradicted | (raim.outcome[failing] == Outcome.UNRESOLVED)
@@ -179,6 +179,6 @@ def _second_attempt(
 
 
 def add_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, *, limits: RaimLimits) -> RaimResult:
-    """Return the RAIM result with P4's protection level, where no fault is left in the position."""
+    """Return the RAIM result with P4's protection level, where the position contains no fault."""
     level = reliability(model, limits=limits, scale=scale).protection_level_m
     return replace(raim, protection_level_m=np.where(raim.faulty, np.nan, level))

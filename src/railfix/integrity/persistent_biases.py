@@ -10,18 +10,18 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, copy_with
 from railfix.core.channel_state import join_channels
 from railfix.integrity.raim import LinearModel, linear_model
-from railfix.integrity.raim.model import update_model
+from railfix.integrity.raim.position_model import update_model
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
+from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.receiver_noise import LastingErrorLimits, LastingErrorState
-from railfix.positioning.windows import Windows
 
 #: Below this fraction of its own error in its residual a range does not show its error.
 _LEAST_REDUNDANCY: Final = 0.1
 #: A mean that is smaller is forgotten.
 _FORGOTTEN: Final = 1e-12
-#: Degrees of freedom that are left, so that the rest is still checked.
+#: Remaining degrees of freedom, so that the rest is still checked.
 _LEAST_FREEDOM: Final = 2
 
 
@@ -53,7 +53,7 @@ def reject_persistent_biases(
 ) -> tuple[PersistentBiases, list[LastingErrorState]]:
     """Return ranges, positions and model without satellites whose codes are wrong for a minute, and the new states.
 
-    RAIM looks at single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
+    RAIM tests single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
     time. The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
 
     Parameters
@@ -116,7 +116,7 @@ def _find_worst(mean: Floats, ranges: Ranges, share: float) -> Masks:
 
 
 def _is_remembered(state: LastingErrorState) -> Masks:
-    """Return the channels whose means are not forgotten, shape (S,)."""
+    """Return the channels whose means are kept, shape (S,)."""
     return np.asarray((np.abs(state.sums) > _FORGOTTEN).any(axis=1))
 
 

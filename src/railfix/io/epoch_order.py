@@ -122,7 +122,7 @@ class EpochOrder:
         return self._times[-1][-1] if self._times else np.datetime64(np.iinfo(np.int64).min + 1, "ns")
 
     def _handed_on(self, time: Datetimes) -> Masks:
-        """Return whether an epoch with the same tag was handed on before."""
+        """Return whether an epoch with the same tag was returned before."""
         if not self._times:
             return np.zeros(len(time), dtype=np.bool_)
         self._times = [np.concatenate(self._times)]
@@ -212,7 +212,7 @@ def _is_lone(time: Datetimes) -> Masks:
 
 
 def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
-    """Return epochs in an order, those repeated filled into the first of the same tag."""
+    """Return epochs in an order; repeated ones are merged into the first of the same tag."""
     ordered = take_epochs(joined, order)
     if not repeated.any():
         return ordered

@@ -178,7 +178,7 @@ def _receiver_runs(
     limits: tuple[np.datetime64 | None, np.datetime64 | None, np.datetime64 | None],
     progress: Callable[[float], None] | None,
 ) -> Iterator[Observations]:
-    """Yield the blocks of all receiver logs in order of time, cut to constellations and times wanted."""
+    """Yield the blocks of all receiver logs in order of time, cut to the requested constellations and times."""
     from railfix.io.receiver.log import scan_receiver_log
 
     start, end, date = limits

@@ -161,7 +161,7 @@ def qualities_in_words(log: PositionLog) -> str:
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return the names of columns in railfix and in the file, of ``NAME=COLUMN`` texts; else SettingsError."""
+    """Return the names of columns in railfix and in the file, of ``NAME=COLUMN`` texts; otherwise SettingsError."""
     columns: dict[str, str] = {}
     for pair in pairs:
         ours, equals, theirs = pair.partition("=")

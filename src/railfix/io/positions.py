@@ -91,7 +91,7 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
     )
 
 
-#: Rows that are this much out of order are sorted; those further back are left where they are [s].
+#: Rows that are out of order by at most this are sorted; others stay in place [s].
 _SORTED_S: Final = 60.0
 
 
@@ -165,7 +165,7 @@ def read_positions(
 
 
 def _in_order(log: PositionLog) -> PositionLog:
-    """Return the log with rows that are a little late put in order, and a note on times that go back."""
+    """Return the log with slightly late rows sorted, and a note on times that go back."""
     known = np.flatnonzero(~np.isnat(log.time))
     time = log.time[known]
     back = np.flatnonzero(np.diff(time) < np.timedelta64(0, "ns")) + 1

@@ -27,7 +27,7 @@ class XmlLine:
 
 def read_root(path: FilePath) -> Element:
     """Return the root of an XML file; InputFileError where it is not such a file."""
-    content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros
+    content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros behind
     try:
         text: str | bytes = content.decode("utf-8")
     except UnicodeDecodeError:  # in the encoding that the file declares

@@ -1,4 +1,4 @@
-"""The level at which Gaussian tails of many hypotheses together keep within a risk."""
+"""The level at which Gaussian tails of many hypotheses sum to a risk."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def solve_level(
     share : ndarray, shape (T, kinds)
         Risk that each kind may use.
     reserved : ndarray, shape (T,)
-        Risk taken off their sum beforehand.
+        Risk subtracted from their sum beforehand.
 
     Returns
     -------

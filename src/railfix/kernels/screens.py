@@ -53,7 +53,7 @@ def suspicions(
             suspected = suspected and not math.isnan(value) and time_ns[t] <= start + hold_ns
             if suspected:
                 total += value
-                suspected = abs(total) > limit[t, m]  # the epoch of coming back is not judged again
+                suspected = abs(total) > limit[t, m]  # the epoch of return is not checked again
             elif abs(value) > limit[t, m]:
                 start, total, suspected = time_ns[t], value, True
             if suspected:
@@ -65,7 +65,7 @@ def suspicions(
 
 @kernel
 def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
-    """Return the median of the values (T, M) of each clock at its channels; NaN is left out.
+    """Return the median of the values (T, M) of each clock at its channels; NaN is ignored.
 
     NaN below `least` satellites with a finite value; clock and satellite of each channel are numbers, shape (M,).
     """

@@ -1,6 +1,6 @@
 """Two channels: the same input through two processes, every message compared byte by byte (P1 2.1).
 
-The second channel is a process of its own. Both get the same epochs, records and clock readings; each returns its
+The second channel is a separate process. Both get the same epochs, records and clock readings; each returns its
 messages with digests of its stages. At the first difference the output stops and the first stage that differs is named.
 """
 
@@ -103,7 +103,7 @@ class TwoChannels(LiveEngine):
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
-        # before there is anything to process: waiting for it later would hold up data, and the end by a signal
+        # before there is data to process: a later wait would delay data, and the end by a signal
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 

@@ -111,7 +111,7 @@ class SessionLog:
     """Log of a session, on the standard error output and in a rotating file, and the status line.
 
     At `LiveSettings.log_bytes` the file is put aside as ``path.1``, and so on (OutputError when it cannot be opened). A
-    status line that is wanted is shown where the standard error output is a terminal.
+    requested status line is shown where the standard error output is a terminal.
     """
 
     def __init__(self, path: Path | None, settings: LiveSettings, *, status: bool = True) -> None:
@@ -183,7 +183,7 @@ class Metrics:
     _sent: float | None = None
 
     def took(self, seconds: float, outputs: Sequence[LiveOutput]) -> None:
-        """Count messages that go out now, and the time they took together."""
+        """Count messages that are sent now, and their total processing time."""
         now = time.monotonic()
         for output in outputs:
             self.processing_s.append(seconds / len(outputs))

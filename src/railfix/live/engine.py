@@ -25,9 +25,9 @@ from railfix.live.stream import FOREVER, Lag, Sensed
 from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.received import merge_navigation
 from railfix.pipeline.results import Result
-from railfix.pipeline.state import State
 from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].
@@ -175,7 +175,7 @@ class LiveEngine:
     def _hear(self, item: _FromSatellites) -> None:
         self._heard = item.heard
         last = self._from_satellites[-1] if self._from_satellites else None
-        if last is not None and last.heard > self._heard_at_push:  # no epoch came between
+        if last is not None and last.heard > self._heard_at_push:  # no epoch was received between
             self._from_satellites[-1] = last.with_later(item)
         else:
             self._from_satellites.append(item)

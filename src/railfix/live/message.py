@@ -53,7 +53,7 @@ class TrainPlace:
     #: Chainage of the reference point; NaN without a place.
     chainage_m: float
     sigma_m: float
-    #: Bound of its error, and the protection level under it; infinite where none is promised.
+    #: Bound of its error, and the protection level under it; infinite where no bound exists.
     bound_m: float
     level_m: float
     status: MessageStatus
@@ -84,7 +84,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
         arc, sigma = float(track.tracked.arc_m[-1]), float(track.tracked.sigma_m[-1])
         amount = float(track.tracked.amount_m[-1])
     bound = level + abs(place - single) + _ROUNDING_M if math.isfinite(single) else math.inf
-    if math.isfinite(amount) and track is not None:  # the filter has a level of its own
+    if math.isfinite(amount) and track is not None:  # the filter has a separate level
         bound, level = amount + _ROUNDING_M, float(track.tracked.level_m[-1])
     chainage, geodetic = math.nan, None
     if math.isfinite(place):
@@ -98,7 +98,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
     # The bound of a position that failed a check does not apply to the dead-reckoned position.
     if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
         status = MessageStatus.DOUBTFUL
-    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # no bound is promised, so none is sent
+    if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # without a bound none is sent
         bound = math.inf
     moving = int(track.direction[-1]) if track is not None and len(track) else 0
     return TrainPlace(
@@ -192,7 +192,7 @@ _INTERFERENCE: Final = frozenset(SuspectedInterference)
 
 
 def _find_suspicion(result: Result) -> SuspectedInterference | None:
-    """Return the worst interference of the antennas at the last epoch; None where it is not looked for."""
+    """Return the worst interference of the antennas at the last epoch; None without this check."""
     found = [int(a.interference.suspicion[-1]) for a in result.antennas.values() if a.interference is not None]
     return SuspectedInterference(max((k for k in found if k in _INTERFERENCE), default=0)) if found else None
 

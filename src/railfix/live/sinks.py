@@ -214,14 +214,14 @@ class MqttTarget:
             if self._client.is_connected():
                 info.wait_for_publish(max(until - time.monotonic(), 0.0))
         self._client.disconnect()
-        # a broker that reads no more would hold the end up for as long as its connection lives
+        # a broker that stops reading would delay the end for the lifetime of its connection
         ending = threading.Thread(target=self._client.loop_stop, daemon=True)
         ending.start()
         ending.join(max(until - time.monotonic(), 0.5))
 
 
 class OutletSink(Outlet[LiveOutput]):
-    """A target behind a queue of its own, closed with it."""
+    """A target with its own queue, closed with it."""
 
     def __init__(self, name: str, target: Any, *, waiting: int, full: str) -> None:
         super().__init__(name, target.send, waiting=waiting, full=full)
@@ -241,7 +241,7 @@ class OutletSink(Outlet[LiveOutput]):
 
 
 class TcpServerSink:
-    """Everybody who connects gets the messages from then on; who does not keep up is disconnected."""
+    """Every connected client gets the messages from then on; a client that is too slow is disconnected."""
 
     def __init__(self, form: Form, name: str) -> None:
         self.form, self.name = form, name
@@ -259,7 +259,7 @@ class TcpServerSink:
         try:
             while await reader.read(1024):
                 pass
-        except OSError:  # the reader has gone, as at the end of its data
+        except OSError:  # the reader has closed the pipe, as at the end of its data
             pass
         finally:
             self._readers.discard(writer)

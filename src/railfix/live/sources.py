@@ -238,7 +238,7 @@ async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> As
 class _Answer:
     """Answer of a caster: HTTP 1.1 by h11 (NTRIP 2), or ``ICY 200 OK`` and bytes (NTRIP 1).
 
-    `begun`: it is a stream of a mount point; `ended`: the caster has ended it.
+    `begun`: the mount point sends a stream; `ended`: the caster has ended it.
     """
 
     def __init__(self, source: str) -> None:

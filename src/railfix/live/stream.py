@@ -290,7 +290,7 @@ STEADY_EPOCHS: Final = 5
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs above the shortest one seen, so that the clocks need not agree."""
+    """Delay of epochs above the shortest observed one, so that the clocks need not agree."""
 
     behind_s: float  #: With a larger delay epochs are skipped until it is a quarter of that; infinite: never.
     skipped: int = 0  #: Epochs skipped since the session fell behind.

@@ -26,7 +26,7 @@ class Ends(NamedTuple):
 
     front_m: float  #: Middle of the possible positions of the front end.
     spread_m: float  #: Largest distance of the front end from it.
-    foremost_m: float  #: No part of the train is further ahead.
+    foremost_m: float  #: No part of the train is farther ahead.
     rearmost_m: float  #: No part of the train is further behind.
 
 
@@ -40,7 +40,7 @@ class TrainFrame:
 
     trajectories: Mapping[str, Trajectory]
     facing: int  #: Direction of the vehicle's front along the line, 0 where unknown.
-    running: int  #: Direction in which the end that runs ahead looks at the start, 0 where unknown.
+    running: int  #: Direction of the leading end at the start, 0 where unknown.
     #: Front end of the train ahead of the reference point, its rear end behind it, and its length [m]; NaN where
     #: unknown.
     front_m: float
@@ -167,5 +167,5 @@ class RunningEnd:
             return None
         side = "rising" if self.direction > 0 else "falling"
         if not before.direction:
-            return f"the train runs toward {side} chainage: its front end is taken to look there"
+            return f"the train runs toward {side} chainage: its front end is assumed to point there"
         return f"the train has changed ends: it has run {CHANGED_ENDS_M:g} m toward {side} chainage"

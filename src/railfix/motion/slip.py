@@ -1,7 +1,7 @@
 r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
 
-``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; else it becomes
-one that no line has. Two rules:
+``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; otherwise it
+becomes one that no line has. Two rules:
 
 * ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
 slip, not its speed: at constant slip speed the rule is silent. * ``"map"``: against the gradient of the line at the
@@ -110,7 +110,7 @@ class SlipState:
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Return the rate of the pitch from body rates (N, 3), the roll in curves taken out, shape (N,) [rad/s].
+    """Return the rate of the pitch from body rates (N, 3), the roll in curves eliminated, shape (N,) [rad/s].
 
     The body leans with the cant: ``w_y cos(phi) - w_z sin(phi)`` with ``sin(phi) = (v w_z - f_y) / g``. Raw it would be
     wrong by 3.4 mrad/s in a curve of 400 m at 17 m/s.
@@ -195,7 +195,7 @@ class _Automaton:
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
 
     def copy(self, limits: SlipLimits) -> _Automaton:
-        """Return the same with numbers of its own: states handed on stay as they are."""
+        """Return a copy: states that were returned stay unchanged."""
         other = copy.copy(self)
         other.limits, other._past = limits, self._past.copy()
         return other
@@ -287,7 +287,7 @@ class _Automaton:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
-        """The wheel turns: it is believed unless the pitch contradicts."""
+        """The wheel turns: its distance is used unless the pitch contradicts."""
         limits = self.limits
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")

@@ -50,7 +50,7 @@ class LineFeatures:
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])
         return cls(
             series=series, features=tuple(map_features(series)), antenna_m=np.asarray(trajectory.arc_m),
-            body_m=line.arc_at_chainage(inside) + body - inside, line=Line.of(line),
+            body_m=line.arc_at_chainage(inside) + body - inside, line=Line(line),
         )  # fmt: skip
 
     def body_at(self, antenna_m: Floats) -> Floats:
@@ -69,7 +69,7 @@ def ahead_m(trajectory: Trajectory) -> float:
 class RateSeries:
     """Rates of the body at K ticks."""
 
-    #: Times at which they hold, and when they were known; shape (K,).
+    #: Times for which they are valid, and when they became known; shape (K,).
     time: Datetimes
     known: Datetimes
     distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).

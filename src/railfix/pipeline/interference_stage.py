@@ -29,10 +29,10 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion import MotionFit, fit_motion
+from railfix.integrity.interference.motion_signs import MotionFit, fit_motion
 from railfix.integrity.interference.range_fits import MotionInputs
+from railfix.pipeline.solution import Solution
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.range_arrays import InterSystemBiases
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Reasons that ranges get because they contradict others, as those of a spoofer do.
@@ -76,7 +76,7 @@ class InterferenceState:
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
-    second: int = -1  #: GPS second of the last epoch that was looked at.
+    second: int = -1  #: GPS second of the last epoch that was checked.
     #: Break and the receiver's alarms since then.
     broken: bool = False
     alarm: int = 0
@@ -97,25 +97,13 @@ class Interference:
         return suspicion(self.causes)
 
 
-class PositionEpochs(NamedTuple):
-    """Results of single epochs that the signs are searched for in, T epochs."""
-
-    #: 3-D positions without the map, of all ranges; and of those that agree, NaN where ranges contradict each other;
-    #: shape (T, 3).
-    point_ecef_m: Floats
-    consistent_ecef_m: Floats
-    noise_scale: Floats  #: Shape (T,).
-    ties: InterSystemBiases  #: Inter-system biases known before each epoch.
-    status: Codes  #: `Status`, before causes are known; shape (T,).
-
-
 def _motion_inputs(
-    corrected: CorrectedRanges, single: PositionEpochs, antennas: AntennaRows, rows: Indices, broken: Masks
+    corrected: CorrectedRanges, single: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
     """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the previous epoch."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
-    near = np.where(np.isnan(consistent), single.point_ecef_m[rows], consistent)
+    near = np.where(np.isnan(consistent), single.point.ecef_m[rows], consistent)
     first, lines = 0, []
     for index, own in antennas.split(rows):
         part = slice(first, first := first + len(own))
@@ -141,7 +129,9 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites that are wrong separately, not by a spoofer who moves all of a clock; shape (T, K)."""
+    """Return the satellites that are wrong individually, not by a spoofer who moves all satellites of a clock; shape
+    (T, K).
+    """
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -277,7 +267,7 @@ def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
 
 def judge_interference(
     corrected: CorrectedRanges,
-    single: PositionEpochs,
+    single: Solution,
     antennas: AntennaRows,
     states: list[InterferenceState],
     limits: InterferenceLimits,

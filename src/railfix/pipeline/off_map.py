@@ -12,7 +12,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
 
 _NEVER: Final = np.datetime64("NaT", "ns")
-#: Time over which the offset of a train that is away is remembered [s].
+#: Time for which the offset of a train off the map is stored [s].
 _REMEMBERED_S: Final = 30.0
 #: A train is back where the mean offset of its positions is a smaller share of what it was away; or metres.
 _BACK_SHARE: Final = 0.5

@@ -46,7 +46,7 @@ def gated_codes(
     line: Line,
     limits: SensorLimits,
 ) -> tuple[Masks, ReturnState]:
-    """Return the epochs whose codes do not count yet, shape (T,), and the state to pass on.
+    """Return the epochs whose codes are not yet used, shape (T,), and the state to pass on.
 
     After an outage single-epoch positions are compared with the position dead-reckoned by the sensors: codes are used
     again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,

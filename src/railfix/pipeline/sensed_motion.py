@@ -84,7 +84,7 @@ class SensedMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class SensedState:
-    """What one chunk leaves to the next."""
+    """State after a chunk."""
 
     tick: int = 0  #: Number of the last sample since the beginning of GPS time; 0 before the first.
     #: Position of the antenna then, by the wheel since the filter's last position; NaN where it is not known.
@@ -214,7 +214,7 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 def _by_interval(
     state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Return samples brought together by interval: `at` is the first sample after each instant, 0 after the first.
+    """Return samples grouped by interval: `at` is the first sample after each instant, 0 after the first.
 
     `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """

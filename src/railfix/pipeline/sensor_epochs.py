@@ -134,7 +134,7 @@ def sensor_epochs(
 
     Samples are those since the previous chunk, epochs those of the antenna, shape (T,); the trajectory determines the
     direction of the front, `sine_at` the sine of the gradient at arc lengths (without it the line is unknown).
-    `sources` names which of `wheel`, `radar`, `force`, `feature`, `balise` and `range` are wanted, `references` has
+    `sources` names the requested ones of `wheel`, `radar`, `force`, `feature`, `balise` and `range`, `references` has
     features of the line, ground units and listed balises.
     """
     if not (samples or state.samples):

@@ -55,7 +55,7 @@ class AntennaRows:
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
-        """Return the same, joined."""
+        """Return the rows of several antennas, joined."""
         return join_epochs(self.apart(function, *of_antennas))
 
     def each_with_state(

@@ -7,7 +7,7 @@ speed v along the unit tangent e of its path measures
     ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
 
 with the drifts of both clocks in m/s and the change of the tropospheric delay. Unknown are v and d_r, whatever the
-number of constellations. The ionosphere's change (millimetres a second) is left in.
+number of constellations. The ionosphere's change (millimetres per second) is neglected.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class DopplerSpeedLimits(Settings):
     #: A Doppler is left out when its residual is over this many of its own standard deviations (the w-test of W.
     #: Baarda, 1968); the largest goes first.
     outlier: float = Field(default=3.5, gt=0)
-    most_rejected: int = Field(default=8, ge=0)  #: Dopplers left out at an epoch at most.
+    most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers left out per epoch.
     min_satellites: int = Field(default=4, ge=3)  #: Satellites that must be left; 2 are solved for.
 
 

@@ -23,9 +23,9 @@ from railfix.track.trajectory import Trajectory
 
 #: Raw codes, without atmospheric corrections, are not wrong by this much but for gross errors [m].
 GROSS_M: Final = 100.0
-#: Largest median residual of the codes that are left: they agree with each other [m].
+#: Largest median residual of the remaining codes: they agree with each other [m].
 AGREEING_M: Final = 30.0
-#: Redundant ranges that are left after an exclusion in space, so that the rest is still checked.
+#: Redundant ranges that remain after an exclusion in space, so that the rest is still checked.
 _LEFT_IN_SPACE: Final = 3
 #: Where only one or two ranges remain, the other exclusions must fit worse by this factor.
 _CLEARER: Final = 5.0
@@ -90,7 +90,7 @@ def _freedom(ranges: Ranges, unknowns: int) -> Integers:
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     """Return the raw codes that are off by more than `GROSS_M`, shape (T, M), where the others agree on a position.
 
-    Three redundant ranges are left and agree. With fewer ranges, one is rejected where leaving it out makes the others
+    Three redundant ranges remain and agree. With fewer ranges, one is rejected where leaving it out makes the others
     agree, and leaving out any other one does not.
     """
     place = least_absolute(ranges, start_ecef_m)

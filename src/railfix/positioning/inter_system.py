@@ -66,7 +66,7 @@ def tie_constellations(
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
         Approximate positions.
     states : sequence of OffsetState
-        Of each receiver after the epochs before; returned anew.
+        State of each receiver after the earlier epochs; the new states are returned.
     reference : str, optional
         Letter of the clock that biases refer to; by default that of GPS, or the first one without GPS.
     parts : sequence of slice

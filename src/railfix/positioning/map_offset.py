@@ -19,9 +19,9 @@ from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.noise_windows import correlated_sums
 from railfix.positioning.normal_equations import SinglePoint
 from railfix.positioning.range_arrays import RangeArrays, Ranges
-from railfix.positioning.windows import correlated_sums
 
 _SUMS: Final = 9  #: Sums of a window.
 
@@ -172,7 +172,9 @@ def map_offset(
 
 
 def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
-    """Return how far 3-D positions (T, 3) lie right of places on the line and above them, shape (T, 2); NaN without."""
+    """Return how far 3-D positions (T, 3) lie right of positions on the line and above them, shape (T, 2); NaN
+    without.
+    """
     known = np.isfinite(arc_m)
     arc = np.where(known, arc_m, 0.0)
     axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]

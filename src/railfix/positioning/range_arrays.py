@@ -1,6 +1,6 @@
 """Pseudoranges ready to be fitted, each with its weight: the arrays that the stages of positioning take.
 
-Arguments are checked here, at the edge; the stages and the compiled functions trust them.
+Arguments are checked here, at the interface; the stages and the compiled functions do not check them again.
 """
 
 from __future__ import annotations

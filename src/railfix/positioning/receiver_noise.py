@@ -28,9 +28,9 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Str
 from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.noise_windows import Dated, Windows, correlated_sums
 from railfix.positioning.normal_equations import Constrained, SinglePoint
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
-from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory
 
 
@@ -90,7 +90,7 @@ def map_information(trajectory: Trajectory, section: Indices) -> Floats:
 
 
 def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
-    """Return the same by the axes of the line there, shape (T, 3, 3), and the sigmas of its map."""
+    """Return it in the axes of the line there, shape (T, 3, 3), and the sigmas of its map."""
     across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
         across[:, :, None] * across[:, None, :] / sigma_plan_m**2 + up[:, :, None] * up[:, None, :] / sigma_height_m**2

@@ -68,7 +68,7 @@ class Section:
 
 
 class SectionCandidates(NamedTuple):
-    """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points."""
+    """Evaluated points, sorted by epoch and point, with q and its slope there; n epochs, p points."""
 
     #: The epochs, and how many points each has (at least one); shape (n,).
     at: Indices

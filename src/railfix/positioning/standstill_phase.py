@@ -17,7 +17,8 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-_WITHIN: Final = 40.0  #: Vectors whose square exceeds the least by more are not looked for: exp(-20) of its likelihood.
+#: Vectors whose square exceeds the least by more are not searched for: exp(-20) of its likelihood.
+_WITHIN: Final = 40.0
 _ROUNDING: Final = 1e-9  #: Exchange of two unknowns must shrink the conditional variance by more than rounding.
 
 

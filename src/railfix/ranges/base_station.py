@@ -20,7 +20,7 @@ _SAME_S: Final = 0.05
 #: centimetres in 30 s, and phase errors by millimetres in a second.
 LONGEST_AGE_S: Final = 60.0
 _PHASE_AGE_S: Final = 1.1
-#: Added for each kilometre between the two: ionosphere, troposphere and orbits seen from elsewhere.
+#: Added for each kilometre between the two: differences of ionosphere, troposphere and orbit errors.
 _PER_KM_M: Final = 0.004
 LONGEST_KM: Final = 100.0  #: Distance up to which the station is used [km].
 
@@ -100,8 +100,8 @@ class BaseErrors:
         """Return the newest errors at the epochs of a train (T,), for its channels (K,), near approximate positions (T,
         3) [m].
 
-        A channel that the station has on another signal of the same band takes that one: a constant of the
-        constellation is the difference.
+        A channel that the station has on another signal of the same band uses that one: a constant of the constellation
+        is the difference.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}

@@ -50,8 +50,8 @@ class ErrorModelFit(Settings):
     """Settings of the fit of an error model."""
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
-    #: Independent passes below which a bin takes the samples of a wider set of bins. 30: its largest error is then
-    #: about the quantile of 2 standard scores, so that at least the shoulder of the tail was seen.
+    #: Independent passes below which a bin uses the samples of a wider set of bins. 30: its largest error is then about
+    #: the quantile of 2 standard scores, so that at least the shoulder of the tail is sampled.
     least_blocks: int = option(
         "Passes of a satellite (30 s blocks) below which a bin takes the values of a wider one.", 30, metavar="N", ge=1
     )

@@ -41,8 +41,8 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
 
 
-#: Accuracies of records (URA, SISA) up to this are covered by `satellite_sigma_m`: 2 to 4.85 m are usual. A worse one
-#: is believed: it is added to the sigma of the satellite's ranges.
+#: Accuracies of records (URA, SISA) up to this are covered by `satellite_sigma_m`: 2 to 4.85 m are usual. A worse
+#: accuracy is added to the sigma of the satellite's ranges.
 _USUAL_ACCURACY_M: Final = 5.0
 
 
@@ -53,14 +53,14 @@ class NominalErrors(Settings):
     (A.4.4.10.4 and A.4.2.4).
     """
 
-    #: Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions promise 2 m and
-    #: 95 % of the time less.
+    #: Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions state 2 m and 95
+    #: % of the time less.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
-    #: Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, but treated as independent.
+    #: Vertical delay error of Klobuchar's model. Mostly common to all satellites, but treated as independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
     #: Added in quadrature with typical coefficients, and to the ranges: the difference of the two models.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
-    #: Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4).
+    #: Vertical delay error of the standard atmosphere (DO-229D A.4.2.4).
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats) -> Floats:

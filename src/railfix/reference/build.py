@@ -21,7 +21,6 @@ from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import Acceleration, Pulses
-from railfix.motion.tachometer import Wheel, estimate_wheel
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.fixes import Fixes, ReferenceSettings, judge_alone, judge_pair, judge_place, judge_travel
 from railfix.reference.smoother import (
@@ -38,6 +37,7 @@ from railfix.reference.smoother import (
     slip_m,
     smooth,
 )
+from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
 #: Speeds farther apart leave the distance between them unknown [s], with this variance [m2].
@@ -133,7 +133,7 @@ class _ReferenceBuilder:
         self.trajectory = data.trajectories[name]
 
     def built(self, fixes: Fixes) -> Built:
-        """From judged fixes to the reference."""
+        """From checked fixes to the reference."""
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
@@ -273,7 +273,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to instants and its variance: by a wheel if any, else by Dopplers."""
+        """Return the distance travelled up to instants and its variance: by a wheel if any, otherwise by Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

@@ -281,7 +281,9 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the random error of the wheel from the closing errors, its scale taken off [m per square root of m]."""
+    """Return the random error of the wheel from the closing errors, without its scale error [m per square
+    root of m].
+    """
     moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m

@@ -13,7 +13,7 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
 from railfix.core.tables import Table, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.evaluate.inputs import floats
+from railfix.evaluate.evaluation_inputs import floats
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name, positions_diagram
 from railfix.evaluate.tables import level_tables, select_evaluation
 from railfix.pipeline.level_stage import prior_basis_text
@@ -83,7 +83,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
 
 
 def _priors(priors: Any) -> str:
-    """Return priors by constellation, equal ones together."""
+    """Return priors by constellation, equal ones merged."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}

@@ -25,7 +25,7 @@ from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
 from railfix.run.inputs import LogReading, RunInputs, RunOptions
 from railfix.run.output import check_folder
-from railfix.run.processor import with_measured_priors
+from railfix.run.processor_setup import with_measured_priors
 from railfix.run.record import read_record
 
 #: A field in a pattern: ``{day}``.
@@ -107,7 +107,7 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     for name, pattern in patterns.items():
         _check_pattern(path, name, pattern)
         if other := sorted(set(_FIELD.findall(pattern)) - set(fields)):
-            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front has not")
+            raise SettingsError(f"{path}: {name} has the field {other[0]}, which front lacks")
     found = {name: _find(folder, pattern) for name, pattern in patterns.items()}
     keys = list(dict.fromkeys(tuple(values[name] for name in fields) for _, values in found["front"]))
     if not keys:

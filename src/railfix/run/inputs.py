@@ -191,7 +191,7 @@ class RunInputs(InputFiles):
         return inputs, config
 
     def with_settings(self, config: Config) -> Self:
-        """Return the same with the files that settings name."""
+        """Return the inputs with the files that settings name."""
         models = {name: getattr(config, name) for name in ("cn0_curve", "error_model", "integrity_support")}
         return self.replaced(**models, sbas=() if config.sbas == "stream" else config.sbas)
 

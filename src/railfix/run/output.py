@@ -140,7 +140,7 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-#: Rows of a group of a file, which is put together in memory.
+#: Rows of a group of a file, which is combined in memory.
 _GROUP: Final = 30_000
 #: How often a caller that waits looks whether the writer has failed [s].
 _LOOK_S: Final = 0.1
@@ -332,7 +332,7 @@ class OutputFolder:
         """Write a table again, Parquet and CSV, some rows at a time, changed."""
         import polars as pl
 
-        from railfix.pipeline.tables import round_floats
+        from railfix.pipeline.result_tables import round_floats
 
         file = f"{name}.parquet"
         self._csv.pop(f"{name}.csv").close()

@@ -16,13 +16,11 @@ from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES, Suspicion
 from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
-from railfix.pipeline.antennas import AntennaOrder
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.results import AntennaResult, Result
-from railfix.pipeline.smoothing import Replay, smooth
-from railfix.pipeline.tables import (
+from railfix.pipeline.result_tables import (
     antenna_positions,
     antenna_train,
     observations_table,
@@ -33,6 +31,8 @@ from railfix.pipeline.tables import (
     train_table,
     with_smoothed,
 )
+from railfix.pipeline.results import AntennaResult, Result
+from railfix.pipeline.smoothed_track import Replay, smooth
 from railfix.run.output import OutputFolder
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sources import OpenedLine
@@ -231,7 +231,7 @@ class AntennaTally:
 
     @property
     def never_recorded(self) -> dict[str, int]:
-        """Satellites seen for which no record was ever usable, with their observations."""
+        """Satellites seen for which no record was usable, with their observations."""
         return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
 
     def as_dict(self) -> dict[str, Any]:
@@ -324,10 +324,10 @@ class ResultRows:
 
     folder: OutputFolder
     line: OpenedLine
-    observations: bool  #: Whether rows of observations are wanted.
+    observations: bool  #: Whether rows of observations are requested.
     checks: SensorChecks | None  #: Collects those of the first antenna, where there are sensors.
     replays: Mapping[str, Replays]  #: Keeps the filter's input, by antenna; empty where nothing is smoothed.
-    passings: bool = False  #: Whether rows of balises and virtual ones are wanted.
+    passings: bool = False  #: Whether rows of balises and virtual ones are requested.
     #: Balises so far that were missed, or read where they are not.
     balise_notes: list[str] = field(default_factory=list)
 
@@ -347,7 +347,7 @@ class ResultRows:
             tables["passings"] = passing_table(result)
         for name, kept in self.replays.items():
             if name in result.fusion:
-                kept.keep(result.fusion[name].replay)
+                kept.keep(result.replays[name])
         if self.line.route is not None:
             tables["positions"], tables["tracks"] = self.line.route.on_tracks(tables["positions"], self.line.track)
             if "train" in tables:
@@ -395,7 +395,7 @@ def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, fold
     smoothed = {}
     for name, kept in replays.items():
         trajectory = processor.trajectories[name]
-        result = smooth(kept.backward(), Line.of(trajectory), processor.config.tracking)
+        result = smooth(kept.backward(), Line(trajectory), processor.config.tracking)
         smoothed[name] = smoothed_table(result, trajectory)
     done = dict.fromkeys(smoothed, 0)
 

@@ -88,7 +88,7 @@ class AntennaPairScreened(Screened):
 
 
 class Spacing(NamedTuple):
-    """Line from the rear to the front antenna, shape (P,) or scalar each; NaN where unknown: not judged."""
+    """Line from the rear to the front antenna, shape (P,) or scalar each; NaN where unknown: not tested."""
 
     heading_deg: ArrayLike
     gradient_permille: ArrayLike

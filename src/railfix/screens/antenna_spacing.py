@@ -51,13 +51,13 @@ def antenna_spacing_screen(
     Parameters
     ----------
     chainage_front_m, chainage_rear_m : array_like, shape (P,) [m]
-        Of the same instants, counted along one line; NaN without a position: not judged.
+        Of the same instants, counted along one line; NaN without a position: not tested.
     spacing_m : array_like, shape (P,) or scalar [m]
         Front less rear along the track as the chainages count it, not negative: the antennas' distance
         where each chainage is the one abeam its antenna, 0 where both are that of one reference point.
     facing : array_like of int, shape (P,) or scalar
         1 where the vehicle's front looks to rising chainage, -1 to falling, 0 where that is unknown:
-        then the order of the two is not judged.
+        then the order of the two is not tested.
 
     Returns
     -------

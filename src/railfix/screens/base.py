@@ -36,7 +36,7 @@ LEAST_SUSPICION: Final = 2.0
 class Screened:
     """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions."""
 
-    metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot judge.
+    metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot be run.
     reject: Masks  #: True = rejected. Where the metric is NaN the screen does not reject.
     #: Limit that the metric is compared with, in its unit; broadcasts to it; NaN where nothing is compared.
     limit: Floats | float = float("nan")
@@ -130,12 +130,12 @@ class Screen(ABC, Generic[Limits]):
 
     name: ClassVar[str]  #: In `Config.screens`, and of its group of settings.
     limits: Limits  #: Default limits; their type has the fields of the group of settings.
-    needs: ClassVar[str]  #: Data without which it cannot judge, for the note.
+    needs: ClassVar[str]  #: Data without which it cannot be run, for the note.
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
     observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
-        """Return whether the screen can judge nothing in this run."""
+        """Return whether the screen cannot be run at all in this run."""
         return False
 
     def notes(self, limits: Limits, setup: ScreenSetup) -> tuple[str, ...]:

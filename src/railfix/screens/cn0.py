@@ -61,7 +61,7 @@ def cn0_screen(
     Parameters
     ----------
     cn0_dbhz : array_like, shape (T, M) [dB-Hz]
-        NaN where the log has none: not judged.
+        NaN where the log has none: not tested.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
     curve : Cn0Curve, optional

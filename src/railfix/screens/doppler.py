@@ -61,7 +61,7 @@ class DopplerLimits(Settings):
     doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
     #: Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Over a longer interval the screen cannot judge.
+    #: Over a longer interval the screen is not run.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
     #: How long a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back, which is
     #: exactly P1's test.
@@ -99,7 +99,7 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
     noise = (sigma_m[1:] ** 2 + sigma_m[:-1] ** 2) * fresh + (limits.doppler_sigma_mps * interval) ** 2
-    # a NaN stays one: without its sigma a satellite is not judged
+    # a NaN stays NaN: without its sigma a satellite is not tested
     return np.asarray(np.maximum(limits.step_m, limits.factor * np.sqrt(noise)) + _jerk_m(interval, limits))
 
 
@@ -160,7 +160,7 @@ class DopplerState:
 
 
 class DopplerChannels(NamedTuple):
-    """Channels, shape (M,) each; the carrier [Hz] is NaN where unknown: not judged."""
+    """Channels, shape (M,) each; the carrier [Hz] is NaN where unknown: not tested."""
 
     satellite: Strings
     signal: Strings
@@ -197,7 +197,7 @@ def doppler_screen(
     break_before : array_like of bool, shape (T,), optional
         Nothing is differenced across the step into these epochs.
     code_sigma_m : array_like, shape (T, M) [m], optional
-        Noise of the codes, requested by mode "sigma"; NaN there: not judged.
+        Noise of the codes, requested by mode "sigma"; NaN there: not tested.
     state : DopplerState, optional
         Left by the previous chunk.
 
@@ -271,7 +271,7 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 
 
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
-    """Return the change of the codes against the Dopplers, the clock taken out, shape (T, M) [m]."""
+    """Return the change of the codes against the Dopplers, the clock eliminated, shape (T, M) [m]."""
     raw = change - rate * interval[:, None]
     # the receiver clock's step is not elapsed time
     passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT

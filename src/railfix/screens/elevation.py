@@ -30,7 +30,7 @@ class ElevationLimits(Settings):
 def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None = None) -> Screened:
     """Reject satellites below the mask, 20 degrees in P1 table 6.
 
-    The metric is the elevation [deg], NaN where unknown: not judged.
+    The metric is the elevation [deg], NaN where unknown: not tested.
     """
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)

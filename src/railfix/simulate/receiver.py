@@ -24,7 +24,7 @@ from railfix.simulate.settings import InterSystemSettings, NoiseSettings, Tracki
 
 
 class CarriedNoise:
-    """Correlated noise of a receiver's channels, the same whatever the chunks; `key` is the seed of the receiver."""
+    """Correlated noise of a receiver's channels, independent of the chunks; `key` is the seed of the receiver."""
 
     def __init__(self, settings: NoiseSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
         self._settings = settings

@@ -96,7 +96,7 @@ class VehicleSettings(ScenarioSettings):
     gauge_m: Positive = 1.067
     front: Three = (9.1, 0.25, 3.95)
     rear: Three = (-9.1, 0.25, 3.95)
-    length_m: Positive = 23.2  #: Over the ends, which are at the same distance from the middle between the bogies.
+    length_m: Positive = 23.2  #: Distance over the ends, which are equally far from the middle between the bogies.
     #: Roll of the body about its forward axis at 20 m/s and more, in proportion to the speed below that. Not in the
     #: vehicle's file, as it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0

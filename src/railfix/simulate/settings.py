@@ -238,7 +238,7 @@ class TachometerSettings(ScenarioSettings):
     lowest_mps: NotNegative = 0.0  #: No pulses come below this speed of the wheel.
     #: Standard deviation of each tooth's position as a fraction of the spacing of the teeth; the same every turn.
     tooth_sigma: float = Field(default=0.0, ge=0.0, le=0.2)
-    #: Probability that a pulse is not seen, and that it is followed by a second one before the next tooth.
+    #: Probability that a pulse is not detected, and that it is followed by a second one before the next tooth.
     lost_chance: Share = 0.0
     doubled_chance: Share = 0.0
     slips: tuple[SlipInterval, ...] = ()  #: In order, without overlap.

@@ -1,7 +1,7 @@
 """Coordinates of a map in degrees of a modern frame, the operation that led there, and its accuracy, in one value.
 
 Operations are those of PROJ (https://proj.org) whose area of use contains the map and whose grids are installed; a
-ballpark operation, which leaves the datum as it is, is never one of them.
+ballpark operation, which does not change the datum, is never used.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _BETTER: Final = 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Georeference:
-    """Coordinates of n points of a map in a modern frame, and how they came there."""
+    """Coordinates of n points of a map in a modern frame, and their transformation."""
 
     latitude_deg: Floats  #: Shape (n,).
     longitude_deg: Floats  #: Shape (n,).
@@ -67,7 +67,7 @@ class Georeference:
 
 @dataclass(frozen=True, kw_only=True)
 class EllipsoidalHeights:
-    """Ellipsoidal heights of n points of a map, and how they came there."""
+    """Ellipsoidal heights of n points of a map, and their transformation."""
 
     height_m: Floats  #: Shape (n,).
     datum: str  #: CRS of the file: ``"ellipsoidal"`` or ``"orthometric"``.

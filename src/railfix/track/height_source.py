@@ -37,8 +37,8 @@ _REACH_M: Final = 200.0  #: Points farther than this from a height along the lin
 #: last for hundreds of metres; a vertical curve of 2 km radius is then off by up to 5 m.
 _KERNEL_M: Final = 15.0
 _LARGEST_KERNEL_M: Final = 150.0
-#: Positions whose heights are this many median deviations off count no more (Cleveland 1979, robust locally weighted
-#: regression, doi:10.1080/01621459.1979.10481038), and how often they are weighed again.
+#: Positions whose heights are this many median deviations off have zero weight (Cleveland 1979, robust locally weighted
+#: regression, doi:10.1080/01621459.1979.10481038), and number of iterations.
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 

@@ -36,7 +36,7 @@ _NEAR_WAY_M: Final = 5_000.0  #: Ways searched before the whole network is [m].
 _SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
 #: Number of nearest samples examined for each position at first; more where these do not extend far enough.
 _SAMPLES: Final = 32
-_TOGETHER: Final = 256  #: Positions that are looked up together: of each every sample near it is in memory.
+_TOGETHER: Final = 256  #: Positions that are processed together: every nearby sample of each is in memory.
 #: Properties that the connections do not change.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
 _NAMED: Final = 8  #: Number of tracks that a message names individually.

@@ -45,8 +45,8 @@ _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Difference of path length and distance at which a joint is half as probable as where they agree [m].
 _PASSING_M: Final = 5.0
-#: Least gain of a change of track, in positions on the right track; less at a joint, which is known by its probability:
-#: on a short track of a switch there are one or two positions.
+#: Least gain of a change of track, in positions on the right track; less at a joint, which is identified by its
+#: probability: on a short track of a switch there are one or two positions.
 _CHANGE: Final = 0.5
 _CHANGE_AT_JOINT: Final = 0.05
 _AT_JOINT: Final = 0.01

@@ -38,7 +38,7 @@ def read_network(
 
 
 def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, tolerance_m: float = TOLERANCE_M) -> Network:
-    """Connect tracks to a network: as their files state it, else by their ends; see `read_network`."""
+    """Connect tracks to a network: as their files state it, otherwise by their ends; see `read_network`."""
     relations = [relation for path in paths for relation in _relations(path)]
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))

@@ -20,7 +20,7 @@ from railfix.track.network_match import Matched, PlanLog
 #: Rows that are filled: those without a position between known positions, or also those whose positions lie off the
 #: map.
 Rows = Literal["gaps", "off-map"]
-#: Farthest track looked at from a position that drifts, and largest difference of a route from the distance travelled
+#: Farthest track examined from a position that drifts, and largest difference of a route from the distance travelled
 #: [m]; and steps of which the speed is the median.
 _DRIFT_M = 500.0
 _STEPS = 15

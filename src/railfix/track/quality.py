@@ -26,7 +26,7 @@ _ADVERSE_M: Final = 0.005  #: Cant of less than this has no side [m].
 _CENTIMETRE_M: Final = 0.01  #: Distance of a chord from its arc that `needed_spacing_m` is for [m].
 #: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
 _KINK_DEG: Final = 3.0
-_SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, else a warning.
+_SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, otherwise a warning.
 #: Largest deviation of the height of a point from the line through its neighbours.
 _HEIGHT_SPIKE_M: Final = 0.50
 #: Largest difference of the gradient attribute from the heights, over `_GRADIENT_WINDOW_M`.
@@ -222,8 +222,8 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 
 
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
-    """Yield curves whose cant is negative: errors where that is so of all curves, or of all to one side; else warnings,
-    for turnouts in curves have such.
+    """Yield curves whose cant is negative: errors where that is so of all curves, or of all to one side; otherwise
+    warnings, for turnouts in curves have such.
     """
     of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
     of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))

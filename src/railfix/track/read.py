@@ -51,7 +51,7 @@ def read_track(
     geoid : str, optional
         Geoid of orthometric heights: ``japan`` (JPGEO2024), ``gsigeo2011``, a pyproj grid or CRS.
     name : str, optional
-        Name of the route; by default that of the file, else the file name.
+        Name of the route; by default that of the file, otherwise the file name.
     max_gap_m : float [m]
         Widest gap between the ends of two segments.
     sigma_plan_m, sigma_height_m : float, optional [m]

@@ -222,7 +222,7 @@ class Geometry:
     turn_deg: Floats
     reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is; shape (V,).
     #: Arc minus chord at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; R from the map where
-    #: both ends have it, else from the circle through neighbouring points; shape (V - 1,).
+    #: both ends have it, otherwise from the circle through neighbouring points; shape (V - 1,).
     mid_chord_m: Floats
     gradient_permille: Floats  #: Gradient from the heights; NaN at duplicates; shape (V - 1,).
     height_spike_m: Floats  #: Height over the straight line between the neighbours; NaN at the ends; shape (V,).

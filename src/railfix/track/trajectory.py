@@ -126,7 +126,7 @@ _END_TOLERANCE_M = 1e-6  #: Rounding allowed beyond the ends of a trajectory [m]
 class Trajectory(FrozenArrays, NotebookTable):
     """Trajectory of one antenna, V points.
 
-    Right is positive across the path, seen in the direction of rising chainage.
+    Right is positive across the path, in the direction of rising chainage.
     """
 
     name: str  #: Positions of the antenna, or of the track used as its path.

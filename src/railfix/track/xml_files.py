@@ -204,6 +204,6 @@ def _values(graph: Graph, subject: Any, predicate: str) -> list[Any]:
 
 
 def _name(graph: Graph, subject: Any) -> str:
-    """Label of a resource, else the last part of its address."""
+    """Label of a resource, otherwise the last part of its address."""
     labels = _values(graph, subject, _LABEL)
     return str(labels[0]) if labels else re.split(r"[/#]", str(subject))[-1]

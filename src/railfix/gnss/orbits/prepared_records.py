@@ -194,7 +194,7 @@ _ISC: Final[Mapping[str, list[int]]] = {
     "1S": [4], "1L": [5], "1X": [4, 5],
 }  # fmt: skip
 #: Standard deviation of the delay on L2 and L5 without ISC [m]: over the satellites of GPS whose CNAV has it, on
-#: 2025-02-15, TGD - ISC less what stands for it has 0.24 m on L2C and 0.55 m on L5Q
+#: 2025-02-15, TGD - ISC less the value used instead has 0.24 m on L2C and 0.55 m on L5Q
 #: (`tests/gnss/test_group_delays.py`).
 _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 _P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
@@ -253,7 +253,9 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m]; else 0."""
+    """Return the sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m];
+    otherwise 0.
+    """
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
 

@@ -177,7 +177,7 @@ def _fill_kepler(
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
-    """Yield channels, epochs and record rows to compute together: all of a short chunk, else by channel."""
+    """Yield channels, epochs and record rows to compute together: all of a short chunk, otherwise by channel."""
     if rows.shape[1] < _SHORT:
         k, t = np.nonzero(usable)
         if len(k):

@@ -24,7 +24,7 @@ class Suspicion(IntEnum):
     SPOOFING_SUSPECTED = 2
     #: All satellites are consistent with one error of the time tags.
     TIME_TAGS = 3
-    #: The 3-D positions have left the map, and nothing else is the matter.
+    #: The 3-D positions have left the map, without any other sign.
     LEFT_MAP = 4
     #: All positions of the last minute failed a check; the cause is unknown.
     CONTRADICTED = 5
@@ -146,8 +146,8 @@ def suspicion(causes: Bits) -> Codes:
 
     The cause that explains most signs comes first. One error of the time tags, fitted to all ranges, moves positions
     and clocks as a spoofer would. Jumps, equal C/N0 and different constellations are not caused by leaving the map. A
-    train that leaves its map shows no sign but that, and neither does jamming. Satellites that are wrong separately
-    are excluded before.
+    train that leaves its map shows no other sign than that, and neither does jamming. Satellites that are wrong
+    separately are excluded before.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -232,9 +232,9 @@ def power_signs(
 ) -> tuple[PowerSigns, PowerState]:
     """Return the statistics of C/N0, shape (T, K), and gain, shape (T,), and the state to pass on.
 
-    The recent peak of a satellite falls by `peak_decay_db_per_min`: a slow change of the sky passes, a jammer that
-    stays is seen for minutes. `channel` names satellite and signal, one signal of each satellite at an epoch. The gain
-    is in the receiver's unit, + for more gain; NaN where unknown.
+    The recent peak of a satellite falls by `peak_decay_db_per_min`: a slow change of the sky does not raise a sign, a
+    constant jammer is detected for minutes. `channel` names satellite and signal, one signal of each satellite at an
+    epoch. The gain is in the receiver's unit, + for more gain; NaN where unknown.
     """
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ

@@ -181,10 +181,10 @@ def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
 
 
 def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Floats]:
-    """Return rows of S (T, F, Q, N) and sigmas (T, F, Q) of each mode; NaN sigmas where it leaves no position."""
+    """Return rows of S (T, F, Q, N) and sigmas (T, F, Q) of each mode; NaN sigmas without a position."""
     normal = np.einsum("tnp,tfn,tnr->tfpr", design, weight, design, optimize=True)
     diagonal = np.diagonal(normal, axis1=2, axis2=3)
-    # a clock without observations is left out, as if known
+    # a clock without observations is left out, as if it were known
     free = diagonal > 0.0
     normal = normal + np.where(free, 0.0, 1.0)[..., None] * np.eye(design.shape[2])
     scale = np.sqrt(np.where(free, diagonal, 1.0))
@@ -250,7 +250,7 @@ class IntegritySupport(Settings):
     valid_until: datetime | None = None
     #: By letter; a constellation without a statement is not used in the levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
-    #: Satellites with statements of their own.
+    #: Satellites with separate statements.
     satellite: dict[Satellite, SatelliteSupport] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -270,7 +270,7 @@ class IntegritySupport(Settings):
         return ~((time < first) | (time > last))
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return a sentence where the message states no end, or does not hold at all of some epochs."""
+        """Return a sentence where the message states no end, or is invalid at some epochs."""
         if self.valid_until is None:
             return ("integrity support message: it states no valid_until; whether it has expired is not known",)
         if self.holds(time).all():

@@ -137,11 +137,11 @@ class RiskBudget(Settings):
         return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
 
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
-        """Return the risk of an epoch in the set that is left after exclusions, any shape.
+        """Return the risk of an epoch for the set that remains after exclusions, any shape.
 
-        More faults than are checked, of probability `beyond`, are taken off once. Every set that exclusion could have
-        left is a possible failure, so the part of the risk for e exclusions is divided by the number of sets of e among
-        all satellites. 0 beyond `MOST_EXCLUDED`, and where nothing remains.
+        The probability of faults beyond the checked ones, `beyond`, is subtracted once. Every set that exclusion could
+        have left is a possible failure, so the part of the risk for e exclusions is divided by the number of sets of e
+        among all satellites. 0 beyond `MOST_EXCLUDED`, and where nothing remains.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
@@ -171,7 +171,7 @@ def set_sums(prior: Floats, most: int) -> Floats:
     return np.stack(sums, axis=1)
 
 
-#: Shared faults at a time that may be hypotheses; the probability of more is taken off the risk.
+#: Largest number of simultaneous shared faults in a hypothesis; the probability of more is subtracted from the risk.
 _MOST_SHARED: Final = 3
 FEW: Final = 2  #: Epochs of two antennas, live: their allocation is kept.
 REMEMBERED: Final = 512  #: Such allocations: satellites come and go behind obstacles.
@@ -346,7 +346,7 @@ class _Classes:
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Return how many satellites at most are left out with each set of shared faults, shape (T, B).
+        """Return the largest number of satellites left out with each set of shared faults, shape (T, B).
 
         `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a
         satellite.

@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.core.settings import Settings
-from railfix.integrity.raim.model import Compact, LinearModel, compact
+from railfix.integrity.raim.position_model import Compact, LinearModel, compact
 
 _TABLE_STEP: Final = 64  #: Degrees of freedom are tabulated in steps of this many.
 
@@ -171,7 +171,7 @@ class Exclusion:
 
     outcome: Codes  #: `Outcome`, shape (T,).
     excluded: Masks  #: Channels to leave out; none unless the outcome is EXCLUDED_ONE or EXCLUDED_TWO; shape (T, M).
-    #: Channels of the passing subset that leaves the least statistic; -1 where none; INSEPARABLE too; shape (T, 2).
+    #: Channels of the passing subset with the least statistic; -1 where none; INSEPARABLE too; shape (T, 2).
     best: Indices
     #: The next such subset of as many channels: the closest competing exclusion; -1 where none; shape (T, 2).
     alternative: Indices
@@ -225,7 +225,7 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     failing = np.flatnonzero(detection.detected)
     result.outcome[failing] = Outcome.UNRESOLVED
     used = np.count_nonzero(model.used[failing], axis=1)
-    # Epochs of like numbers of satellites together: no block is wider than it must be.
+    # Epochs are grouped by numbers of satellites: no block is wider than necessary.
     failing = failing[np.argsort(used, kind="stable")]
     widest = int(used.max(initial=1))
     size = max(1, _BLOCK_SIZE // (widest * widest))

@@ -1,4 +1,4 @@
-"""Ephemerides put together from navigation subframes as they are received.
+"""Ephemerides combined from navigation subframes as they are received.
 
 A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1, B-CNAV1,
 B-CNAV2) or ten pages (D2), GLONASS four strings. `assemble_records` combines the subframes of a piece of a stream with
@@ -189,7 +189,7 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append records of GLONASS strings whose next epoch came within their frame, up to a time or all known."""
+        """Append records of GLONASS strings whose next epoch arrived within their frame, up to a time or all known."""
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):
                 del self.waiting[satellite]

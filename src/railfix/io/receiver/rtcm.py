@@ -149,7 +149,7 @@ def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Move times by whole weeks to within half a week of the preceding one; GLONASS only in a log of its own."""
+    """Move times by whole weeks to within half a week of the preceding one; GLONASS only in a separate log."""
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()

@@ -119,7 +119,7 @@ def apply_records(
 
 
 class _HeaderRecords:
-    """Reader of header records into a copy of a header: by columns, else by words, with a note."""
+    """Reader of header records into a copy of a header: by columns, otherwise by words, with a note."""
 
     def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path

@@ -108,7 +108,7 @@ class ContinuityLimits(Settings):
     sigmas: float = Field(default=4.5, gt=0)  #: Standard deviations of the channel's residual that reject it.
     #: Largest number of channels rejected; where more would be, no channel continues.
     max_rejected: int = Field(default=8, ge=0)
-    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is judged.
+    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +127,7 @@ class TrackJumps:
     """Verdict on the change of each phase into its epoch, T epochs by M channels."""
 
     jump: Masks  #: True where the phase does not fit: a new arc begins; shape (T, M).
-    metric_m: Floats  #: Change of phase less that of the remaining channels; NaN where not judged; shape (T, M).
+    metric_m: Floats  #: Change of phase less that of the remaining channels; NaN where not tested; shape (T, M).
     judged: Masks  #: Shape (T, M).
     moved_m: (
         Floats  #: Distance along the line since the previous epoch, from the phases; NaN where not known; shape (T,).
@@ -140,7 +140,7 @@ class TrackedPhases(NamedTuple):
 
     phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), NaN where not used; shape (T, M).
     sat_ecef_m: Floats  #: Satellites where there is a phase, shape (T, M, 3).
-    slip: Masks  #: Slips already known: not judged again; shape (T, M).
+    slip: Masks  #: Slips already known: not tested again; shape (T, M).
 
 
 def track_jumps(
@@ -163,7 +163,7 @@ def track_jumps(
     phases : TrackedPhases
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
-        Positions of codes alone, good to some metres; NaN: the epoch cannot judge nor be judged.
+        Positions of codes alone, good to some metres; NaN: the epoch is not used.
     state : ContinuityState, optional
     limits : ContinuityLimits, optional
 

@@ -1,6 +1,6 @@
 """P4's observation equations, linearised, the unknowns of each epoch eliminated.
 
-Per epoch t and channel i, around a place on the line::
+Per epoch t and channel i, around a position on the line::
 
     code  - range = -u.e d + (-u.c m1 - u.h m2) + b_g
     phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
@@ -49,7 +49,7 @@ class Phases:
     weight: Floats
     #: Equal within an unbroken stretch of one channel's phase, and different elsewhere; shape (T, M).
     arc_id: Integers
-    integers: IntegerChannels | None = None  #: None leaves all ambiguities real numbers.
+    integers: IntegerChannels | None = None  #: None: all ambiguities are real numbers.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
         """Return the phases of some epochs."""
@@ -86,7 +86,7 @@ class Linearised:
     #: Observed less computed, less `clock_m`; shape (T, M).
     code_m: Floats
     phase_m: Floats
-    #: First values of the epoch's clocks, taken off codes and phases; shape (T,).
+    #: First values of the epoch's clocks, subtracted from codes and phases; shape (T,).
     clock_m: Floats
     phase_clock_m: Floats
     known: Floats  #: Prior information: errors of the map, ties between clocks; shape (T, P, P).
@@ -164,7 +164,7 @@ def _ties(ties: InterSystemBiases) -> tuple[Floats, Floats]:
 
 
 def own_clock(lin: Linearised) -> bool:
-    """Return whether the phases have a clock of their own."""
+    """Return whether the phases have a separate clock."""
     return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
 
 

@@ -51,7 +51,7 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
     """Return the PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
 
-    The choice looks at all messages: make it on recorded messages before the positioning begins. Live messages cannot
+    The choice uses all messages: make it on recorded messages before the positioning begins. Live messages cannot
     be judged in advance; there the PRN is given.
     """
     limits, scores = limits or SbasLimits(), []
@@ -173,7 +173,7 @@ class SbasCorrections:
         inflated: Masks,
         covariance: Integers,
     ) -> SatelliteCorrections:
-        """Put the parts together; NaN where the state is not OK."""
+        """Combine the parts; NaN where the state is not OK."""
         used = state == SatelliteState.OK
         table = self._tables.long_term
         has = used & (long.row >= 0)

@@ -30,7 +30,7 @@ class BitField(NamedTuple):
 
     first: int
     length: int
-    #: Unit of the number; None leaves an integer.
+    #: Unit of the number; None: an integer.
     scale: float | None = None
     signed: bool = False
     number: int | None = None

@@ -16,7 +16,7 @@ Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and alma
 Layouts and scales are those that cssrlib and MAAST (L5_decodeMT39.m, 40, 47) share. Messages of SouthPAN of three days
 (`test_sbas_orbits.py`) determine the rest: the semi-major axis is counted from 6370 km, and the node from the meridian
 of Greenwich at midnight of GPS time. Open: a step of the inclination rate is 7 pi / 6 or 7 pi times 2^-21 1e-6 rad/s;
-SouthPAN sends 0, and an orbit with another rate has no position here. BDSBAS has a layout of its own and is left out.
+SouthPAN sends 0, and an orbit with another rate has no position here. BDSBAS has a different layout and is left out.
 """
 
 from __future__ import annotations

@@ -204,7 +204,9 @@ class IonosphereDelays(FrozenArrays):
     """Delays of T epochs by K satellites from the grid."""
 
     state: Integers  #: `IonosphereState`, shape (T, K).
-    delay_m: Floats  #: Slant delay on L1, to be taken off the code; other carriers scale by (f1/f)^2; shape (T, K).
+    delay_m: (
+        Floats  #: Slant delay on L1, to be subtracted from the code; other carriers scale by (f1/f)^2; shape (T, K).
+    )
     sigma_uire_m: Floats  #: Shape (T, K).
     #: Pierce point, shape (T, K).
     latitude_deg: Floats

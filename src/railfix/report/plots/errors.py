@@ -15,8 +15,8 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
-from railfix.evaluate.epochs import level_columns
-from railfix.evaluate.figures import PASSED
+from railfix.evaluate.accuracy import PASSED
+from railfix.evaluate.epoch_table import level_columns
 from railfix.integrity.stanford import Region, Stanford
 from railfix.report.plots.chart import (
     BLACK,
@@ -312,7 +312,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     """Return levels over the time since `start`, or over the chainage without one."""
     layers: list[Layer] = []
     shown = total = 0
-    # levels matter near the alarm limit: a few far beyond it do not set the axis
+    # levels are of interest near the alarm limit: a few far beyond it do not set the axis
     top = 2.0 * alarm_limit_m
     epoch = since(positions, find_start(positions))
     x = floats(positions, "chainage_m") if start is None else epoch

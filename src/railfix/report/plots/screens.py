@@ -38,7 +38,7 @@ from railfix.screens import SCREENS, Cn0Limits, ScreenPicture
 
 _KEPT: Final = "#2f86b8"
 _COLUMNS: Final = 4
-#: Rows of a picture that are examined together.
+#: Rows of a chart that are evaluated in one step.
 _BLOCK: Final = 100_000
 #: Points of the line of a limit: two a pixel of a wide chart.
 _LINE_POINTS: Final = 1500

@@ -110,7 +110,7 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
         # Part of each path in phase with the sum: its own square is constant, the rest oscillates.
         in_phase = follow * (real * carrier + imaginary * quadrature) + own * triangle
         near = away < half
-        # Early less late of a path at x: -2 x when near, else a plateau that falls to 0 past a chip.
+        # Early less late of a path at x: -2 x when near, otherwise a plateau that falls to 0 past a chip.
         far = np.copysign(np.clip(1.0 + half - away, 0.0, spacing), -x)
         push = np.where(near, 2.0 * late, far) * in_phase
         slope = 2.0 * (near * in_phase).sum(axis=0)

@@ -310,7 +310,7 @@ def neighbour_reflection(settings: NeighbourSettings, rays: Rays, time_s: Floats
 
 
 def equipment_amplitude(equipment: tuple[RoofEquipment, ...], rays: Rays) -> Floats:
-    """Return the amplitude left of the direct signal by equipment on the vehicle's own roof, shape (N,)."""
+    """Return the remaining amplitude of the direct signal after equipment on the vehicle's own roof, shape (N,)."""
     amplitude = np.ones(len(rays.x))
     for part in equipment:
         along = np.maximum(np.abs(rays.x), _LEAST_LATERAL)

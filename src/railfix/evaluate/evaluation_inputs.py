@@ -79,7 +79,7 @@ class RunFolder(RunRecord):
 
     @property
     def tracks(self) -> list[Path]:
-        """Files of the track: that in the folder where the run moved, joined or raised it, else its inputs."""
+        """Files of the track: those in the folder if the run moved, joined or raised it, otherwise its inputs."""
         name = self.track_facts.get("file")
         return [self.path / str(name)] if name else self.input_paths("track")
 

@@ -36,15 +36,15 @@ _REACH_M: Final = 40.0
 _LEAST_ELEVATION_DEG: Final = 10.0
 #: Residual atmospheric error of the difference of phases at two positions, as a fraction of their distance.
 _PHASE_SHARE: Final = 1e-6
-#: Hypotheses with codes this much less likely (logarithm) than the best are not looked at with phases.
+#: Hypotheses with codes this much less likely (logarithm) than the best are not evaluated with phases.
 _UNLIKELY: Final = 25.0
 #: Standard deviations of the position along the track, and of the height, for the phase search [m].
 _ANY_PLACE_M: Final = 50.0
-#: Probability of a larger misfit of the mean codes below which the error model is not believed.
+#: Probability of a larger misfit of the mean codes below which the error model is rejected.
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
 _FREEDOM: Final = 8.0  #: Degrees of freedom of the errors of heights.
-#: Probability that the phases of a standstill follow no model, by a slip or half a cycle that was not seen.
+#: Probability that the phases of a standstill follow no model, by an undetected slip or half a cycle.
 _PHASE_FAULT_PRIOR: Final = 1e-3
 _UNMAPPED_WIDTH_M: Final = 60.0  #: Width over which a missing track can lie.
 

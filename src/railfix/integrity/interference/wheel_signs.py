@@ -1,7 +1,7 @@
 """Distance by satellites against that of a wheel: detects a pull along the track that no other test detects.
 
 Over a window the two differ by the noise of two positions and by the wheel's scale error, which is estimated before the
-window. A pull from the beginning, or as slow as the diameter is uncertain, is not seen.
+window. A pull from the beginning, or as slow as the uncertainty of the diameter, is not detected.
 """
 
 from __future__ import annotations

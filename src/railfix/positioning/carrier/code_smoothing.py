@@ -51,8 +51,8 @@ class CycleSlipLimits(Settings):
 
     The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise of the phases,
     noise of the mean Doppler, and the error of the trapezoidal rule for a motion with that jerk. One cycle on L1 (0.19
-    m) is seen up to intervals of about 1 s, two to 1.5 s; a test on the track (`continuity.track_jumps`) has no such
-    end.
+    m) is detected up to intervals of about 1 s, two to 1.5 s; a test on the track (`continuity.track_jumps`) has no
+    such limit.
     """
 
     #: Longest interval that is bridged: the interval of a station's log, 30 s.
@@ -88,11 +88,11 @@ class Slips:
     #: Phase times wavelength on the clock of the codes: whole milliseconds that only the codes stepped are added. NaN
     #: where the phase is missing or its wavelength is unknown; shape (T, M).
     phase_m: Floats
-    #: Metrics of the two tests; NaN where they cannot judge; shape (T, M).
+    #: Metrics of the two tests; NaN where they cannot be used; shape (T, M).
     doppler_metric_m: Floats
     code_metric_m: Floats
     doppler_limit_m: Floats  #: Shape (T,).
-    #: Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen; shape (T,).
+    #: Step of the receiver's clock into the epoch from the codes; 0 where none is detected; shape (T,).
     clock_step_m: Floats
     half_cycle: Masks  #: The receiver reports an unresolved half cycle: harmless to a float ambiguity; shape (T, M).
 

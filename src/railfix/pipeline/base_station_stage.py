@@ -14,7 +14,7 @@ from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.carrier_stage import CarrierState, find_antenna_slips, smooth_ranges
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.range_stage import correct_ranges
 from railfix.pipeline.received import Received, correction_source
@@ -29,7 +29,7 @@ from railfix.track.trajectory import Trajectory
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
 _NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
-#: Positions of a station that differ by no more are the same [m].
+#: Positions of a station that differ by no more than this are equal [m].
 _SAME_PLACE_M: Final = 0.01
 
 

@@ -1,7 +1,7 @@
 """Protection level along the track with fault hypotheses: solution separation over sets of faults.
 
 While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no part.
-The level L is where the tails of all hypotheses together use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
+The level L is reached where the tails of all hypotheses use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
@@ -79,7 +79,7 @@ class ProtectionLevel:
     k_two_faults: Floats
     k_false_alarm: Floats  #: Sigmas of the thresholds, shape (T,).
     separation: Floats  #: The largest ``|x_J - x|/T_J``; 0 where nothing can be left out; shape (T,).
-    #: It is at most 1. Where not the level does not hold. False without a position; shape (T,).
+    #: It is at most 1. Otherwise the level is invalid. False without a position; shape (T,).
     consistent: Masks
     #: Channel that sets `one_fault_m`; -1 where none does (`worst_constellation`, a side, the map); shape (T,).
     worst_one: Indices
@@ -202,7 +202,7 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
-    """Return the epochs of like numbers of hypotheses together: no block is wider than it must be."""
+    """Return the epochs grouped by numbers of hypotheses: no block is wider than necessary."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
     used = model.used[rows].sum(axis=1)
@@ -353,7 +353,7 @@ class LevelStatus(IntEnum):
     AVAILABLE = 0
     #: The level is above the alarm limit or infinite, or the position is missing.
     UNAVAILABLE = 1
-    #: The ranges contradict each other: the level does not hold.
+    #: The ranges contradict each other: the level is invalid.
     ALARM = 2
 
 

@@ -28,7 +28,7 @@ def missing_notes(received: Received, config: Config, second: SecondCodes | None
     return tuple(notes)
 
 
-#: Sets of channels remembered.
+#: Number of cached sets of channels.
 _REMEMBERED: Final = 64
 
 

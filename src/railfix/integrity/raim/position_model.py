@@ -128,7 +128,7 @@ class LinearModel:
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
-        """Return the covariance of the wanted components, shape (T, interest, interest) [m^2].
+        """Return the covariance of the components of interest, shape (T, interest, interest) [m^2].
 
         `scale` multiplies the sigmas of the ranges (and ties), not the map error: of the covariance Q, ``Q P Q`` comes
         from the prior P and ``Q - Q P Q`` from the ranges.
