@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -114,7 +114,8 @@ def joined(parts: Iterable[Any]) -> Any:
     """Chunks of one result one after the other."""
     parts = list(parts)
     values = {}
-    for name, value in vars(parts[0]).items():
+    for name in (f.name for f in fields(parts[0])):  # not what is computed from them
+        value = getattr(parts[0], name)
         if isinstance(value, np.ndarray):
             values[name] = np.concatenate([getattr(p, name) for p in parts])
         elif name in ("tracked", "sensed"):
