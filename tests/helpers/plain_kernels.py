@@ -19,7 +19,7 @@ from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
 from railfix.tracking.bank import OTHERS, SourceKind, classify_source
 from railfix.tracking.packing import _pack_sources, pack_parameters
-from railfix.tracking.state import CLOCKS, HYPOTHESIS, MONITORS, SATELLITES
+from railfix.tracking.state import HYPOTHESIS, MONITORS
 
 
 def _compiled_modules() -> list[str]:
@@ -71,7 +71,7 @@ def kernel_state(
     """
     listed = [*names, *OTHERS] if names else []
     count, satellites = len(log_probability), sum(classify_source(name) == SourceKind.SATELLITE for name in names)
-    x, P = np.zeros((count + len(listed), SATELLITES)), np.zeros((count + len(listed), SATELLITES, SATELLITES))
+    x, P = np.zeros((count + len(listed), ix.SATELLITES)), np.zeros((count + len(listed), ix.SATELLITES, ix.SATELLITES))
     x[: len(place_m), ix.ARC], P[: len(place_m), ix.ARC, ix.ARC] = place_m, np.square(sigma_m)
     hypothesis, values = np.zeros(count, dtype=HYPOTHESIS), np.zeros(1, dtype=MONITORS)
     hypothesis["log_probability"], values["hypotheses"] = log_probability, count
@@ -79,4 +79,4 @@ def kernel_state(
         values[name] = value
     source = _pack_sources(listed, limits)
     source["running"][: len(place_m) - count] = True
-    return layout.State(x, P, hypothesis, values, np.zeros(satellites), np.zeros(len(CLOCKS), dtype=bool), source)
+    return layout.State(x, P, hypothesis, values, np.zeros(satellites), np.zeros(len(ix.CLOCKS), dtype=bool), source)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,23 @@ def test_runs_there_and_back_and_over_a_part_make_one_line() -> None:
     nearest = cKDTree(line[:, :2]).query(((survey.track.ecef_m - ORIGIN) @ AXES.T)[:, :2])[1]
     assert np.percentile(np.abs(height - line[nearest, 2]), 95) < 3.0
     assert survey.passes.max() >= 6
+
+
+@pytest.mark.parametrize("gap_m", [(300.0, 510.0), (1000.0, 1200.0)])
+def test_a_gap_of_a_tunnel_is_bridged_and_one_run_states_what_it_does_not_see(gap_m: tuple[float, float]) -> None:
+    """On the straight, and in the curve of 400 m."""
+    line, way = open_line(), np.arange(0.0, 2099.0, 14.0)
+    whole = run_over(line, way, 3, sigma_m=0.1)
+    kept = (way <= gap_m[0]) | (way >= gap_m[1])
+    run = replace(whole, time=whole.time[kept], ecef_m=whole.ecef_m[kept], sigma_m=whole.sigma_m[kept])
+    survey = survey_line([run])
+    assert survey.track.chainage_m[-1] == pytest.approx(2099.0, rel=0.04)
+    assert np.percentile(across_m(survey, line), 95) < 2.0
+    notes = " ".join(survey.track.provenance.notes)
+    assert "1 gap in the runs bridged by a curve, the longest 2" in notes
+    assert "one run does not show the error that all its positions share: 1.0 m in plan and 2.0 m in height" in notes
+    assert survey.sigma_plan_m.min() > 0.99
+    assert survey_line([whole, replace(whole, name="again")]).track.sigma_plan_m < survey.track.sigma_plan_m
 
 
 def test_runs_over_two_parts_are_joined_where_they_overlap() -> None:

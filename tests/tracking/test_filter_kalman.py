@@ -52,13 +52,13 @@ def case() -> tuple[Ride, SensorEpochs]:
 @pytest.fixture(scope="module")
 def expected(case: tuple[Ride, SensorEpochs]) -> Kalman:
     ride, sensors = case
-    chunk = prepare_chunk(part(ride.epochs, slice(0, 1)), TrackState.empty(), NORMAL)
-    (start,), _ = places(chunk, 0, ride.line, NORMAL)
+    chunk = prepare_chunk(part(ride.epochs, slice(0, 1)), TrackState(), NORMAL)
+    (start,) = places(chunk, 0, ride.line, NORMAL)
     return Oracle(ride.epochs, sensors, ride.line, NORMAL).run(float(start))
 
 
 def assert_equal(found: Tracked, expected: Kalman) -> None:
-    """GNSS alone agrees to 3e-8 m; the filter adds a millionth to the variance of sensors, to keep a matrix regular."""
+    """Places and speeds agree to a micrometre, their standard deviations to a millionth."""
     assert (found.hypotheses == 1).all()
     for values, unknown, sigmas in (
         (found.arc_m, S, found.sigma_m),
@@ -85,7 +85,7 @@ def test_the_smoother_is_filterpys_in_the_gaussian_limit(case: tuple[Ride, Senso
     trace: list = []
     found, _ = track(ride.epochs, ride.line, limits=NORMAL, sensors=sensors, trace=trace)
     assert_equal(found, expected)
-    both, _ = smooth_steps(trace, TrackState.empty(), None, NORMAL)
+    both, _ = smooth_steps(trace, TrackState(), None, NORMAL)
     np.testing.assert_allclose(both.arc_m, expected.smoothed_mean[:, S], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(both.speed_mps, expected.smoothed_mean[:, V], rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(both.sigma_m, np.sqrt(expected.smoothed_covariance[:, S, S]), rtol=1e-6)

@@ -7,14 +7,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.constants import ACROSS_LOST
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.chunk import prepare_chunk
+from railfix.tracking.chunk import compute_singer_step, prepare_chunk
 from railfix.tracking.search import places
-from railfix.tracking.state import Monitors, StateIndex, TrackState
-from railfix.tracking.velocity import singer_step
+from railfix.tracking.state import Monitors, TrackState
 from tracking_cases import (
     ORIGIN_M,
     Ride,
@@ -55,9 +55,9 @@ def test_a_start_does_not_depend_on_where_the_map_has_its_points(start_m: float)
     for step in (40.0, 1.0):
         points = ORIGIN_M[0] + np.arange(0.0, 2001.0, step)[:, None] * ORIGIN_M[1]
         case = ride(5, trajectory=Trajectory.from_antenna_path(Track.from_ecef(points)), start_m=start_m, noise=1.0)
-        state = TrackState.empty()
+        state = TrackState()
         chunk = prepare_chunk(part(case.epochs, slice(0, 1)), state, TrackingLimits())
-        found.append(places(chunk, 0, case.line, TrackingLimits())[0])
+        found.append(places(chunk, 0, case.line, TrackingLimits()))
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
     assert np.abs(found[0][0] - start_m) < 10.0
 
@@ -240,8 +240,8 @@ def test_a_place_put_wrong_is_lost_and_sought_again() -> None:
 
 @pytest.mark.requirement("E5")
 def test_the_noise_of_the_motion_is_that_of_many_short_steps() -> None:
-    whole_step, whole_noise = singer_step(3.0, 1.0, 2.0)
-    step, noise = singer_step(0.01, 1.0, 2.0)
+    whole_step, whole_noise = compute_singer_step(3.0, 1.0, 2.0)
+    step, noise = compute_singer_step(0.01, 1.0, 2.0)
     total, product = np.zeros((3, 3)), np.eye(3)
     for _ in range(300):
         total = step @ total @ step.T + noise
@@ -257,7 +257,7 @@ def test_inputs_are_left_as_they_are() -> None:
         if array is not None:
             array.setflags(write=False)
     _, state = track(part(case.epochs, slice(0, 15)), case.line)
-    for array in (state.mean, state.covariance, state.log_probability):
+    for array in (state.mean, state.covariance, state.hypothesis["log_probability"]):
         array.setflags(write=False)
     track(part(case.epochs, slice(15, 30)), case.line, state)
 
@@ -272,7 +272,7 @@ def _looped(trajectory_length: float) -> tuple[GnssEpochs, np.ndarray, Line]:
 def test_probabilities_sum_to_one_and_motion_decides() -> None:
     epochs, arc, line = _looped(1500.0)
     result, state = track(epochs, line, limits=TrackingLimits())
-    assert np.exp(state.log_probability).sum() == pytest.approx(1.0)
+    assert np.exp(state.hypothesis["log_probability"]).sum() == pytest.approx(1.0)
     assert np.nanmax(result.probability) <= 1.0 + 1e-12
     assert np.abs(result.arc_m - arc)[-20:].max() < 8.0
 
@@ -314,7 +314,7 @@ def test_a_train_that_leaves_the_map_has_no_level(speed_mps: float, stop_s: int)
     case = ride(
         60, trajectory=whole, start_m=start_m, noise=0.5, speed_mps=lambda t: np.where(t < stop_s, speed_mps, 0.0)
     )
-    result, _ = track(case.epochs, Line.of(Trajectory.from_antenna_path(Track.from_ecef(points))), levels=True)
+    result, _ = track(case.epochs, Line(Trajectory.from_antenna_path(Track.from_ecef(points))), levels=True)
     over = np.abs(np.clip(result.arc_m, 0.0, 1500.0) - case.arc_m) > result.level_m
     assert not over.any()
     assert np.isfinite(result.level_m[20:30]).all()
@@ -407,18 +407,18 @@ def test_codes_count_at_once_when_they_come_back() -> None:
 @pytest.mark.requirement("E5")
 def test_nothing_learnt_outlives_a_reset() -> None:
     """Every field of the state but the times, the satellites and what withholds a level is that of an empty one."""
-    kept = {"time", "satellite", "seen", "previous", "measured"}
+    kept = {"time", "origin", "satellite", "seen", "previous"}
     case = ride(60)
     _, state = track(case.epochs, case.line, levels=True)
     learnt = [item.name for item in fields(TrackState) if item.name not in kept]
     state.monitors = Monitors(**dict.fromkeys((item.name for item in fields(Monitors)), 1.5))
     state.reset()
-    empty = TrackState.empty()
-    assert state.monitors == Monitors(level_hold_s=1.5, ambiguity_hold_s=1.5)
+    empty = TrackState()
+    assert state.monitors == Monitors(level_hold_s=1.5, ambiguity_hold_s=1.5, measured_s=1.5)
     for name in learnt:
         value, begun = getattr(state, name), getattr(empty, name)
         if isinstance(value, np.ndarray):
-            assert not value.any(), name
+            assert not len(value) or not value.any(), name
         elif name != "monitors":
             assert value == begun or str(value) == str(begun) == "NaT", name
     assert state.time == case.epochs.time[-1]
@@ -429,11 +429,11 @@ def test_an_improbable_place_hides_no_other() -> None:
     """Places near a hypothesis are not restarted, unless it has drifted off them and is as good as excluded."""
     case = ride(40, noise=0.5)
     _, state = track(case.epochs.take(slice(0, 30)), case.line)
-    for name in ("mean", "covariance", "log_code", "log_least", "log_recent"):
+    for name in ("mean", "covariance", "hypothesis"):
         setattr(state, name, np.repeat(getattr(state, name)[:1], 2, axis=0))
-    for arc in (StateIndex.ARC, StateIndex.PREVIOUS_ARC):
+    for arc in (ix.ARC, ix.PREVIOUS_ARC):
         state.mean[:, arc] += [600.0, 50.0]
-    state.log_probability, state.origin_m = np.array([0.0, -36.0]), state.mean[:, StateIndex.ARC].copy()
+    state.hypothesis["log_probability"], state.hypothesis["origin_m"] = [0.0, -36.0], state.mean[:, ix.ARC]
     state.monitors = replace(state.monitors, across=ACROSS_LOST)
     result, _ = track(case.epochs.take(slice(30, None)), case.line, state)
     assert result.hypotheses[0] == 3

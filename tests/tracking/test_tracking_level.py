@@ -13,6 +13,7 @@ from scipy.stats import norm
 import belief_campaign
 from plain_kernels import given, kernel_state, plain
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking import layout
 from railfix.kernels.tracking.constants import (
     LEVEL_DOUBT_S,
@@ -26,7 +27,7 @@ from railfix.tracking import GnssEpochs, Line, Tracked, TrackingLimits, TrackSta
 from railfix.tracking.bank import OTHERS, budget
 from railfix.tracking.line import TILT_M
 from railfix.tracking.result import EPOCH_RESULT
-from railfix.tracking.state import SATELLITES, StateIndex, TrackState
+from railfix.tracking.state import TrackState
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits()
@@ -60,8 +61,8 @@ def level_of(
     )
     state.source["contradicted_s"][: len(names)] = weak_s
     if slow is not None:
-        state.x[:, StateIndex.SLOW_CODE], state.P[:, StateIndex.SLOW_CODE, StateIndex.SLOW_CODE] = slow[:2]
-        state.P[:, StateIndex.SLOW_CODE, StateIndex.ARC] = state.P[:, StateIndex.ARC, StateIndex.SLOW_CODE] = slow[2]
+        state.x[:, ix.SLOW_CODE], state.P[:, ix.SLOW_CODE, ix.SLOW_CODE] = slow[:2]
+        state.P[:, ix.SLOW_CODE, ix.ARC] = state.P[:, ix.ARC, ix.SLOW_CODE] = slow[2]
     if in_view is not None:
         state.source["running"][-1], state.x[-1, 0], state.P[-1, 0, 0] = True, in_view[0], in_view[1] ** 2
     far, level = probability if apart > LIMITS.start_separation_m else 0.0, plain("tracking.level")
@@ -227,18 +228,18 @@ def test_the_sub_filter_with_all_in_view_begins_without_codes_too_and_ends_besid
 def test_what_a_map_is_off_across_is_off_along_after_a_bend() -> None:
     """By hand, 60 degrees to the left: the way on the map has it, what the phases measure has not."""
     random, turn = np.random.default_rng(3), np.radians(60.0)
-    mean, root = random.normal(size=SATELLITES), random.normal(size=(SATELLITES, SATELLITES))
-    mean[StateIndex.ARC], mean[StateIndex.PREVIOUS_ARC] = 100.0, 0.0
+    mean, root = random.normal(size=ix.SATELLITES), random.normal(size=(ix.SATELLITES, ix.SATELLITES))
+    mean[ix.ARC], mean[ix.PREVIOUS_ARC] = 100.0, 0.0
     vertex = np.zeros(3, dtype=layout.VERTEX)
     vertex["arc_m"], vertex["axes"] = [0.0, 100.0, 200.0], np.eye(3)
     vertex["axes"][1:, 0] = np.cos(turn), -np.sin(turn), 0.0
     vertex["axes"][1:, 1] = np.sin(turn), np.cos(turn), 0.0
     x, P = mean.copy(), root @ root.T
     plain("tracking.subfilters").rotate_map_error(given(LIMITS)._replace(vertex=vertex), x, P)
-    step = np.eye(SATELLITES)
-    right = StateIndex.MAP_RIGHT
-    step[StateIndex.ARC, right] = -np.sin(turn)
-    step[StateIndex.MAP_LENGTH_ERROR, right] = np.sin(turn)
+    step = np.eye(ix.SATELLITES)
+    right = ix.MAP_RIGHT
+    step[ix.ARC, right] = -np.sin(turn)
+    step[ix.MAP_LENGTH_ERROR, right] = np.sin(turn)
     step[right, right] = np.cos(turn)
     expected = step @ root @ root.T @ step.T
     expected[right, right] += (LIMITS.level_map_m * np.sin(turn)) ** 2
@@ -251,7 +252,7 @@ def test_what_a_map_is_off_across_is_off_along_after_a_bend() -> None:
 def test_only_the_map_that_lies_aside_withholds_the_level(name: str) -> None:
     """A displacement of 9 m does in the sub-filter of the map, in no other."""
     state = kernel_state([100.0], [1.0], [0.0], LIMITS, ["G"], branch_s=LEVEL_START_S)
-    at, right = 1 + list(OTHERS).index(name), StateIndex.MAP_RIGHT
+    at, right = 1 + list(OTHERS).index(name), ix.MAP_RIGHT
     state.source["running"][at], state.x[1 + at, right], state.P[1 + at, right, right] = True, 9.0, 1.0
     plain("tracking.monitors").update_monitors(state, np.nan, 0.0, 0.0, 1.0, 1.0)
     assert state.monitors["level_hold_s"][0] == (LEVEL_HOLD_S if name == "map" else 0.0)
@@ -270,8 +271,7 @@ def test_a_map_that_may_be_wrong_is_so_where_nothing_is_measured() -> None:
     assert kept < 0.5
     for name, wrong_m in (("map", LIMITS.level_map_m), ("G", 0.0)):
         old, new = (
-            bank.covariance[bank.without.index(name), StateIndex.MAP_RIGHT, StateIndex.MAP_RIGHT]
-            for bank in (before.bank, after.bank)
+            bank.covariance[bank.without.index(name), ix.MAP_RIGHT, ix.MAP_RIGHT] for bank in (before.bank, after.bank)
         )
         walked = (case.line.sigma_plan_m**2 + wrong_m**2) * (1.0 - kept)
         assert new == pytest.approx(kept * old + walked, rel=0.05)

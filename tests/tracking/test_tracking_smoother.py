@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from railfix.kernels.tracking import index as ix
 from railfix.tracking import BackwardInformation, Step, TrackingLimits, TrackState, smooth_steps, track
 from railfix.tracking.smoother import transition
-from railfix.tracking.state import StateIndex
 from tracking_cases import Ride, bent_line, part, ride, without_epochs
 
 LIMITS = TrackingLimits()
@@ -26,8 +26,8 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
     joint = np.zeros((size, width, size, width))
     means, combined = [], []
     for t, step in enumerate(trace):
-        assert step.updated is not None
-        prior, combine, value, variance = (array[0] for array in vars(step.updated).values())
+        assert step.trace is not None
+        prior, combine, value, variance, restarted, _ = (array[0] for array in step.trace)
         combined.append((combine, np.diag(1.0 / variance), value / variance))
         innovation_free = _prediction(step)
         if t == 0:
@@ -35,7 +35,7 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
             means.append(innovation_free)
             continue
         move = transition(trace[t - 1].mean[0], step.dt, LIMITS)
-        move[step.cut[0]] = 0.0
+        move[restarted] = 0.0
         joint[t, :, :t] = np.einsum("ij,jsk->isk", move, joint[t - 1, :, :t])
         joint[:t, :, t] = np.moveaxis(joint[t, :, :t], 0, -1)
         noise = prior - move @ trace[t - 1].covariance[0] @ move.T
@@ -57,15 +57,15 @@ def _dense(trace: list[Step]) -> tuple[np.ndarray, np.ndarray]:
     system = np.eye(len(right)) + weights @ rows @ cross
     change = cross @ np.linalg.solve(system, right)
     after = whole - cross @ np.linalg.solve(system, weights @ cross.T)
-    place = np.arange(size) * width + int(StateIndex.ARC)
-    arc = np.array([mean[StateIndex.ARC] for mean in means]) + change[place]
+    place = np.arange(size) * width + int(ix.ARC)
+    arc = np.array([mean[ix.ARC] for mean in means]) + change[place]
     return arc, np.sqrt(after[place, place])
 
 
 def _prediction(step: Step) -> np.ndarray:
     """Mean before the measurements."""
-    assert step.updated is not None
-    prior, row, value, variance = (array[0] for array in vars(step.updated).values())
+    assert step.trace is not None
+    prior, row, value, variance, _, _ = (array[0] for array in step.trace)
     whitened = row / np.sqrt(variance)[:, None]
     system = np.eye(len(row)) + whitened @ prior @ whitened.T
     return np.asarray(step.mean[0] - prior @ whitened.T @ np.linalg.solve(system, value / np.sqrt(variance)))
@@ -87,8 +87,8 @@ def test_smoothed_places_are_those_of_one_dense_solution() -> None:
 def test_chunks_backward_give_what_the_whole_gives() -> None:
     case = ride(60, noise=1.0, seed=3)
     trace, _ = _traced(case)
-    whole, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
-    pieces, states, state = [], [TrackState.empty()], None
+    whole, _ = smooth_steps(trace, TrackState(), None, LIMITS)
+    pieces, states, state = [], [TrackState()], None
     for cut in (slice(0, 7), slice(7, 40), slice(40, 60)):
         one = Ride(part(case.epochs, cut), case.arc_m[cut], case.speed_mps[cut], case.trajectory)
         trace, state = _traced(one, state)
@@ -112,7 +112,7 @@ def test_a_gap_is_bridged_from_both_ends_within_its_sigmas() -> None:
         blank = without_epochs(case.epochs, gap)
         trace: list[Step] = []
         found, _ = track(blank, case.line, trace=trace)
-        result, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
+        result, _ = smooth_steps(trace, TrackState(), None, LIMITS)
         error = np.abs(result.arc_m - case.arc_m)
         ratios.append(error / result.sigma_m)
         inside.append(error[gap])
@@ -125,9 +125,9 @@ def test_a_gap_is_bridged_from_both_ends_within_its_sigmas() -> None:
 def test_nothing_goes_back_beyond_a_beginning() -> None:
     case = ride(40, noise=1.0)
     trace, _ = _traced(case)
-    whole, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
-    first, _ = smooth_steps(trace[:20], TrackState.empty(), None, LIMITS)
+    whole, _ = smooth_steps(trace, TrackState(), None, LIMITS)
+    first, _ = smooth_steps(trace[:20], TrackState(), None, LIMITS)
     assert not np.allclose(first.arc_m, whole.arc_m[:20], rtol=0.0, atol=1e-6)
     trace[20].parent = np.full_like(trace[20].parent, -1)
-    broken, _ = smooth_steps(trace, TrackState.empty(), None, LIMITS)
+    broken, _ = smooth_steps(trace, TrackState(), None, LIMITS)
     np.testing.assert_array_equal(broken.arc_m[:20], first.arc_m)

@@ -114,53 +114,27 @@ def _with_each_later(
     """
     n, own, limit = rows.shape[1], ranges.own, common[LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
-    share, of_first = rows[i, i], rows[n, i]
-    inverse = 1.0 / share if share > LEAST_REDUNDANCY else 0.0
-    weight = inverse * of_first
-    undetectable = undetectable or (inverse == 0.0 and abs(of_first) > limit)
-    square, distance = removed[0] + weight * of_first, removed[1] + weight * rows[n + 1, i]
-    across, up = removed[2] + weight * rows[n + 2, i], removed[3] + weight * rows[n + 3, i]
-    residual, map_across, map_up = rows[n + 1, i], rows[n + 2, i], rows[n + 3, i]
-    first, gains, residuals = rows[i, i + 1 :], rows[n, i + 1 :], rows[n + 1, i + 1 :]
-    of_across, of_up = rows[n + 2, i + 1 :], rows[n + 3, i + 1 :]
-    rests = own[: n - 1 - i]
-    for at in range(n - 1 - i):
-        rests[at] = rows[i + 1 + at, i + 1 + at]
-    lost = False
-    for at in range(n - 1 - i):
-        coupling = inverse * first[at]
-        of_gain = gains[at] - coupling * of_first
-        rest = rests[at] - coupling * first[at]
-        last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
-        lost |= not rest > LEAST_REDUNDANCY
-        offset[at], sigma[at], ratio[at] = separate(
-            square + last * of_gain,
-            distance + last * (residuals[at] - coupling * residual),
-            across + last * (of_across[at] - coupling * map_across),
-            up + last * (of_up[at] - coupling * map_up),
-            (0.0, 0.0, 0.0),
-            common,
-        )
-    if not (ranges.any or undetectable or lost):
-        return
+    first = rows[i, i] > LEAST_REDUNDANCY
+    inverse = 1.0 / rows[i, i] if first else 0.0
+    weight = inverse * rows[n, i]
+    undetectable = undetectable or (not first and abs(rows[n, i]) > limit)
+    with_first, taken, more = np.empty(4), np.empty(4), (0.0, 0.0, 0.0)
+    for c in range(4):
+        with_first[c] = removed[c] + weight * rows[n + c, i]
     for at in range(n - 1 - i):
         j = i + 1 + at
         coupling = inverse * rows[i, j]
-        of_gain = rows[n, j] - coupling * of_first
-        rest = rows[j, j] - coupling * rows[i, j]
-        last = of_gain / rest if rest > LEAST_REDUNDANCY else 0.0
+        gain, rest = rows[n, j] - coupling * rows[n, i], rows[j, j] - coupling * rows[i, j]
+        checked = rest > LEAST_REDUNDANCY
+        last = gain / rest if checked else 0.0
+        for c in range(4):
+            taken[c] = with_first[c] + last * (rows[n + c, j] - coupling * rows[n + c, i])
         if ranges.any:
             for m in range(n):
                 own[m] = rows[n, m] - weight * rows[i, m] - last * (rows[j, m] - coupling * rows[i, m])
-            offset[at], sigma[at], ratio[at] = separate(
-                square + last * of_gain,
-                distance + last * (rows[n + 1, j] - coupling * residual),
-                across + last * (rows[n + 2, j] - coupling * map_across),
-                up + last * (rows[n + 3, j] - coupling * map_up),
-                of_ranges(own, ranges),
-                common,
-            )
-        if undetectable or (not rest > LEAST_REDUNDANCY and abs(of_gain) > limit):
+            more = of_ranges(own, ranges)
+        offset[at], sigma[at], ratio[at] = separate(taken[0], taken[1], taken[2], taken[3], more, common)
+        if undetectable or (not checked and abs(gain) > limit):
             offset[at], sigma[at], ratio[at] = 0.0, np.inf, 0.0
 
 

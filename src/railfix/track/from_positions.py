@@ -23,11 +23,11 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 #: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 _TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
-#: Positions that deviate laterally from their neighbours within a time [s] by more than a distance [m] and this many
-#: medians of such distances are outliers; the search is repeated without them, in some rounds, where there are enough
-#: positions.
-_NEAR_S: Final = 2.5
+#: Positions that deviate laterally from their neighbours by more than a distance [m], this many medians of such
+#: distances and a curve of this radius [m] are outliers; the search is repeated without them, in some rounds, where
+#: there are enough positions.
 _BESIDE_M: Final = 5.0
+_LEAST_RADIUS_M: Final = 150.0
 _BESIDE_MEDIANS: Final = 6.0
 _ROUNDS: Final = 20
 _ENOUGH: Final = 10
@@ -155,8 +155,8 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 
 
 def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
-    """Flag positions off the line between their neighbours, which are no more than `_NEAR_S` away: by more than
-    `_BESIDE_M` and `_BESIDE_MEDIANS` medians of all such distances, the farthest first.
+    """Flag positions off the line between their neighbours by more than `_BESIDE_M`, `_BESIDE_MEDIANS` medians of all
+    such distances, and what a curve of `_LEAST_RADIUS_M` needs, the farthest first.
     """
     wrong = np.zeros(len(time), dtype=np.bool_)
     if len(time) < _ENOUGH or np.isnat(time).any():
@@ -170,8 +170,8 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
         before, after = t[1:-1] - t[:-2], t[2:] - t[1:-1]
         share = (before / np.maximum(before + after, 1e-9))[:, None]
         off = np.linalg.norm(points[1:-1] - points[:-2] * (1.0 - share) - points[2:] * share, axis=1)
-        off[np.maximum(before, after) > _NEAR_S] = 0.0
-        limit = max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(off)))
+        of_curve = ((points[2:] - points[:-2]) ** 2).sum(axis=1) / (8.0 * _LEAST_RADIUS_M)
+        limit = np.maximum(of_curve, max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(off))))
         around = np.pad(off, 1)
         farthest = (off > limit) & (off >= around[:-2]) & (off > around[2:])
         if not farthest.any():

@@ -13,10 +13,10 @@ from typing import Final
 import scipy
 
 from railfix.kernels.tracking import constants
+from railfix.kernels.tracking import index as ix
 from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.state import CLOCKS
 
 #: Sensors by the kind of their rows.
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
@@ -79,16 +79,11 @@ def budget(limits: TrackingLimits) -> Budget:
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S
     local = 1.0 + remembered_s * limits.level_samples_per_hour / 3600.0
-    exposed = [
-        min(local * limits.level_fault_prior, 1.0),
-        min((1.0 + remembered_s / CONSTELLATION_FAULT_S) * limits.level_constellation_prior, 1.0),
-        min(local * limits.level_sensor_prior, 1.0),
-        min(local * limits.level_motion_prior, 1.0),
-        min(local * limits.level_map_prior, 1.0),
-        min(local * limits.level_balise_prior, 1.0),
-        min(local * limits.level_side_prior, 1.0),
-        0.0,
-    ]
+    of_constellation = (1.0 + remembered_s / CONSTELLATION_FAULT_S) * limits.level_constellation_prior
+    others = [limits.level_sensor_prior, limits.level_motion_prior, limits.level_map_prior]
+    others += [limits.level_balise_prior, limits.level_side_prior]
+    each = [local * limits.level_fault_prior, of_constellation, *(local * prior for prior in others), 0.0]
+    exposed = [min(prior, 1.0) for prior in each]
     kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
     risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)
     of_speed = SPEED_SHARE * risk / (MOST_SOURCES + 1)
@@ -108,7 +103,7 @@ def budget(limits: TrackingLimits) -> Budget:
 
 def classify_source(name: str) -> SourceKind:
     """Return the kind of a source: `G12` is a satellite, `G` a constellation, `wheel` a sensor."""
-    if name in CLOCKS:
+    if name in ix.CLOCKS:
         return SourceKind.CONSTELLATION
     if name in OTHERS:
         return OTHERS[name]

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import constants
+from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import CHANNEL, EPOCH, Records
+from railfix.motion.singer import singer_steps
 from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.state import CLOCKS, TrackState
-from railfix.tracking.velocity import Velocity, compute_velocity, singer
+from railfix.tracking.state import TrackState
 
 #: Shortest interval between epochs [s].
 _SHORTEST_S: Final = 1e-3
@@ -22,8 +25,8 @@ _SHORTEST_S: Final = 1e-3
 _APART_S: Final = 3600.0
 #: Phases or Dopplers of an epoch that give speed and clock drift with redundancy.
 _MOTION: Final = 4
-#: Place of each clock in `CLOCKS`.
-_OFFSETS: Final = {letter: k for k, letter in enumerate(CLOCKS)}
+#: Place of each clock in `ix.CLOCKS`.
+_OFFSETS: Final = {letter: k for k, letter in enumerate(ix.CLOCKS)}
 #: Satellites unseen for this many correlation times of codes are dropped from the state.
 FORGOTTEN: Final = 3.0
 
@@ -44,6 +47,7 @@ class Chunk:
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
     """Return the chunk, and give the state an error for each satellite measured in it."""
+    state.origin = epochs.time[0] if np.isnat(state.origin) else state.origin
     phase, before = _previous(epochs, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
     placed = np.isfinite(epochs.sat_ecef_m).all(axis=2)
@@ -71,19 +75,19 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     seen[0] = state.seen
     used = (slot >= 0).nonzero()[0]
     present = np.zeros((len(epochs), len(state.satellite)), dtype=np.bool_)
-    np.logical_or.at(present, (slice(None), slot[used]), any_kind[:, used])  # a satellite may have several channels
+    np.logical_or.at(present.T, slot[used], any_kind[:, used].T)  # a satellite may have several channels
     seen[1:] = np.where(present, epochs.time[:, None], seen[1:])
     seen = np.fmax.accumulate(seen, axis=0)
     kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * constants.CODE_CORRELATION_S
     state.seen = seen[-1]
 
     variance = _compute_variance(epochs, limits)
-    near = np.full((len(epochs), 3), np.nan) if epochs.near_ecef_m is None else epochs.near_ecef_m
-    velocity = compute_velocity(
-        near, epochs.sat_ecef_m, epochs.sat_velocity_mps, before, measured, has, variance, interval
-    )
-    epoch = _pack_epochs(epochs, interval, velocity, limits)
-    epoch["begins"] = apart | epochs.off_map
+    epoch = np.zeros(len(epochs), dtype=EPOCH)
+    epoch["time_s"], epoch["interval_s"], epoch["velocity_mps"] = seconds(epochs.time - state.origin), interval, np.nan
+    for dt in np.unique(interval).tolist():
+        step, noise = compute_singer_step(dt, limits.acceleration_mps2, limits.acceleration_s)
+        epoch["step"][interval == dt], epoch["noise"][interval == dt] = step, noise
+    epoch["begins"], epoch["coded"] = apart | epochs.off_map, has[0].any(axis=1)
     epoch["motion_measured"] = has[1:].sum(axis=2).max(axis=0) >= _MOTION
     channel = np.zeros(epochs.code_m.shape, dtype=CHANNEL)
     channel["satellite"], channel["clock"] = slot, [_OFFSETS[letter] for letter in epochs.clock.tolist()]
@@ -91,6 +95,8 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     channel["before_ecef_m"], channel["code_sigma_m"] = before, epochs.code_sigma_m
     for name, values in (("measured", measured), ("has", has), ("variance", variance)):
         channel[name] = np.moveaxis(values, 0, -1)
+    if epochs.near_ecef_m is not None:
+        _write_velocities(epoch, channel, epochs.near_ecef_m)
     return Chunk(
         time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, apart=apart, off_map=epochs.off_map,
         fresh=present & ~kept, within_memory=kept,
@@ -110,16 +116,20 @@ def _compute_variance(epochs: GnssEpochs, limits: TrackingLimits) -> Floats:
     )
 
 
-def _pack_epochs(epochs: GnssEpochs, interval: Floats, velocity: Velocity, limits: TrackingLimits) -> Records:
-    """Return the records of epochs with their intervals, Singer's steps and velocities without the line."""
-    epoch = np.zeros(len(epochs), dtype=EPOCH)
-    epoch["time_s"], epoch["interval_s"] = seconds(epochs.time - epochs.time[0]), interval
-    epoch["velocity_mps"], epoch["velocity_age_s"] = velocity.velocity_mps, velocity.age_s
-    epoch["velocity_covariance"] = velocity.covariance
-    for dt in np.unique(interval).tolist():
-        step, noise = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
-        epoch["step"][interval == dt], epoch["noise"][interval == dt] = step, noise
-    return epoch
+@lru_cache(maxsize=64)
+def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
+    """Compute `railfix.motion.singer.singer_steps` of one interval, shapes (3, 3)."""
+    step, noise = singer_steps(np.array([dt]), sigma_mps2, tau_s)
+    return step[0], noise[0]
+
+
+def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> None:
+    """Write the velocities without the line; numba is imported here, for what runs no filter does without."""
+    from railfix.kernels.tracking.velocity import write_velocities
+
+    latitude, longitude, _ = geodetic_from_ecef(np.where(np.isfinite(near_ecef_m), near_ecef_m, 1e6))
+    up = np.ascontiguousarray(enu_axes(latitude, longitude)[:, 2])
+    write_velocities(epoch, channel, np.array(near_ecef_m), up)
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:

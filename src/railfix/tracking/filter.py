@@ -10,42 +10,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from railfix.core.arrays import copy_with
+from railfix.kernels.tracking import constants, layout
 from railfix.kernels.tracking import index as ix
-from railfix.kernels.tracking import layout
 from railfix.tracking.chunk import Chunk, finish_chunk, prepare_chunk
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.packing import (
-    compute_start_variance,
-    pack_parameters,
-    pack_sensors,
-    pack_state,
-    unpack_state,
-)
+from railfix.tracking.packing import pack_parameters, pack_sensors, pack_state, unpack_state
 from railfix.tracking.result import Tracked, TrackStatus, new_results
-from railfix.tracking.search import Sought, seek
-from railfix.tracking.smoother import Step, Updated
-from railfix.tracking.state import SATELLITES, StateIndex, TrackState
+from railfix.tracking.search import Sought, begin, seek
+from railfix.tracking.smoother import Step
+from railfix.tracking.state import TrackState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 
 class Recursion:
-    """A chunk as the kernel takes it.
-
-    Parameters
-    ----------
-    chunk : Chunk
-    line : Line
-    sensors : SensorEpochs
-    limits : TrackingLimits
-    start_state : TrackState
-        State before the chunk, with the errors of its satellites.
-    levels : bool
-        Whether there are sub-filters.
-    """
+    """A chunk as the kernel takes it; `start_state`: before it, with the errors of its satellites."""
 
     def __init__(
         self,
@@ -61,73 +43,71 @@ class Recursion:
         self.chunk, self.line, self.limits, self.levels = chunk, line, limits, levels
         self.results = new_results(len(chunk.time), len(chunk.satellite))
         vertex, whole = line.records
+        _, unknown = begin(np.zeros(1), len(start_state.satellite), line, limits, sigma_m=constants.EXPIRED_SIGMA_M)
         self.given = layout.Given(
             epoch=chunk.epoch, channel=chunk.channel, sensor=pack_sensors(sensors, chunk.time), fresh=chunk.fresh,
             within_memory=chunk.within_memory, vertex=vertex, line=whole,
             parameters=pack_parameters(limits, line.sigma_plan_m),
-            start_variance=compute_start_variance(start_state, line, limits),
+            start_variance=np.diagonal(unknown[0]).copy(),
         )  # fmt: skip
 
-    def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, bool]:
-        """Do epochs from `first` on and change the state; return the next, and whether places have to be sought there.
+    def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, int]:
+        """Do epochs from `first` on and change the state; return the next, and why places have to be sought there or 0.
 
         One at a time where the smoother needs something of each.
         """
         last = len(self.chunk.time) if trace is None else first + 1
         parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
-        done = self._run(state, first, last, ix.WHOLE, parents, trace)
-        return done, done < last
+        return self._run(state, (first, last), ix.WHOLE, parents, trace)
 
-    def search(self, state: TrackState, epoch: int, trace: list[Step] | None) -> None:
-        """Do an epoch before which places have to be sought."""
+    def search(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> None:
+        """Do an epoch before which places have to be sought, for the reasons of `advance`."""
         chunk = self.chunk
         if state.hypotheses:
-            packed = pack_state(state, chunk.time[0], self.limits, levels=self.levels)
+            packed = pack_state(state, self.limits, levels=self.levels)
             self.kernel(self.given, packed, self.results, _new_trace(0, 0, 0), (epoch, epoch + 1), ix.PREDICTION)
-            unpack_state(state, packed, chunk.time[0])
+            unpack_state(state, packed)
         else:
             state.code_bias = np.where(chunk.fresh[epoch], 0.0, state.code_bias)
-        found = seek(state, chunk, epoch, self.line, self.limits)
+        found = seek(state, chunk, epoch, self.line, self.limits, reasons)
         state.time = chunk.time[epoch]
         if not state.hypotheses:
             if trace is not None:
-                trace.append(Step.without_place(state, float(chunk.epoch["interval_s"][epoch])))
+                trace.append(self.make_step(state, epoch))
             return
         if found.lost:
             state.bank = None
-        self._run(state, epoch, epoch + 1, ix.REST_LOST if found.lost else ix.REST, found, trace)
+        self._run(state, (epoch, epoch + 1), ix.REST_LOST if found.lost else ix.REST, found, trace)
 
-    def _run(self, state: TrackState, first: int, last: int, part: int, found: Sought, trace: list[Step] | None) -> int:
-        """Run the recursion over epochs, change the state, and return the first epoch that is not done."""
+    def _run(
+        self, state: TrackState, span: tuple[int, int], part: int, found: Sought, trace: list[Step] | None
+    ) -> tuple[int, int]:
+        """Run the recursion over a span of epochs and change the state; return what `recursion.advance` does."""
         count, width = state.mean.shape
         rows = 3 * len(self.chunk.satellite) + self.given.sensor.shape[1]
         traced = _new_trace(0, 0, 0) if trace is None else _new_trace(count, rows, width)
-        packed = pack_state(state, self.chunk.time[0], self.limits, levels=self.levels)
-        done = int(self.kernel(self.given, packed, self.results, traced, (first, last), part))
-        if done > first:
-            unpack_state(state, packed, self.chunk.time[0])
+        packed = pack_state(state, self.limits, levels=self.levels)
+        done, reasons = self.kernel(self.given, packed, self.results, traced, span, part)
+        if done > span[0]:
+            unpack_state(state, packed)
             state.time = self.chunk.time[done - 1]
             if trace is not None:
-                trace.append(self._make_step(state, first, traced, found))
-        return done
+                step = self.make_step(state, span[0])
+                traced.restarted[:, ix.SATELLITES + self.chunk.fresh[span[0]].nonzero()[0]] = True
+                kept = traced.kept[: state.hypotheses]
+                step.trace = layout.Trace._make([values[kept] for values in traced])
+                step.mean, step.covariance, step.parent = state.mean, state.covariance, found.parent[kept]
+                step.splits = None if found.splits is None else [found.splits[k] for k in kept.tolist()]
+                trace.append(step)
+        return done, reasons
 
-    def _make_step(self, state: TrackState, epoch: int, traced: layout.Trace, found: Sought) -> Step:
-        """Return what the smoother needs of an epoch."""
-        measured = bool(np.isfinite(traced.variance).any())
-        cut = traced.restarted
-        cut[:, SATELLITES + self.chunk.fresh[epoch].nonzero()[0]] = True
-        updated = Updated(prior=traced.prior, row=traced.row, value=traced.value, variance=traced.variance)
-        step = Step(
-            dt=float(self.chunk.epoch["interval_s"][epoch]), cut=cut, satellite=state.satellite, parent=found.parent,
-            splits=found.splits, updated=updated if measured else None,
-        )  # fmt: skip
-        step.choose(traced.kept[: state.hypotheses])
-        step.mean, step.covariance = state.mean, state.covariance
-        return step
+    def make_step(self, state: TrackState, epoch: int) -> Step:
+        """Return an epoch without a hypothesis for the smoother."""
+        return Step(dt=float(self.chunk.epoch["interval_s"][epoch]), satellite=state.satellite)
 
 
 def _new_trace(hypotheses: int, rows: int, unknowns: int) -> layout.Trace:
-    """Return room for what the smoother needs of an epoch, none of it measured."""
+    """Return an empty record of an epoch for the smoother."""
     return layout.Trace(
         prior=np.zeros((hypotheses, unknowns, unknowns)), row=np.zeros((hypotheses, rows, unknowns)),
         value=np.zeros((hypotheses, rows)), variance=np.full((hypotheses, rows), np.inf),
@@ -135,7 +115,7 @@ def _new_trace(hypotheses: int, rows: int, unknowns: int) -> layout.Trace:
     )  # fmt: skip
 
 
-def _kernel() -> Callable[..., int]:
+def _kernel() -> Callable[..., tuple[int, int]]:
     """Return the compiled recursion; numba is imported here, for what runs no filter does without."""
     from railfix.kernels.tracking.recursion import advance
 
@@ -178,27 +158,27 @@ def track(
         Epochs one by one with the state handed on give the same numbers as all at once.
     """
     limits, sensors = limits or TrackingLimits(), sensors or SensorEpochs()
-    state = TrackState.empty() if state is None else copy_with(state)
+    state = TrackState() if state is None else copy_with(state)
     if not len(epochs):
         return Tracked.empty(epochs.time, len(epochs.satellite)), state
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, sensors, limits, state, levels=levels)
-    epoch, sought = 0, False
+    epoch, reasons = 0, 0
     while epoch < len(epochs):
-        lost = not np.isfinite(state.mean[:, StateIndex.ARC]).all()
+        lost = not np.isfinite(state.mean[:, ix.ARC]).all()
         if lost or chunk.apart[epoch] or chunk.off_map[epoch]:
             state.reset()
         if chunk.off_map[epoch]:
             state.time, recursion.results.epoch["status"][epoch] = chunk.time[epoch], TrackStatus.OFF_MAP
             if trace is not None:
-                trace.append(Step.without_place(state, float(chunk.epoch["interval_s"][epoch])))
+                trace.append(recursion.make_step(state, epoch))
             epoch += 1
             continue
-        if state.hypotheses and not sought:
-            epoch, sought = recursion.advance(state, epoch, trace)
+        if state.hypotheses and not reasons:
+            epoch, reasons = recursion.advance(state, epoch, trace)
         else:
-            recursion.search(state, epoch, trace)
-            epoch, sought = epoch + 1, False
+            recursion.search(state, epoch, reasons, trace)
+            epoch, reasons = epoch + 1, 0
     finish_chunk(chunk, epochs, state)
     result = Tracked.from_records(epochs.time, recursion.results)
     np.add(result.arc_m, line.round_m(result.arc_m), out=result.arc_m)

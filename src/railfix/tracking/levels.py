@@ -11,12 +11,13 @@ with the risk of L and that of V, which is a hundredth of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks, copy_with
+from railfix.core.arrays import Codes, Floats, Indices, copy_with
+from railfix.core.epoch_rows import join_epochs, take_epochs
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import constants
 from railfix.tracking.epochs import BaliseEpochs, GnssEpochs, SensorEpochs
@@ -29,11 +30,20 @@ from railfix.tracking.state import TrackState
 #: Sensors whose values between two epochs are added, and the one of which the mean is taken.
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
 _MEAN: Final = np.array([False, False, True])
+#: The standard deviation explains a sub-filter up to so many of it away: where a place has no level, where it has one.
+#: One without the faulty satellite lies further away.
+_EXPLAINED: Final = (3.0, 4.0)
+#: Larger levels are none [m]: they are those of a sub-filter that is left without measurements.
+LARGEST_LEVEL_M: Final = 1000.0
+_KEPT: Final = (
+    "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
+    "unchecked_prior", "amount_m", "status",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
 class AccumulatedIncrement:
-    """What was measured after the last epoch that was taken."""
+    """Measurements accumulated since the last epoch that was taken."""
 
     #: First epoch of the log: epochs are taken where a period from there is rounded to another number.
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -52,18 +62,9 @@ def decimate_epochs(
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
     """Return which epochs are taken, these with what was measured since the one before, and what is left after them.
 
-    None for these where none is. A carrier phase goes on where it did so at all epochs between. Ways between epochs are
-    added, the force is their mean; balises at the next epoch taken; places by features and ranges to ground units at
-    the epochs that are taken.
-
-    Parameters
-    ----------
-    epochs : GnssEpochs
-        T epochs.
-    sensors : SensorEpochs
-    since : AccumulatedIncrement
-        Left by the epochs before.
-    period_s : float [s]
+    None for these where none is. A carrier phase goes on where it did so at all epochs between. Distances between
+    epochs are added, the force is their mean; balises at the next epoch taken; places by features and ranges to ground
+    units at the epochs that are taken. `since` is what the epochs before left.
     """
     if not len(epochs):
         return np.empty(0, dtype=np.intp), None, SensorEpochs(), since
@@ -71,36 +72,45 @@ def decimate_epochs(
     number = np.floor(seconds(epochs.time - start) / period_s + 0.5).astype(np.int64)
     before = np.maximum.accumulate(np.concatenate([[since.number], number]))
     taken = (before[1:] > before[:-1]).nonzero()[0]
-    joined = epochs.phase_joined & np.isfinite(epochs.phase_m)
     value, variance = _columns(sensors, len(epochs))
-    goes_on = np.concatenate([_unbroken(epochs, since)[None], joined])
-    total = np.concatenate([since.total[None], value])
-    square = np.concatenate([since.variance[None], variance])
+    # Row 0 is what the epochs before left, row t + 1 epoch t; a row that is taken ends an interval.
+    goes_on = np.ones((len(epochs) + 1, len(epochs.channel)), dtype=np.bool_)
+    if since.unbroken is not None:
+        goes_on[0] = [name in since.unbroken for name in epochs.channel.tolist()]
+    goes_on[1:] = epochs.phase_joined & np.isfinite(epochs.phase_m)
+    total, square = np.concatenate([since.total[None], value]), np.concatenate([since.variance[None], variance])
     balises, left_balises = _balises(sensors, since, np.searchsorted(taken, np.arange(len(epochs))), len(taken))
-    # Rows of the intervals: that left by the epochs before is the first; those after the last epoch taken are left.
     edges = np.concatenate([[0], taken + 2])
+    rest, end, first = slice(int(edges[-1]), None), int(edges[-1]), edges[:-1]
     size = edges[1:] - edges[:-1]
     size[:1] += since.epochs - 1
-    rest = slice(int(edges[-1]), None)
+    unbroken = epochs.channel[goes_on[rest].all(axis=0)].tolist()
     left = copy_with(
         since, start=start, number=int(before[-1]),
         epochs=len(total[rest]) if len(taken) else since.epochs + len(epochs),
-        unbroken=_names(
-            epochs, np.asarray(goes_on[rest].all(axis=0)), restarted=len(taken) > 0 and not len(total[rest])
-        ),
+        unbroken=None if len(taken) and end == len(total) else frozenset(unbroken),
         total=total[rest].sum(axis=0), variance=square[rest].sum(axis=0), balises=left_balises,
     )  # fmt: skip
     if not len(taken):
         return taken, None, SensorEpochs(), left
-    end, first = int(edges[-1]), edges[:-1]
     some = copy_with(
         epochs if len(taken) == len(epochs) else epochs.take(taken),
-        phase_joined=np.logical_and.reduceat(goes_on[:end], first, axis=0) & joined[taken],
+        phase_joined=np.logical_and.reduceat(goes_on[:end], first, axis=0) & goes_on[taken + 1],
     )
     share = np.where(_MEAN, 1.0 / np.maximum(size, 1)[:, None], 1.0)
     total, square = (np.add.reduceat(values[:end], first, axis=0) * share for values in (total, square))
-    sensed = _sensors(sensors, taken, total, np.sqrt(square))
-    return taken, some, replace(sensed, balises=balises), left
+    sensed = SensorEpochs(
+        wheel_sign=sensors.wheel_sign, balises=balises, place_m=_take(sensors.place_m, taken),
+        place_sigma_m=_take(sensors.place_sigma_m, taken), ranges=sensors.ranges and sensors.ranges.take(taken),
+    )  # fmt: skip
+    for column, names in enumerate(_SUMMED):
+        if getattr(sensors, names[0]) is not None:
+            sensed = replace(sensed, **{names[0]: total[:, column], names[1]: np.sqrt(square[:, column])})
+    return taken, some, sensed, left
+
+
+def _take(values: Floats | None, rows: Indices) -> Floats | None:
+    return None if values is None else values[rows]
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
@@ -118,52 +128,9 @@ def _balises(
     """Return the balises at the epochs that are taken, and those read after them, with what was left before."""
     if sensors.balises is None and since.balises is None:
         return None, None
-    before = since.balises or BaliseEpochs.none(1)
-    own = sensors.balises or BaliseEpochs.none(len(interval))
-    rows = BaliseEpochs(**{
-        f.name: np.concatenate([getattr(before, f.name), getattr(own, f.name)]) for f in fields(BaliseEpochs)
-    })  # fmt: skip
+    rows = join_epochs([since.balises or BaliseEpochs.none(1), sensors.balises or BaliseEpochs.none(len(interval))])
     parts = rows.find_latest(np.concatenate([[0], interval]), taken + 1)
-    found, left = (
-        BaliseEpochs(**{f.name: getattr(parts, f.name)[part] for f in fields(BaliseEpochs)})
-        for part in (slice(taken), slice(taken, None))
-    )
-    return found, left
-
-
-def _unbroken(epochs: GnssEpochs, since: AccumulatedIncrement) -> Masks:
-    """Return which channels' phases went on at all epochs since the last one that was taken, shape (K,)."""
-    if since.unbroken is None:
-        return np.ones(len(epochs.channel), dtype=np.bool_)
-    return np.array([name in since.unbroken for name in epochs.channel.tolist()], dtype=np.bool_)
-
-
-def _names(epochs: GnssEpochs, unbroken: Masks, *, restarted: bool) -> frozenset[str] | None:
-    return None if restarted else frozenset(epochs.channel[unbroken].tolist())
-
-
-def _sensors(sensors: SensorEpochs, taken: Indices, total: Floats, sigma: Floats) -> SensorEpochs:
-    """Return the sensors at the epochs that are taken."""
-    values: dict[str, Any] = {}
-    for column, names in enumerate(_SUMMED):
-        if getattr(sensors, names[0]) is not None:
-            values |= {names[0]: total[:, column], names[1]: sigma[:, column]}
-    for name in ("place_m", "place_sigma_m"):
-        if (given := getattr(sensors, name)) is not None:
-            values[name] = given[taken]
-    ranges = sensors.ranges if sensors.ranges is None else sensors.ranges.take(taken)
-    return SensorEpochs(**values, wheel_sign=sensors.wheel_sign, ranges=ranges)
-
-
-#: The standard deviation explains a sub-filter up to so many of it away: where a place has no level, where it has one.
-#: One without the faulty satellite lies further away.
-_EXPLAINED: Final = (3.0, 4.0)
-#: Larger levels are none [m]: they are those of a sub-filter that is left without measurements.
-LARGEST_LEVEL_M: Final = 1000.0
-_KEPT: Final = (
-    "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
-    "unchecked_prior", "amount_m", "status",
-)  # fmt: skip
+    return take_epochs(parts, slice(taken)), take_epochs(parts, slice(taken, None))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,19 +182,8 @@ def carried_levels(
 ) -> tuple[Tracked, LevelState]:
     """Return places with the levels of the epochs that the filter with sub-filters took, carried to all epochs.
 
-    Parameters
-    ----------
-    tracked : Tracked
-        By the filter, T epochs.
-    epochs : GnssEpochs
-    taken : ndarray of int
-        Epochs that the filter with sub-filters took.
-    place : Tracked or None
-        Its places there; None without any.
-    line : Line
-    state : LevelState
-        Its last epoch before these.
-    limits : TrackingLimits
+    `tracked` has the places of the filter, `taken` the epochs that the one with sub-filters took, `place` its places
+    there, None without any, and `state` its last epoch before these.
     """
     number = taken.searchsorted(np.arange(len(epochs)), side="right")
     times, values = np.array([state.time]), state.values[None]
@@ -236,7 +192,7 @@ def carried_levels(
         columns[:, _KEPT.index("level_m")] = np.where(is_bounded(place.status), place.level_m, np.inf)
         times, values = np.concatenate([times, place.time]), np.concatenate([values, columns])
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
-    tau = _since(times[number], tracked.time)
+    tau = seconds(tracked.time - times[number])  # NaN before the first
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
     # What the place may have gone wrong by since then: V tau + a tau^2 / 2.
     growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
@@ -279,8 +235,3 @@ def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)
-
-
-def _since(last: Datetimes, time: Datetimes) -> Floats:
-    """Return the seconds since the last epoch with sub-filters; NaN before the first."""
-    return np.where(np.isnat(last), np.nan, seconds(time - last))

@@ -21,23 +21,11 @@ class Tails(NamedTuple):
     late: float
 
     def degrees(self, residual: Floats, codes: int) -> Floats:
-        """Return the degrees of freedom of each row, by the sign of its residual; shapes as for `weight`."""
-        degrees = np.full(residual.shape, self.usual)
-        degrees[:, :codes][residual[:, :codes] > 0.0] = self.late
-        return degrees
+        """Return the degrees of freedom of M rows, the first of codes, by the sign of the residual; shape (H, M)."""
+        return np.where((np.arange(residual.shape[1]) < codes) & (residual > 0.0), self.late, self.usual)
 
     def weight(self, residual: Floats, square: Floats, codes: int) -> Floats:
-        """Return the weights of rows, shape (H, M).
-
-        Parameters
-        ----------
-        residual : ndarray, shape (H, M)
-            Only its sign is used; positive: longer than expected.
-        square : ndarray, shape (H, M)
-            Its mean square over the variance.
-        codes : int
-            How many rows are of codes; they come first.
-        """
+        """Return the weights of rows with residuals, and mean squares of them over their variances; shape (H, M)."""
         degrees = self.degrees(residual, codes)
         return np.asarray((self.usual + 1.0) / self.usual * degrees / (degrees + square))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -12,7 +11,7 @@ from railfix.core.arrays import Floats
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.ranges.atmosphere import geomagnetic_latitude
-from railfix.track.trajectory import Trajectory, joins_m
+from railfix.track.trajectory import Trajectory
 
 #: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude: 2/9 of that of
 #: the vertical delay that DO-229D J.2.3 assumes without SBAS, 9 m up to 20 deg, 4.5 m up to 55 deg, 6 m beyond [m].
@@ -21,49 +20,38 @@ TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Line:
-    """Vertices of a trajectory with their axes."""
+    """A trajectory with smooth axes at its points; places beyond its ends are on it too."""
 
-    arc_m: Floats  #: Shape (V,).
-    ecef_m: Floats  #: Shape (V, 3).
-    axes: Floats  #: Rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3).
-    segment: Floats  #: Unit vector of each segment; shape (V - 1, 3).
-    gradient: Floats  #: Climb over horizontal length of each segment; shape (V - 1,).
-    sigma_plan_m: float
-    sigma_height_m: float
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.arc_m: Floats = trajectory.arc_m  #: Shape (V,).
+        self.ecef_m: Floats = trajectory.ecef_m  #: Shape (V, 3).
+        self.segment: Floats = trajectory.tangent  #: Unit vector of each segment; shape (V - 1, 3).
+        self.joins_m = trajectory.joins_m
+        #: Standard deviations of the map [m].
+        self.sigma_plan_m, self.sigma_height_m = trajectory.sigma_plan_m, trajectory.sigma_height_m
 
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> Line:
-        """Return the axes at the vertices of a trajectory."""
-        segment = np.asarray(trajectory.tangent)
+    @cached_property
+    def axes(self) -> Floats:
+        """Axes at the points, rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3)."""
+        segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
-        up = np.concatenate([trajectory.up[:1], trajectory.up])
-        right = np.cross(tangent, up)
+        right = np.cross(tangent, np.concatenate([up[:1], up]))
         right /= np.linalg.norm(right, axis=1, keepdims=True)
-        return cls(
-            arc_m=np.asarray(trajectory.arc_m),
-            ecef_m=np.asarray(trajectory.ecef_m),
-            axes=np.stack([tangent, right, np.cross(right, tangent)], axis=1),
-            segment=segment,
-            gradient=np.asarray(trajectory.gradient_permille) / 1e3,
-            sigma_plan_m=trajectory.sigma_plan_m,
-            sigma_height_m=trajectory.sigma_height_m,
-        )
+        return np.stack([tangent, right, np.cross(right, tangent)], axis=1)
+
+    @cached_property
+    def gradient(self) -> Floats:
+        """Climb over horizontal length of each segment, shape (V - 1,)."""
+        return self.trajectory.gradient_permille / 1e3
 
     def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
-        """Points and axes at arc lengths, beyond the ends of a closed line where it goes on, of others straight on.
+        """Return points [m] and axes at arc lengths [m], shapes (H, 3), (H, 3, 3) and (H,).
 
-        Parameters
-        ----------
-        arc_m : ndarray, shape (H,) [m]
-
-        Returns
-        -------
-        ecef_m : ndarray, shape (H, 3) [m]
-        axes : ndarray, shape (H, 3, 3)
-            Rows: tangent, right, up; interpolated between vertices.
+        Beyond the ends of a closed line they are where it goes on, of others straight on. Rows of the axes are tangent,
+        right and up, interpolated between vertices.
         """
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         index = self.arc_m[1:-1].searchsorted(arc_m, side="right")
@@ -74,31 +62,12 @@ class Line:
         return self.ecef_m[index] + along[:, None] * self.segment[index], axes
 
     @cached_property
-    def joins_m(self) -> tuple[float, float]:
-        """Arc lengths at which a closed line goes on before its start and after its end; NaN at an open end."""
-        return joins_m(self.arc_m, self.ecef_m)
-
-    @cached_property
-    def bounds_m(self) -> tuple[float, float]:
-        """Arc lengths of the open ends; infinite where the line is closed."""
-        before, after = self.joins_m
-        return (
-            float(self.arc_m[0]) if np.isnan(before) else -np.inf,
-            float(self.arc_m[-1]) if np.isnan(after) else np.inf,
-        )
-
-    @cached_property
     def closed(self) -> bool:
         """Whether the line goes on at one of its ends."""
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift of places beyond an end of a closed line to where it goes on [m]; 0 for others.
-
-        Parameters
-        ----------
-        arc_m : ndarray [m]
-        """
+        """Return the shift of places beyond an end of a closed line to where it goes on [m]; 0 for others."""
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
         for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):
@@ -107,15 +76,7 @@ class Line:
         return back
 
     def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
-        """Arc lengths of the same places that are nearest to others, beyond an end of a closed line if need be [m].
-
-        Parameters
-        ----------
-        arc_m : ndarray [m]
-            On the line.
-        to_m : ndarray [m]
-            May lie beyond an end.
-        """
+        """Return arc lengths of places nearest to others, beyond the end of a closed line if need be [m]."""
         if not self.closed:
             return arc_m
         back = self.round_m(to_m)
@@ -131,28 +92,27 @@ class Line:
         return np.asarray(nearest - back)
 
     @cached_property
-    def middle_m(self) -> Floats:
-        """Arc lengths of the middles of the segments, shape (V - 1,) [m]."""
-        return 0.5 * (self.arc_m[1:] + self.arc_m[:-1])
-
-    @cached_property
     def records(self) -> tuple[Records, Records]:
         """Vertices, and the line as a whole, as the recursion takes them; shapes (V,), (1,)."""
         vertex, line = np.zeros(len(self.arc_m), dtype=VERTEX), np.zeros(1, dtype=LINE)
         for name in ("arc_m", "ecef_m", "axes"):
             vertex[name] = getattr(self, name)
-        for name in ("segment", "middle_m", "gradient"):
-            vertex[name][:-1] = getattr(self, name)
+        for name, values in (("segment", self.segment), ("gradient", self.gradient), ("middle_m", self._middle_m)):
+            vertex[name][:-1] = values
         line["sigma_plan_m"], line["sigma_height_m"] = self.sigma_plan_m, self.sigma_height_m
         latitude_deg, longitude_deg, _ = geodetic_from_ecef(self.ecef_m[0])
         magnetic_deg = 180.0 * abs(geomagnetic_latitude(latitude_deg / 180.0, longitude_deg / 180.0))
         line["tilt_m"] = TILT_M[int(np.searchsorted(_TILT_LATITUDES_DEG, magnetic_deg))]
-        line["start_m"], line["end_m"] = self.bounds_m
-        line["start_turn_m"] = np.nan_to_num(self.joins_m[0] - self.arc_m[0])
-        line["end_turn_m"] = np.nan_to_num(self.arc_m[-1] - self.joins_m[1])
+        (before, after), first, last = self.joins_m, self.arc_m[0], self.arc_m[-1]
+        line["start_m"], line["end_m"] = first if np.isnan(before) else -np.inf, last if np.isnan(after) else np.inf
+        line["start_turn_m"], line["end_turn_m"] = np.nan_to_num(before - first), np.nan_to_num(last - after)
         return vertex, line
 
     def gradient_at(self, arc_m: Floats) -> Floats:
-        """Climb over horizontal length, between the middles of segments, shape (H,)."""
+        """Return the climb over horizontal length, linear between the middles of segments, shape (H,)."""
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
-        return np.interp(arc_m, self.middle_m, self.gradient)
+        return np.interp(arc_m, self._middle_m, self.gradient)
+
+    @cached_property
+    def _middle_m(self) -> Floats:
+        return 0.5 * (self.arc_m[1:] + self.arc_m[:-1])

@@ -7,17 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats
-from railfix.core.timescale import seconds, timedelta
+from railfix.core.arrays import Datetimes
+from railfix.core.timescale import seconds
 from railfix.kernels.tracking import constants, layout
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Records
 from railfix.tracking import bank
 from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.line import Line
-from railfix.tracking.search import begin
-from railfix.tracking.state import CLOCKS, HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
+from railfix.tracking.state import HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
 
 #: Least `MAP_BRANCH_M` in standard deviations of the map across.
 _BRANCH_SIGMAS = 3.0
@@ -64,11 +62,11 @@ def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
 
 def list_sources(state: TrackState) -> list[str]:
     """Return the sources of sub-filters in the order of the recursion."""
-    return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
+    return [*state.satellite.tolist(), *ix.CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
 
 
-def pack_state(state: TrackState, origin: np.datetime64, limits: TrackingLimits, *, levels: bool) -> layout.State:
-    """Return a copy of the state; `origin` is the first time of the chunk."""
+def pack_state(state: TrackState, limits: TrackingLimits, *, levels: bool) -> layout.State:
+    """Return a copy of the state."""
     names = list_sources(state) if levels else []
     count, width = state.mean.shape
     x, P = np.zeros((count + len(names), width)), np.zeros((count + len(names), width, width))
@@ -79,15 +77,13 @@ def pack_state(state: TrackState, origin: np.datetime64, limits: TrackingLimits,
         at = np.array([names.index(state.bank.without[k]) for k in kept], dtype=np.intp)
         source["running"][at], source["contradicted_s"][at] = True, state.bank.contradicted_s[kept]
         x[count + at], P[count + at] = state.bank.mean[kept], state.bank.covariance[kept]
-    hypothesis, monitors = np.zeros(count, dtype=HYPOTHESIS), np.zeros(1, dtype=MONITORS)
-    for name in HYPOTHESIS.names or ():
-        hypothesis[name] = getattr(state, name)
+    monitors = np.zeros(1, dtype=MONITORS)
     for name, value in vars(state.monitors).items():
         monitors[name] = value
     monitors["hypotheses"] = count
-    monitors["measured_s"] = seconds(state.measured - origin)
-    monitors["coded_s"] = np.fmax(seconds(state.coded - origin), -np.inf)
-    return layout.State(x, P, hypothesis, monitors, state.code_bias.copy(), state.offset_known.copy(), source)
+    return layout.State(
+        x, P, state.hypothesis.astype(HYPOTHESIS), monitors, state.code_bias.copy(), state.offset_known.copy(), source
+    )
 
 
 def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
@@ -98,29 +94,19 @@ def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
         for field, values in (("prior", given.prior), ("k", given.k_fault), ("k_speed", given.k_speed_fault)):
             source[field] = np.array(values)[kinds]
         source["clock"] = [
-            CLOCKS.index(bank.get_clock(name)) if kind == bank.SourceKind.SATELLITE else 0
+            ix.CLOCKS.index(bank.get_clock(name)) if kind == bank.SourceKind.SATELLITE else 0
             for name, kind in zip(names, kinds, strict=True)
         ]
     return source
 
 
-def compute_start_variance(state: TrackState, line: Line, limits: TrackingLimits) -> Floats:
-    """Return the variance of each unknown where nothing is known of it, shape (N,)."""
-    start = np.full(1, constants.EXPIRED_SIGMA_M)
-    _, covariance = begin(np.zeros(1), start, len(state.satellite), line, limits)
-    return np.diagonal(covariance[0]).copy()
-
-
-def unpack_state(state: TrackState, packed: layout.State, origin: Any) -> None:
-    """Put what the recursion leaves into the state; `origin` is the first time of the chunk."""
+def unpack_state(state: TrackState, packed: layout.State) -> None:
+    """Write the arrays of the recursion back into the state."""
     monitors: Any = packed.monitors[0]
     first, count = len(packed.hypothesis), int(monitors["hypotheses"])
     state.mean, state.covariance = packed.x[:count].copy(), packed.P[:count].copy()
-    for name in HYPOTHESIS.names or ():
-        setattr(state, name, packed.hypothesis[name][:count].copy())
+    state.hypothesis = packed.hypothesis[:count].copy()
     state.monitors = Monitors(**{name: float(monitors[name]) for name in vars(state.monitors)})
-    state.measured = origin + timedelta(monitors["measured_s"].item())
-    state.coded = origin + timedelta(monitors["coded_s"].item())
     state.code_bias, state.offset_known = packed.code_bias, packed.offset_known
     if len(packed.source):
         running, names = packed.source["running"].nonzero()[0], list_sources(state)

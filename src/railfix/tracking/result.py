@@ -3,50 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from enum import IntEnum
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
-from railfix.kernels.tracking import constants
+from railfix.kernels.tracking.index import TrackStatus as TrackStatus
 from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind
-
-
-class TrackStatus(IntEnum):
-    """What the filter says of an epoch."""
-
-    #: One place, from measurements of this epoch.
-    TRACKING = constants.TRACKING
-    #: Another place of the line is more probable than the risk; one of the most probable is given.
-    SEVERAL_BRANCHES = constants.SEVERAL_BRANCHES
-    #: Predicted: no measurement of this epoch, or none that is believed.
-    COASTING = constants.COASTING
-    #: Measurements contradict the track: places are sought over the whole line.
-    LOST = constants.LOST
-    #: No place: predicted with more than 200 m of standard deviation.
-    EXPIRED = constants.EXPIRED
-    #: No place: no epoch so far had two codes more than unknowns.
-    NOT_STARTED = constants.NOT_STARTED
-    #: No place: every position for 10 s contradicted the line.
-    OFF_MAP = constants.OFF_MAP
-    #: One place, but 3-D positions of the last minutes lie beside or above the line, or another track of the network
-    #: is more probable than `track_risk`.
-    MAP_OFFSET = constants.MAP_OFFSET
-    #: One place, but within the last 20 s its distance from the other antenna's was off by more than 5 m, or its speed
-    #: by more than 1.5 m/s, and four standard deviations.
-    ANTENNAS_DISAGREE = constants.ANTENNAS_DISAGREE
-    #: One place, but measurements, the velocity or a sub-filter contradict it: nothing bounds its error.
-    DOUBTFUL = constants.DOUBTFUL
-    #: One place, but the signals may be those of a spoofer: nothing bounds its error.
-    SPOOFING_SUSPECTED = constants.SPOOFING_SUSPECTED
-
-    @property
-    def text(self) -> str:
-        """The word written to files: ``several_branches``."""
-        return self.name.lower()
-
 
 #: Statuses whose level bounds the error: beside the map, on one of several branches or on a track in doubt, no
 #: sub-filter does.

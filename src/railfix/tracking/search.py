@@ -9,13 +9,13 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.geodesy import range_with_rotation
-from railfix.core.timescale import seconds
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.index import CODE
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Records
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
-from railfix.tracking.state import ANY_SPEED, CLOCKS, OFFSETS, SATELLITES, StateIndex, TrackState
+from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 
 #: The line is searched at points this far apart at most; a Gaussian of `START_SIGMA_M` covers what lies between, and
 #: codes count with the error that a place between two points makes [m].
@@ -38,26 +38,21 @@ _BESIDE: Final = len(_BESIDE_STEPS)
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
 #: What a new hypothesis takes over from a lost track: its error has gone into everything else.
-_KEPT: Final = np.array([StateIndex.WHEEL, StateIndex.FORCE_OFFSET, StateIndex.RADAR])
+_KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
 
 
-def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tuple[Floats, Floats]:
-    """Return the places along the line that the codes of an epoch are consistent with.
+def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floats:
+    """Return the arc lengths that the codes of an epoch are consistent with, shape (C,) [m].
 
-    Returns
-    -------
-    arc_m : ndarray, shape (C,) [m]
-        Local maxima of the likelihood with Student's t errors, the best first; empty with fewer than `REDUNDANT`
-        codes beyond the unknowns.
-    sigma_m : ndarray, shape (C,) [m]
-        `START_SIGMA_M` for each.
+    Local maxima of the likelihood with Student's t errors, the best first; none with fewer than `REDUNDANT` codes
+    beyond the unknowns.
     """
     channel = chunk.channel[epoch]
-    has = channel["has"][:, CODE] != 0
-    groups = [has & (channel["clock"] == g) for g in range(len(CLOCKS))]
+    has = channel["has"][:, ix.CODE] != 0
+    groups = [has & (channel["clock"] == g) for g in range(len(ix.CLOCKS))]
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
-        return np.empty(0), np.empty(0)
+        return np.empty(0)
     # between the vertices too: a map with few of them would be searched with gaps
     arc = np.linspace(line.arc_m[0], line.arc_m[-1], 1 + int(np.ceil((line.arc_m[-1] - line.arc_m[0]) / _SPACING_M)))
     points, _ = line.at(arc)
@@ -65,7 +60,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     tails = limits.tails
     for group in groups:
         distance, _ = range_with_rotation(channel["sat_ecef_m"][group], points[:, None, :])
-        residual = channel["measured"][group, CODE] - distance
+        residual = channel["measured"][group, ix.CODE] - distance
         variance = (1.0 + limits.code_white_share**2) * channel["code_sigma_m"][group] ** 2 + _SPACING_M**2 / 12.0
         clock = np.median(residual, axis=1, keepdims=True)
         for _ in range(constants.PASSES):
@@ -83,101 +78,48 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
             chosen.append(candidate)
         if len(chosen) == limits.most_hypotheses:
             break
-    sigma = np.full(len(chosen), constants.START_SIGMA_M)
-    return arc[chosen], sigma
+    return arc[chosen]
 
 
 def begin(
     arc_m: Floats,
-    sigma_m: Floats,
     satellites: int,
     line: Line,
     limits: TrackingLimits,
     *,
+    sigma_m: float = constants.START_SIGMA_M,
     known: tuple[Floats, Floats] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return the mean and covariance of new hypotheses at places, shapes (H, N) and (H, N, N).
+    """Return the mean and covariance of new hypotheses at places [m], shapes (H, N), (H, N, N) and (H,).
 
-    Parameters
-    ----------
-    arc_m, sigma_m : ndarray, shape (H,) [m]
-    satellites : int
-        Errors of satellites in the state.
-    line : Line
-    limits : TrackingLimits
-    known : tuple of ndarray, shapes (N,) and (N, N), optional
-        Mean and covariance of a lost track: what it knew of the sensors is kept, clocks and satellites restart.
+    `satellites` is the number of their errors in the state, `known` are mean and covariance of a lost track, (N,) and
+    (N, N): what it knew of the sensors is kept, clocks and satellites restart.
     """
-    width = SATELLITES + satellites
+    width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
-    mean[:, StateIndex.ARC] = mean[:, StateIndex.PREVIOUS_ARC] = arc_m
+    mean[:, ix.ARC] = mean[:, ix.PREVIOUS_ARC] = arc_m
     variance = np.ones((len(arc_m), width))
-    variance[:, StateIndex.ARC] = variance[:, StateIndex.PREVIOUS_ARC] = sigma_m**2
-    variance[:, StateIndex.SPEED] = variance[:, StateIndex.PREVIOUS_SPEED] = _ANY_SPEED_MPS**2
-    variance[:, StateIndex.ACCELERATION] = limits.acceleration_mps2**2
-    variance[:, StateIndex.DRIFT] = _ANY_DRIFT_MPS**2
-    variance[:, StateIndex.MAP_RIGHT] = line.sigma_plan_m**2
-    variance[:, StateIndex.MAP_UP] = line.sigma_height_m**2
-    variance[:, StateIndex.SLOW_CODE] = limits.slow_code_m**2
-    variance[:, StateIndex.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
-    variance[:, StateIndex.WHEEL] = WHEEL_PRIOR**2
-    variance[:, StateIndex.FORCE_OFFSET] = FORCE_PRIOR_MPS2**2
-    variance[:, StateIndex.RADAR] = RADAR_PRIOR**2
-    variance[:, OFFSETS:SATELLITES] = constants.OFFSET_PRIOR_M**2
+    variance[:, ix.ARC] = variance[:, ix.PREVIOUS_ARC] = sigma_m**2
+    variance[:, ix.SPEED] = variance[:, ix.PREVIOUS_SPEED] = _ANY_SPEED_MPS**2
+    variance[:, ix.ACCELERATION] = limits.acceleration_mps2**2
+    variance[:, ix.DRIFT] = _ANY_DRIFT_MPS**2
+    variance[:, ix.MAP_RIGHT] = line.sigma_plan_m**2
+    variance[:, ix.MAP_UP] = line.sigma_height_m**2
+    variance[:, ix.SLOW_CODE] = limits.slow_code_m**2
+    variance[:, ix.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
+    variance[:, ix.WHEEL] = WHEEL_PRIOR**2
+    variance[:, ix.FORCE_OFFSET] = FORCE_PRIOR_MPS2**2
+    variance[:, ix.RADAR] = RADAR_PRIOR**2
+    variance[:, ix.OFFSETS : ix.SATELLITES] = constants.OFFSET_PRIOR_M**2
     covariance = np.zeros((len(arc_m), width, width))
     diagonal = np.arange(width)
     covariance[:, diagonal, diagonal] = variance
-    covariance[:, StateIndex.CODE_CLOCK, StateIndex.CODE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
-    covariance[:, StateIndex.PHASE_CLOCK, StateIndex.PHASE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
+    covariance[:, ix.CODE_CLOCK, ix.CODE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
+    covariance[:, ix.PHASE_CLOCK, ix.PHASE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
     if known is not None:
         mean[:, _KEPT] = known[0][_KEPT]
         covariance[:, _KEPT[:, None], _KEPT] = known[1][_KEPT[:, None], _KEPT]
     return mean, covariance
-
-
-def split(
-    mean: Floats, covariance: Floats, log_probability: float, arc_m: Floats, sigma_m: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return narrower hypotheses within a wide one, about places; probabilities by its density there.
-
-    Parameters
-    ----------
-    mean, covariance : ndarray, shapes (N,), (N, N)
-        The wide hypothesis.
-    log_probability : float
-    arc_m, sigma_m : ndarray, shape (C,) [m]
-    """
-    place = StateIndex.ARC
-    wide = covariance[place, place]
-    gain = covariance[:, place] / wide
-    means = mean + gain * (arc_m - mean[place])[:, None]
-    narrower = covariance - np.outer(gain, gain) * wide
-    covariances = narrower + np.outer(gain, gain) * (sigma_m**2)[:, None, None]
-    log_weight = -0.5 * (arc_m - mean[place]) ** 2 / wide + np.log(sigma_m)
-    return means, covariances, log_probability + log_weight - np.logaddexp.reduce(log_weight)
-
-
-def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Floats, Floats, Floats]:
-    """Mean, covariance and logarithm of the share of hypotheses a little before and after one, its speed unknown.
-
-    Where a line turns back within some tens of metres, Dopplers fit one leg run forward and the other run backward
-    alike, and a step of the estimate over the bend is none of the equations linearised before it. Contradicted by its
-    motion, the place beyond the bend must be tried.
-
-    Parameters
-    ----------
-    mean, covariance : ndarray, shapes (N,), (N, N)
-    limits : TrackingLimits
-    """
-    steps = constants.BEND_M * _BESIDE_STEPS
-    gain = np.zeros(len(mean))
-    gain[[StateIndex.ARC, StateIndex.PREVIOUS_ARC]] = 1.0
-    means = mean + gain * steps[:, None]
-    wider = covariance + np.outer(gain, gain) * (0.5 * constants.BEND_M) ** 2
-    for unknown, sigma in ((StateIndex.SPEED, _BEND_SPEED_MPS), (StateIndex.ACCELERATION, limits.acceleration_mps2)):
-        wider[unknown, unknown] += sigma**2
-    covariances = np.repeat(wider[None], len(steps), axis=0)
-    return means, covariances, np.full(len(steps), np.log(_BESIDE_SHARE / len(steps)))
 
 
 #: Probability of other places where the velocity contradicts the one that was sure: the map may be wrong just here.
@@ -192,9 +134,7 @@ class SplitHypothesis:
     #: Mean and covariance of the wide one; shapes (N,), (N, N).
     mean: Floats
     covariance: Floats
-    #: Place of the narrower one, and its standard deviation.
-    place_m: float
-    sigma_m: float
+    place_m: float  #: Place of the narrower one, with the standard deviation `START_SIGMA_M`.
 
 
 class Sought(NamedTuple):
@@ -205,43 +145,51 @@ class Sought(NamedTuple):
     splits: list[SplitHypothesis | None] | None  #: Hypotheses that began at this epoch within wider ones.
 
 
-#: Mean, covariance, logarithm of the probability, arc length at the start and part by codes of some hypotheses.
-_Part: TypeAlias = tuple[Floats, Floats, Floats, Floats, Floats]
+#: Means, covariances and records of some hypotheses; shapes (H, N), (H, N, N), (H,).
+_Part: TypeAlias = tuple[Floats, Floats, Records]
 
 
-def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Sought:
-    """Seek places at the start, after a gap and when lost; the state is that predicted to the epoch."""
+def _new_records(log_probability: Floats, origin_m: Floats, log_code: Floats | float = 0.0) -> Records:
+    """Return the records of hypotheses that begin, `HYPOTHESIS`; arguments of shape (H,)."""
+    records = np.zeros(len(origin_m), dtype=HYPOTHESIS)
+    records["log_probability"], records["origin_m"], records["log_code"] = log_probability, origin_m, log_code
+    return records
+
+
+def _join(state: TrackState, parts: list[_Part]) -> None:
+    """Make some hypotheses those of the state, with probabilities that add up to 1."""
+    state.mean, state.covariance, state.hypothesis = (np.concatenate(items) for items in zip(*parts, strict=True))
+    state.hypothesis["log_probability"] -= np.logaddexp.reduce(state.hypothesis["log_probability"])
+
+
+def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits, reasons: int) -> Sought:
+    """Seek places before an epoch, and change the state, which is predicted to it.
+
+    `reasons` are bits of `index.LOST_TRACK` and those after it; 0 without a hypothesis.
+    """
     if not state.hypotheses:
-        arc, sigma = places(chunk, epoch, line, limits)
-        state.mean, state.covariance = begin(arc, sigma, len(state.satellite), line, limits)
-        state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
-        state.log_code = np.zeros(len(arc))
+        arc = places(chunk, epoch, line, limits)
+        state.mean, state.covariance = begin(arc, len(state.satellite), line, limits)
+        state.hypothesis = _new_records(np.full(len(arc), -np.log(max(len(arc), 1))), arc)
         _start_branches(state)
         return Sought(lost=False, parent=np.full(len(arc), -1), splits=None)
-    monitors, parent = state.monitors, np.arange(state.hypotheses)
-    weak = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
-    lost = weak or monitors.across >= constants.ACROSS_LOST
-    gap = bool(seconds(chunk.time[epoch] - state.measured) > constants.GAP_S)
-    wide = state.covariance[:, StateIndex.ARC, StateIndex.ARC] > constants.START_SIGMA_M**2
-    if not (lost or (gap and wide.any())):
-        contradicted = monitors.weak_motion_s >= constants.BESIDE_AFTER_S or monitors.across >= constants.ACROSS_DOUBT
-        contradicted = contradicted or monitors.motion_misfit > 1.0 - constants.MOTION_FIT
-        if contradicted and state.measured >= state.time:
-            parent = np.append(parent, np.full(_try_beside(state, line, limits), -1))
-        return Sought(lost=False, parent=parent, splits=None)
-    arc, sigma = places(chunk, epoch, line, limits)
+    parent, lost = np.arange(state.hypotheses), bool(reasons & ix.LOST_TRACK)
+    wide = state.covariance[:, ix.ARC, ix.ARC] > constants.START_SIGMA_M**2
+    if not (lost or (reasons & ix.GAP and wide.any())):
+        added = _try_beside(state, line, limits) if reasons & ix.CONTRADICTED else 0
+        return Sought(lost=False, parent=np.append(parent, np.full(added, -1)), splits=None)
+    arc = places(chunk, epoch, line, limits)
     if not len(arc):
         return Sought(lost=lost, parent=parent, splits=None)
-    of_now = state.mean, state.covariance, state.log_probability, state.origin_m, state.log_code
+    weak = state.monitors.weak_motion_s >= constants.LOST_MOTION_S
+    weak = lost and (weak or state.monitors.weak_code_s >= constants.LOST_CODE_S)
+    of_now = state.mean, state.covariance, state.hypothesis
     if lost:
         parts, splits = ([] if weak else [of_now]) + [_begin_elsewhere(state, arc, line, limits, weak=weak)], None
     else:
-        inside, splits = _split_wide(state, arc, sigma, wide, line)
+        inside, splits = _split_wide(state, arc, wide, line)
         parts = [of_now, *inside]
-    state.mean, state.covariance, log_probability, state.origin_m, state.log_code = (
-        np.concatenate(items) for items in zip(*parts, strict=True)
-    )
-    state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
+    _join(state, parts)
     parent = np.full(state.hypotheses, -1)
     if splits is not None:
         parent = np.array([k if item is None else item.parent for k, item in enumerate(splits)])
@@ -251,7 +199,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
 
 def _start_branches(state: TrackState) -> None:
     """Start the count of time and distance on the branches."""
-    state.log_least, state.log_recent = state.log_probability, np.zeros(state.hypotheses)
+    state.hypothesis["log_least"], state.hypothesis["log_recent"] = state.hypothesis["log_probability"], 0.0
     state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
 
 
@@ -266,73 +214,83 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
         hold = max(hold, constants.LEVEL_START_S)
     state.monitors = replace(
         state.monitors, level_hold_s=hold, weak_motion_s=0.0, weak_code_s=0.0, across=0.0, code_shift=0.0,
-        code_shift_variance=0.0, least_speed_mps=ANY_SPEED[0], most_speed_mps=ANY_SPEED[1],
+        code_shift_variance=0.0, least_speed_mps=ANY_SPEED[0], most_speed_mps=ANY_SPEED[1], coded_s=-np.inf,
     )  # fmt: skip
-    state.coded = np.datetime64("NaT", "ns")
 
 
 def _split_wide(
-    state: TrackState, arc: Floats, sigma: Floats, wide: Masks, line: Line
+    state: TrackState, arc_m: Floats, wide: Masks, line: Line
 ) -> tuple[list[_Part], list[SplitHypothesis | None]]:
-    """Return narrower hypotheses at places within wide ones, and what each hypothesis was split from."""
+    """Return narrower hypotheses at places within wide ones, and what each hypothesis was split from.
+
+    Each is the wide one as if its place were known with `START_SIGMA_M`; their probabilities are by its density there.
+    """
     parts: list[_Part] = []
     splits: list[SplitHypothesis | None] = [None] * state.hypotheses
-    for one in np.flatnonzero(wide):
-        mean, covariance = state.mean[one], state.covariance[one]
-        reach = 5.0 * np.sqrt(covariance[StateIndex.ARC, StateIndex.ARC])
-        there = line.nearest_m(arc, mean[StateIndex.ARC])
-        near = np.abs(there - mean[StateIndex.ARC]) < reach
-        if near.any():
-            new = split(mean, covariance, float(state.log_probability[one]), there[near], sigma[near])
-            parts.append((*new, there[near], np.full(int(near.sum()), state.log_code[one])))
-            splits += [
-                SplitHypothesis(parent=int(one), mean=mean, covariance=covariance, place_m=at, sigma_m=wide_m)
-                for at, wide_m in zip(there[near].tolist(), sigma[near].tolist(), strict=True)
-            ]
+    for h in np.flatnonzero(wide):
+        mean, covariance, record = state.mean[h], state.covariance[h], state.hypothesis[h]
+        variance = covariance[ix.ARC, ix.ARC]
+        there = line.nearest_m(arc_m, mean[ix.ARC])
+        away = there - mean[ix.ARC]
+        near = np.abs(away) < 5.0 * np.sqrt(variance)
+        there, away = there[near], away[near]
+        if not len(there):
+            continue
+        gain = covariance[:, ix.ARC] / variance
+        narrower = covariance - np.outer(gain, gain) * (variance - constants.START_SIGMA_M**2)
+        log_weight = -0.5 * away**2 / variance
+        log_probability = record["log_probability"] + log_weight - np.logaddexp.reduce(log_weight)
+        records = _new_records(log_probability, there, record["log_code"])
+        parts.append((mean + gain * away[:, None], np.repeat(narrower[None], len(there), axis=0), records))
+        splits += [
+            SplitHypothesis(parent=int(h), mean=mean, covariance=covariance, place_m=place_m)
+            for place_m in there.tolist()
+        ]
     return parts, splits
 
 
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
     """Return hypotheses at places away from those of a lost track; `weak`: its weights were low for long."""
-    best = int(np.argmax(state.log_probability))
+    log_probability = state.hypothesis["log_probability"]
+    best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.across >= constants.ACROSS_TAKEN else _ELSEWHERE
     # One that is less probable than a new place has drifted from where codes would begin it.
-    alive = state.log_probability >= np.log(elsewhere / len(arc))
-    going = state.mean[best : best + 1, StateIndex.ARC] if weak else state.mean[alive, StateIndex.ARC]
+    alive = log_probability >= np.log(elsewhere / len(arc))
+    going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]
     there = line.nearest_m(arc[:, None], going)
     arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
     # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
     # the hypotheses go on as they are.
     arc = np.concatenate([going, arc]) if weak else arc
-    sigma = np.full(len(arc), constants.START_SIGMA_M)
-    known = state.mean[best], state.covariance[best]
-    fresh = begin(arc, sigma, len(state.satellite), line, limits, known=known)
-    return (*fresh, np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc, np.zeros(len(arc)))
+    fresh = begin(arc, len(state.satellite), line, limits, known=(state.mean[best], state.covariance[best]))
+    return (*fresh, _new_records(np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc))
 
 
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
-    """Add hypotheses beside those that are apart, the most probable first; return how many.
+    """Add hypotheses a little before and after those that are apart, the most probable first; return how many.
 
-    Motion that contradicts the best one contradicts another lap of it alike: without places of its own beside it the
-    other lap would lose by them.
+    Where a line turns back within some tens of metres, Dopplers fit one leg run forward and the other run backward
+    alike, and a step of the estimate over the bend is none of the equations linearised before it. Contradicted by its
+    motion, the place beyond the bend must be tried, with any speed. Motion that contradicts the best hypothesis
+    contradicts another lap of it alike: without places of its own beside it the other lap would lose by them.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE
-    for h in np.argsort(-state.log_probability, kind="stable").tolist():
-        there = line.nearest_m(state.mean[parents, StateIndex.ARC], state.mean[h, StateIndex.ARC])
-        if len(parents) < room and (np.abs(there - state.mean[h, StateIndex.ARC]) > limits.start_separation_m).all():
+    for h in np.argsort(-state.hypothesis["log_probability"], kind="stable").tolist():
+        there = line.nearest_m(state.mean[parents, ix.ARC], state.mean[h, ix.ARC])
+        if len(parents) < room and (np.abs(there - state.mean[h, ix.ARC]) > limits.start_separation_m).all():
             parents.append(h)
-    if state.hypotheses > limits.most_hypotheses // 2 or not parents:
-        return 0
-    parts = [beside(state.mean[h], state.covariance[h], limits) for h in parents]
-    mean, covariance, share = (np.concatenate(items) for items in zip(*parts, strict=True))
-    parent = np.repeat(parents, _BESIDE)
-    log_probability = np.concatenate([state.log_probability, state.log_probability[parent] + share])
-    state.mean = np.concatenate([state.mean, mean])
-    state.covariance = np.concatenate([state.covariance, covariance])
-    state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
-    state.log_least = np.concatenate([state.log_least, np.zeros(len(mean))])
-    state.log_recent = np.concatenate([state.log_recent, np.zeros(len(mean))])
-    state.log_code = np.concatenate([state.log_code, state.log_code[parent]])
-    state.origin_m = np.concatenate([state.origin_m, mean[:, StateIndex.ARC]])
-    return len(mean)
+    parts: list[_Part] = [(state.mean, state.covariance, state.hypothesis)]
+    places_of_both = np.ix_([ix.ARC, ix.PREVIOUS_ARC], [ix.ARC, ix.PREVIOUS_ARC])
+    for h in parents:
+        means = np.repeat(state.mean[h][None], _BESIDE, axis=0)
+        means[:, [ix.ARC, ix.PREVIOUS_ARC]] += constants.BEND_M * _BESIDE_STEPS[:, None]
+        wider, record = state.covariance[h].copy(), state.hypothesis[h]
+        wider[places_of_both] += (0.5 * constants.BEND_M) ** 2
+        wider[ix.SPEED, ix.SPEED] += _BEND_SPEED_MPS**2
+        wider[ix.ACCELERATION, ix.ACCELERATION] += limits.acceleration_mps2**2
+        log_probability = np.full(_BESIDE, record["log_probability"] + np.log(_BESIDE_SHARE / _BESIDE))
+        records = _new_records(log_probability, means[:, ix.ARC], record["log_code"])
+        parts.append((means, np.repeat(wider[None], _BESIDE, axis=0), records))
+    _join(state, parts)
+    return _BESIDE * len(parents)

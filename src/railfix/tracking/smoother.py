@@ -16,27 +16,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.core.arrays import Floats, Indices, Strings
 from railfix.kernels.tracking import constants
-from railfix.kernels.tracking.layout import EPOCH
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import EPOCH, Trace
+from railfix.tracking.chunk import compute_singer_step
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.search import SplitHypothesis
-from railfix.tracking.state import SATELLITES, StateIndex, TrackState
-from railfix.tracking.velocity import singer
-
-
-@dataclass(frozen=True, kw_only=True)
-class Updated:
-    """Update of H hypotheses of N unknowns by M measurements, as `railfix.kernels.tracking.layout.Trace`."""
-
-    prior: Floats  #: Covariance of the unknowns before the measurements; shape (H, N, N).
-    row: Floats  #: Measurement matrix; shape (H, M, N).
-    value: Floats  #: Innovations; shape (H, M).
-    variance: Floats  #: Variances over the weights, infinite for what was not used; shape (H, M).
-
-    def take(self, chosen: Indices) -> Updated:
-        """Return the update of some hypotheses."""
-        return Updated(**{name: value[chosen] for name, value in vars(self).items()})
+from railfix.tracking.state import TrackState
 
 
 @dataclass(kw_only=True)
@@ -44,45 +31,31 @@ class Step:
     """One epoch of the filter with H hypotheses, as it was left."""
 
     dt: float  #: Since the epoch before [s].
-    cut: Masks  #: Unknowns that have restarted at this epoch; shape (H, N).
-    satellite: Strings  #: Shape (N - SATELLITES,).
+    satellite: Strings  #: Shape (N - ix.SATELLITES,).
+    trace: Trace | None = None  #: Measurements and restarts; None without a hypothesis.
     #: After the epoch; shapes (H, N), (H, N, N).
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
     #: Hypothesis of the epoch before; -1 where one began; shape (H,).
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    updated: Updated | None = None  #: None without a measurement.
     splits: list[SplitHypothesis | None] | None = None
-
-    @classmethod
-    def without_place(cls, state: TrackState, dt: float) -> Step:
-        """Return an epoch without any hypothesis."""
-        return cls(dt=dt, cut=np.zeros(state.mean.shape, dtype=np.bool_), satellite=state.satellite)
-
-    def choose(self, chosen: Indices) -> None:
-        """Keep some hypotheses."""
-        self.cut, self.parent = self.cut[chosen], self.parent[chosen]
-        if self.splits is not None:
-            self.splits = [self.splits[k] for k in chosen.tolist()]
-        if self.updated is not None:
-            self.updated = self.updated.take(chosen)
 
     def before(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
         """Carry the information of later epochs on hypothesis h backward through its measurements."""
-        if self.updated is not None:
-            from railfix.kernels.tracking.backward import before_measurements
+        from railfix.kernels.tracking.backward import before_measurements
 
-            made = self.updated
+        made = self.trace
+        if made is not None:
             vector, matrix = before_measurements(
                 made.prior[h], made.row[h], made.value[h], made.variance[h], vector, matrix
             )
         part = None if self.splits is None else self.splits[h]
         if part is not None:
             # The density of the narrower one over the wide one, as if its place had been measured.
-            place = StateIndex.ARC
+            place = ix.ARC
             wide = part.covariance[place, place]
             back = np.eye(len(vector))
-            share = (1.0 - part.sigma_m**2 / wide) / wide
+            share = (1.0 - constants.START_SIGMA_M**2 / wide) / wide
             back[place] -= share * part.covariance[place]
             vector, matrix = back @ vector, back @ matrix @ back.T
             vector[place] += (part.place_m - part.mean[place]) / wide
@@ -95,8 +68,8 @@ def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
     from railfix.kernels.tracking.backward import transition_matrix
 
     epoch = np.zeros(1, dtype=EPOCH)
-    epoch["interval_s"], epoch["step"] = dt, singer(dt, limits.acceleration_mps2, limits.acceleration_s)[0]
-    return transition_matrix(float(mean[StateIndex.SPEED]), epoch[0], len(mean))
+    epoch["interval_s"], epoch["step"] = dt, compute_singer_step(dt, limits.acceleration_mps2, limits.acceleration_s)[0]
+    return transition_matrix(float(mean[ix.SPEED]), epoch[0], len(mean))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +80,7 @@ class BackwardInformation:
     #: Of the unknowns; shapes (N,), (N, N).
     vector: Floats
     matrix: Floats
-    satellite: Strings  #: Shape (N - SATELLITES,).
+    satellite: Strings  #: Shape (N - ix.SATELLITES,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,26 +116,26 @@ def smooth_steps(
     """
     size = len(steps)
     satellite = steps[-1].satellite if size else before.satellite
-    width = SATELLITES + len(satellite)
+    width = ix.SATELLITES + len(satellite)
     arc, sigma, speed = np.full(size, np.nan), np.full(size, np.nan), np.full(size, np.nan)
     vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
     last = steps[-1].mean if size else before.mean
     if later is not None and np.isfinite(later.place_m) and len(last):
-        index = int(np.argmin(np.abs(last[:, StateIndex.ARC] - later.place_m)))
+        index = int(np.argmin(np.abs(last[:, ix.ARC] - later.place_m)))
         vector, matrix = _arrange(later, satellite)
     for t in range(size - 1, -1, -1):
         step = steps[t]
-        if not len(step.mean):
+        if step.trace is None:
             vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
             continue
         mean, covariance = step.mean[index], step.covariance[index]
-        row = covariance[StateIndex.ARC]
-        variance = row[StateIndex.ARC] - row @ matrix @ row
-        if covariance[StateIndex.ARC, StateIndex.ARC] <= constants.EXPIRED_SIGMA_M**2:
-            arc[t], sigma[t] = mean[StateIndex.ARC] + row @ vector, np.sqrt(max(variance, 0.0))
-            speed[t] = mean[StateIndex.SPEED] + covariance[StateIndex.SPEED] @ vector
+        row = covariance[ix.ARC]
+        variance = row[ix.ARC] - row @ matrix @ row
+        if covariance[ix.ARC, ix.ARC] <= constants.EXPIRED_SIGMA_M**2:
+            arc[t], sigma[t] = mean[ix.ARC] + row @ vector, np.sqrt(max(variance, 0.0))
+            speed[t] = mean[ix.SPEED] + covariance[ix.SPEED] @ vector
         vector, matrix = step.before(index, vector, matrix)
-        parent, cut = int(step.parent[index]), step.cut[index]
+        parent, restarted = int(step.parent[index]), step.trace.restarted[index]
         earlier = steps[t - 1].mean if t else before.mean
         if parent < 0 or parent >= len(earlier):
             vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
@@ -170,16 +143,16 @@ def smooth_steps(
         start = np.zeros(width)
         start[: earlier.shape[1]] = earlier[parent]
         move = transition(start, step.dt, limits)
-        move[cut] = 0.0
+        move[restarted] = 0.0
         vector, matrix, index = move.T @ vector, move.T @ matrix @ move, parent
-    place = float(before.mean[index, StateIndex.ARC]) if len(before.mean) > index else float("nan")
+    place = float(before.mean[index, ix.ARC]) if len(before.mean) > index else float("nan")
     known = len(before.satellite)
     return (
         Smoothed(arc_m=arc, sigma_m=sigma, speed_mps=speed),
         BackwardInformation(
             place_m=place,
-            vector=vector[: SATELLITES + known],
-            matrix=matrix[: SATELLITES + known, : SATELLITES + known],
+            vector=vector[: ix.SATELLITES + known],
+            matrix=matrix[: ix.SATELLITES + known, : ix.SATELLITES + known],
             satellite=before.satellite,
         ),
     )
@@ -188,9 +161,9 @@ def smooth_steps(
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
     """Return the vector and matrix for other satellites; those no longer in the state have no information."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
-    to = np.concatenate([np.arange(SATELLITES), SATELLITES + here])
-    of = np.concatenate([np.arange(SATELLITES), SATELLITES + there])
-    width = SATELLITES + len(satellite)
+    to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
+    of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])
+    width = ix.SATELLITES + len(satellite)
     vector, matrix = np.zeros(width), np.zeros((width, width))
     vector[to] = later.vector[of]
     matrix[np.ix_(to, to)] = later.matrix[np.ix_(of, of)]

@@ -7,23 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks, Strings
-from railfix.kernels.tracking.index import CLOCKS, OFFSETS, SATELLITES, StateIndex
-from railfix.kernels.tracking.layout import record_of
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Records, record_of
 from railfix.tracking.epochs import Previous
-
-__all__ = [
-    "ANY_SPEED",
-    "CLOCKS",
-    "HYPOTHESIS",
-    "MONITORS",
-    "OFFSETS",
-    "SATELLITES",
-    "Bank",
-    "Monitors",
-    "StateIndex",
-    "TrackState",
-]
 
 #: Bounds of the speed where nothing is known of it [m/s].
 ANY_SPEED: Final = (-np.inf, np.inf)
@@ -62,6 +49,10 @@ class Monitors:
     #: bounds while there are several hypotheses [m/s].
     least_speed_mps: float = ANY_SPEED[0]
     most_speed_mps: float = ANY_SPEED[1]
+    #: Times since `TrackState.origin` of the last epoch with measurements that the filter used, NaN before one, and of
+    #: the last one whose codes counted (`TrackingLimits.code_period_s`), -inf where the next ones do [s].
+    measured_s: float = np.nan
+    coded_s: float = -np.inf
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,67 +67,58 @@ class Bank:
     contradicted_s: Floats  #: How long the measurements of each have contradicted it [s]; shape (B,).
 
 
+#: Scalars of the state as the recursion takes them: the fields of `Monitors`, and the number of hypotheses.
+MONITORS: Final = record_of(dict.fromkeys(Monitors.__dataclass_fields__, float) | {"hypotheses": np.intp})
+#: What each hypothesis has beside its Gaussian.
+HYPOTHESIS: Final = record_of({
+    "log_probability": float,  # logarithm of its probability
+    "log_code": float,  # part of that which the codes gave (`railfix.kernels.tracking.hypotheses`)
+    "log_least": float,  # least `log_probability` lately: it rises with time (`constants.LEAST_RISE`)
+    # Evidence of the codes lately against laps within the error of the map (`constants.RECENT_S`); no probability.
+    "log_recent": float,
+    "origin_m": float,  # arc length at which it began [m]
+})  # fmt: skip
+
+
 @dataclass(kw_only=True)
 class TrackState:
     """State after an epoch: H hypotheses of N unknowns. Its arrays are never written to."""
 
-    time: np.datetime64  #: Of the last epoch; NaT before the first.
-    mean: Floats  #: Units of `StateIndex`; shape (H, N).
-    covariance: Floats  #: Shape (H, N, N).
-    log_probability: Floats  #: Shape (H,).
-    origin_m: Floats  #: Arc length at which each hypothesis began [m]; shape (H,).
-    satellite: Strings  #: Satellites whose errors are in the state; shape (N - SATELLITES,).
-    seen: np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]  #: When each was last measured; shape (N - SATELLITES,).
-    offset_known: Masks  #: Clocks that have had an observation; shape (len(CLOCKS),).
-    previous: Previous | None
-    measured: np.datetime64  #: Last epoch with measurements that the filter used.
-    #: Last epoch whose codes counted (`TrackingLimits.code_period_s`); NaT where the next ones do.
-    coded: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    #: Part of `log_probability` that the codes gave (`railfix.kernels.tracking.hypotheses`); shape (H,).
-    log_code: Floats = field(default_factory=lambda: np.empty(0))
-    #: Least logarithm of the probability lately: it rises with time (`railfix.kernels.tracking.constants.LEAST_RISE`);
-    #: shape (H,).
-    log_least: Floats = field(default_factory=lambda: np.empty(0))
-    #: Evidence of the codes lately against laps within the error of the map (`RECENT_S` there); no probability;
-    #: shape (H,).
-    log_recent: Floats = field(default_factory=lambda: np.empty(0))
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last epoch.
+    origin: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the first epoch.
+    mean: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES)))  #: Units as in `index.py`; shape (H, N).
+    covariance: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES, ix.SATELLITES)))  #: Shape (H, N, N).
+    hypothesis: Records = field(default_factory=lambda: np.empty(0, dtype=HYPOTHESIS))  #: `HYPOTHESIS`; shape (H,).
+    #: Satellites whose errors are in the state; shape (N - ix.SATELLITES,).
+    satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
+    #: When each was last measured; shape (N - ix.SATELLITES,).
+    seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
     #: Mean innovation of each satellite's codes over their standard deviation
-    #: (`railfix.kernels.tracking.adaptation`); shape (N - SATELLITES,).
+    #: (`railfix.kernels.tracking.adaptation`); shape (N - ix.SATELLITES,).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
+    #: Clocks that have had an observation; shape (len(ix.CLOCKS),).
+    offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))
+    previous: Previous | None = None
     monitors: Monitors = field(default_factory=Monitors)
     bank: Bank | None = None  #: None without levels.
 
     @property
     def hypotheses(self) -> int:
         """Number of hypotheses."""
-        return len(self.log_probability)
-
-    @classmethod
-    def empty(cls) -> TrackState:
-        """Return the state before the first epoch."""
-        return cls(
-            time=np.datetime64("NaT", "ns"),
-            mean=np.empty((0, SATELLITES)),
-            covariance=np.empty((0, SATELLITES, SATELLITES)),
-            log_probability=np.empty(0),
-            origin_m=np.empty(0),
-            satellite=np.empty(0, dtype="<U3"),
-            seen=np.empty(0, dtype="datetime64[ns]"),
-            offset_known=np.zeros(len(CLOCKS), dtype=np.bool_),
-            previous=None,
-            measured=np.datetime64("NaT", "ns"),
-        )
+        return len(self.hypothesis)
 
     def reset(self) -> None:
         """Restart: no hypothesis, no sub-filter, no clock known, nothing adapted; the level stays held back."""
-        width = SATELLITES + len(self.satellite)
+        width = ix.SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
-        self.log_probability = self.log_code = self.log_least = self.log_recent = self.origin_m = np.empty(0)
-        self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
+        self.hypothesis = self.hypothesis[:0]
+        self.offset_known = np.zeros(len(ix.CLOCKS), dtype=np.bool_)
         self.code_bias = np.zeros(len(self.satellite))
-        held = self.monitors
-        self.monitors = Monitors(level_hold_s=held.level_hold_s, ambiguity_hold_s=held.ambiguity_hold_s)
-        self.coded = np.datetime64("NaT", "ns")
+        self.monitors = Monitors(
+            level_hold_s=self.monitors.level_hold_s,
+            ambiguity_hold_s=self.monitors.ambiguity_hold_s,
+            measured_s=self.monitors.measured_s,
+        )
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:
@@ -148,7 +130,7 @@ class TrackState:
             Among `satellite`.
         new : tuple of str
         """
-        index = np.concatenate([np.arange(SATELLITES), SATELLITES + kept]).astype(np.intp)
+        index = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + kept]).astype(np.intp)
         self.mean, self.covariance = _rearrange(self.mean, self.covariance, index, len(new))
         if self.bank is not None:
             mean, covariance = _rearrange(self.bank.mean, self.bank.covariance, index, len(new))
@@ -159,22 +141,11 @@ class TrackState:
         self.seen = np.concatenate([self.seen[kept], unseen])
 
 
-#: What each hypothesis has beside its Gaussian, and the scalars of the state, as the recursion takes them: fields of
-#: these names. Times are seconds since the first epoch of a chunk.
-HYPOTHESIS: Final = record_of(
-    dict.fromkeys(("log_probability", "log_code", "log_least", "log_recent", "origin_m"), float)
-)
-MONITORS: Final = record_of(
-    dict.fromkeys((*Monitors.__dataclass_fields__, "measured_s", "coded_s"), float) | {"hypotheses": np.intp}
-)
-
-
 def _rearrange(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
-    """Gaussians over some of their unknowns and so many new errors of satellites."""
-    count, old, width = len(mean), len(index), len(index) + new
-    means, covariances = np.zeros((count, width)), np.zeros((count, width, width))
-    means[:, :old] = mean[:, index]
-    covariances[:, :old, :old] = covariance[:, index[:, None], index]
-    diagonal = np.arange(old, width)
+    """Return Gaussians over some of their unknowns and a number of new errors of satellites."""
+    old = len(index)
+    means, covariances = np.zeros((len(mean), old + new)), np.zeros((len(mean), old + new, old + new))
+    means[:, :old], covariances[:, :old, :old] = mean[:, index], covariance[:, index[:, None], index]
+    diagonal = np.arange(old, old + new)
     covariances[:, diagonal, diagonal] = 1.0
     return means, covariances

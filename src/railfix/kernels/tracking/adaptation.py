@@ -101,14 +101,8 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
     """Return the shift of the place that the codes of an epoch imply, over its standard deviation; 0 with few codes.
 
     The score of the innovations v against a shift, ``h' S^-1 v / sqrt(h' S^-1 h)`` with h the coefficients of the arc
-    length: standard normal and white over epochs where the model holds.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (Q, Q)
-        H P H' of the quantities before the measurements; the codes are the first ones.
-    weight : ndarray, shape (M,)
-        First weights; those above 1 count as 1.
+    length: standard normal and white over epochs where the model holds. `covariance`, shape (Q, Q), is H P H' of the
+    quantities before the measurements, the codes first; first weights above 1, shape (M,), count as 1.
     """
     codes = rows.code.stop
     if codes < constants.MISFIT_CODES:

@@ -17,21 +17,14 @@ from railfix.kernels.tracking.update import correct
 def before_measurements(
     P: Floats, row: Floats, value: Floats, variance: Floats, vector: Floats, matrix: Floats
 ) -> tuple[Floats, Floats]:
-    """Return what later epochs say of the unknowns before an epoch's measurements, with these.
+    """Carry the information of later epochs on the unknowns backward through an epoch's measurements.
 
     Of one measurement with row h, innovation y and ``S = h' P h + r`` (G. J. Bierman, 1973)::
 
         l = h y / S + (I - h g' / S) l          L = h h' / S + (I - h g' / S) L (I - g h' / S)          g = P h
 
-    The measurements are taken in the order of the filter, and backward from the last.
-
-    Parameters
-    ----------
-    P : ndarray, shape (N, N)
-        Covariance before the measurements.
-    row, value, variance : ndarray, shapes (M, N), (M,), (M,)
-    vector, matrix : ndarray, shapes (N,), (N, N)
-        Information l and L of later epochs after the measurements.
+    The measurements, shapes (M, N), (M,), (M,), are taken in the order of the filter, and backward from the last. P,
+    shape (N, N), is the covariance before them, `vector` and `matrix`, shapes (N,) and (N, N), are l and L after them.
     """
     count, size = row.shape
     P, x, gain = P.copy(), np.zeros(size), np.empty(size)

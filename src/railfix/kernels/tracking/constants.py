@@ -1,26 +1,12 @@
-"""Constants of the filter along the track that nobody tunes, each with its reason.
+"""Constants of the filter along the track that nobody tunes, each with its reason: compiled in.
 
-`railfix.tracking.limits` has what a user may set. The compiler takes the values as they
-stand here.
+`railfix.tracking.limits` has what a user may set.
 """
 
 from __future__ import annotations
 
 import math
 from typing import Final
-
-# Statuses (`railfix.tracking.TrackStatus`).
-TRACKING: Final = 0
-SEVERAL_BRANCHES: Final = 1
-COASTING: Final = 2
-LOST: Final = 3
-EXPIRED: Final = 4
-NOT_STARTED: Final = 5
-OFF_MAP: Final = 6
-MAP_OFFSET: Final = 7
-ANTENNAS_DISAGREE: Final = 8
-DOUBTFUL: Final = 9
-SPOOFING_SUSPECTED: Final = 10
 
 # Prediction.
 #: Time and travel over which the multipath of a satellite's code changes: a reflector of a street or a station is
@@ -40,18 +26,16 @@ PHASE_WALK_M: Final = 0.03
 #: Change of the drift of the receiver's clock in the square root of a second: 1.7e-9 of the frequency, what quartz
 #: oscillators without an oven show when shaken.
 CLOCK_WALK_MPS: Final = 0.5
-#: Change of the offset between two constellations in the square root of a second.
+#: Change of the offset between two constellations in the square root of a second, and its first standard deviation.
 OFFSET_WALK_M: Final = 0.02
-OFFSET_PRIOR_M: Final = 30.0  #: Standard deviation of such an offset at first.
+OFFSET_PRIOR_M: Final = 30.0
 #: Least local error of the map across and up, and the length over which it changes. The map's stated accuracy
 #: counts where it is more, of heights the half.
 MAP_ROUGHNESS_M: Final = 0.3
 MAP_CORRELATION_M: Final = 50.0
 MAP_SCALE_M: Final = 0.03  #: Error of a length along the map [m per square root of m].
-#: Length over which the absolute error of the map changes (sigmas are those of the trajectory).
-MAP_ABSOLUTE_M: Final = 500.0
-#: Standard deviation of the clock of the codes about the median of an epoch [m].
-CODE_CLOCK_SIGMA_M: Final = 1e3
+MAP_ABSOLUTE_M: Final = 500.0  #: Length over which the absolute error of the map changes; its sigma is the map's.
+CODE_CLOCK_SIGMA_M: Final = 1e3  #: Standard deviation of the clock of the codes about the median of an epoch [m].
 #: Random walks of the sensors' scales and offset in the square root of a second. A wheel of a car wandered over 2 %
 #: within half a minute at bends; an accelerometer's offset follows its temperature.
 WHEEL_WALK: Final = 5e-4
@@ -60,26 +44,21 @@ RADAR_WALK: Final = 2e-4
 #: Share of the map's error of height that changes over `MAP_CORRELATION_M`; across it is the whole: heights of a survey
 #: or a terrain model are wrong over longer distances.
 HEIGHT_ROUGHNESS: Final = 0.5
-#: Least variance of a step of the place [m2], keeps matrices regular.
-LEAST_STEP_M2: Final = 1e-6
+LEAST_STEP_M2: Final = 1e-6  #: Least variance of a step of the place [m2]; it keeps matrices regular.
 
 # Equations.
 #: Slower than this ranges to ground units are not used [m/s]: the error of a standing range stays (P2 3.3).
 STILL_MPS: Final = 0.3
 #: Slower than this a speed does not tell the direction [m/s]: four sigmas of what a wheel of one hertz leaves of it.
 DIRECTION_MPS: Final = 1.0
-#: Shorter than this the tangent is the direction of a displacement [m].
-CHORD_M: Final = 0.5
+CHORD_M: Final = 0.5  #: Shorter than this the tangent is the direction of a displacement [m].
 #: Share of their own information below which phases or Dopplers say nothing that others do not.
 LEAST_PIVOT: Final = 1e-12
 
 # Clocks.
-#: A clock whose median innovation is beyond this many standard deviations has stepped.
-STEPPED: Final = 5.0
-#: Standard deviation of the clock of phases and its drift after a step [m, m/s].
-UNKNOWN_CLOCK: Final = 100.0
-#: Variance of the offset of the first constellation from the clock of the codes [m2].
-FIRST_OFFSET_M2: Final = 1e-4
+STEPPED: Final = 5.0  #: A clock whose median innovation is beyond this many standard deviations has stepped.
+UNKNOWN_CLOCK: Final = 100.0  #: Standard deviation of the clock of phases and its drift after a step [m, m/s].
+FIRST_OFFSET_M2: Final = 1e-4  #: Variance of the offset of the first constellation from the clock of the codes [m2].
 
 # Reweighting.
 PASSES: Final = 4  #: Rounds of reweighting an epoch.
@@ -95,8 +74,7 @@ MOVED_M: Final = 2.0
 RELINEARISED: Final = 4
 
 # What is learnt of noise.
-#: Time over which the scales of Dopplers and phases are learnt [s].
-SCALE_S: Final = 60.0
+SCALE_S: Final = 60.0  #: Time over which the scales of Dopplers and phases are adapted [s].
 #: Logarithms that the scales of their variances stay within.
 LEAST_SCALE: Final = -1.5
 LARGEST_SCALE: Final = 3.0
@@ -117,8 +95,7 @@ NOMINAL_M: Final = 0.8
 #: With more satellites beyond `BIAS_FAULTY`, too long or too short, and one of them too short, there is no level: the
 #: map or a constellation is wrong, or reflections pull the clock.
 BIAS_SATELLITES: Final = 2
-#: Factor on the variance of codes that are left out: their innovations go on telling when the fault ends.
-BIAS_INFLATED: Final = 1e6
+BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out: innovations show when the fault ends.
 #: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
 INFLATED_M: Final = 15.0
 #: Not where all codes imply another place by more standard deviations: they may have stepped together.
@@ -129,8 +106,7 @@ INFLATED_SIGMAS: Final = 3.0
 #: error of it is forgotten.
 MAP_MISFIT_S: Final = 30.0
 MAP_MISFIT_KEPT_S: Final = 300.0
-#: Fewer codes of an epoch do not tell a shift from clocks.
-MISFIT_CODES: Final = 4
+MISFIT_CODES: Final = 4  #: Fewer codes of an epoch do not tell a shift from clocks.
 #: A single epoch counts with at most so many standard deviations; beyond `STEP_SIGMAS` it is a step of all codes and
 #: shows nothing of the map.
 MISFIT_CLIPPED: Final = 3.0
@@ -140,8 +116,7 @@ MISFIT_LEARNT_S: Final = 5.0
 MISFIT_LARGEST: Final = 8.0
 
 # Speeds.
-#: A measured speed is known to so many standard deviations.
-SPEED_SIGMAS: Final = 4.0
+SPEED_SIGMAS: Final = 4.0  #: A measured speed is known to this many standard deviations.
 
 # Branches.
 #: Least distance of two branches at which half of their difference is the map's: three times an error of 2 m.
@@ -189,8 +164,7 @@ LEAST_RISE: Final = 0.3
 TAKEOVER_AFTER_S: Final = 15.0
 #: Satellites with a phase or a Doppler, or codes, that an epoch's evidence needs: fewer fit any speed and place.
 MOTION_SATELLITES: Final = 4
-#: Distance that is worth one of the logarithm of the odds by motion [m]: a map does not tell tangents at rest.
-MOTION_M: Final = 3.0
+MOTION_M: Final = 3.0  #: Travel worth one of the logarithm of the odds by motion [m]: at rest tangents do not differ.
 #: Places beside are tried, and beyond an open end the track is lost, once motion has been contradicted for so long [s]:
 #: shorter it is a reflection, at any rate.
 BESIDE_AFTER_S: Final = 0.9
@@ -216,8 +190,7 @@ ALLOWED_SQUARE: Final = 4.0
 #: Sums from which on the level is withheld, and the track is lost.
 ACROSS_DOUBT: Final = 12.0
 ACROSS_LOST: Final = 30.0
-#: The sum after a takeover: more than a velocity across the line gives.
-ACROSS_TAKEN: Final = 60.0
+ACROSS_TAKEN: Final = 60.0  #: The sum after a takeover: more than a velocity across the line gives.
 #: Mean of the places that codes imply, over its standard deviation, and logarithm of the variance of lengths of the
 #: map, 6 times their error: beyond them codes contradict motion, by a step of all codes, a pull, or a wrong map.
 DRIFT_SIGMAS: Final = 5.0
@@ -236,21 +209,17 @@ YOUNG_HOLD_S: Final = 1.0
 #: Codes that imply another place by more than so many standard deviations for so long [s] have stepped together.
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
-#: The level is withheld for so long after a step of all codes [s]: the place after it is the codes' own.
-STEP_HOLD_S: Final = 300.0
+STEP_HOLD_S: Final = 300.0  #: No level for this long after a step of all codes [s]: the place is the codes' own.
 
 # Levels.
-#: Share of a distance that a source without codes may be wrong by: a worn or wrongly entered wheel.
-SCALE_BOUND: Final = 0.02
+SCALE_BOUND: Final = 0.02  #: Share of a distance without codes that may be wrong: a worn or wrongly entered wheel.
 #: A source that is not measured needs no sub-filter once it has left the filter: place and standard deviation differ
 #: by less than this share of the standard deviation.
 JOINED: Final = 0.05
-#: Newton's steps for the level end when one is smaller than this [m].
+#: Newton's steps for the level end when one is smaller than this [m], or after this many.
 PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
 #: A pair of satellites that requires less than this share of the risk has it taken off, in place of a term of its own.
 PAIR_SHARE: Final = 1e-3
-#: Less than this share of what is known of the place, without both of a pair, is nothing.
-PAIR_LEFT: Final = 1e-3
-#: Satellites whose line of sight has at least this component along the track are ahead, or behind.
-AHEAD: Final = 0.3
+PAIR_LEFT: Final = 1e-3  #: Less than this share of what is known of the place, without both of a pair, is nothing.
+AHEAD: Final = 0.3  #: Satellites whose line of sight has at least this component along the track are ahead, or behind.

@@ -19,6 +19,7 @@ for each end the phases would measure absolute place from the bend of the line, 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,9 +29,22 @@ from railfix.kernels.compiling import inner
 from railfix.kernels.sight import TURN, sight
 from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
-from railfix.kernels.tracking.layout import Given, Rows
+from railfix.kernels.tracking.layout import Given, Record, Rows
 from railfix.kernels.tracking.line import gradient_at, nearest_arc, wrap_arc, write_point
 from railfix.kernels.tracking.update import Equations
+
+
+class Geometry(NamedTuple):
+    """Points and lines of sight that the equations of an epoch are made at."""
+
+    point: Floats  #: Now, ECEF [m]; shape (3,).
+    axes: Floats  #: Tangent, right, up there; shape (3, 3).
+    before: Floats  #: At the epoch before, ECEF [m]; shape (3,).
+    chord: Floats  #: Direction of the displacement since then, near rest the tangent; shape (3,).
+    distance: Floats  #: Range of each channel with measurements [m]; shape (K,).
+    sight: Floats  #: Unit vectors to the satellites, ECEF; shape (K, 3).
+    along: Floats  #: Their components along the axes; shape (K, 3).
+
 
 #: Unknowns of the distance run since the epoch before: s - s' + q_a.
 DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
@@ -51,54 +65,46 @@ def new_equations(rows: Rows) -> Equations:
 
 @inner
 def linearise(
-    given: Given, t: int, rows: Rows, x: Floats, at: tuple[float, float], direction: float, equations: Equations
+    given: Given, t: int, rows: Rows, x: Floats, at: tuple[float, float], wheel_sign: float, equations: Equations
 ) -> None:
     """Write the equations of an epoch about the arc lengths `at`: now and at the epoch before [m].
 
-    The innovations are those of the mean x: what x is away from `at` is added to first order. `direction` is the sign
-    of the last speed with one.
+    The innovations are those of the mean x: what x is away from `at` is added to first order. `wheel_sign` is that of
+    `find_wheel_sign`.
     """
-    vertex, line = given.vertex, given.line[0]
-    point, axes, before, unused = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    write_point(vertex, line, at[0], point, axes)
-    write_point(vertex, line, at[1], before, unused)
-    seen = _compute_sights(given, t, point, axes)
-    _write_codes(given, t, rows, x, seen, x[ix.ARC] - at[0], equations)
+    geometry = _compute_geometry(given, t, at)
+    _write_codes(given, t, rows, x, geometry, x[ix.ARC] - at[0], equations)
     motion = _write_motion_quantities(rows.code.stop, x, at, equations)
-    _write_phases(given, t, rows, motion, seen, before, _compute_chord(point, before, axes, at), equations)
-    _write_dopplers(given, t, rows, motion, seen, point, axes, equations)
-    _write_sensors(given, t, rows, x, direction, equations)
+    _write_phases(given, t, rows, geometry, motion, equations)
+    _write_dopplers(given, t, rows, geometry, motion, equations)
+    _write_sensors(given, t, rows, x, wheel_sign, equations)
 
 
 @inner
-def _compute_sights(given: Given, t: int, point: Floats, axes: Floats) -> Floats:
-    """Return range, unit vector to the satellite and its components on the axes of each channel.
+def find_wheel_sign(x: Floats, direction: float) -> float:
+    """Return the sign of a wheel's distance without one: that of the speed, or of the last speed with a direction."""
+    return math.copysign(1.0, x[ix.SPEED]) if abs(x[ix.SPEED]) > constants.DIRECTION_MPS else direction
 
-    Shape (K, 7): column 0 the range [m], 1 to 3 the unit vector (ECEF), 4 to 6 its components along the tangent, to the
-    right and up. Rows of channels without a measurement are not written.
-    """
+
+@inner
+def _compute_geometry(given: Given, t: int, at: tuple[float, float]) -> Geometry:
+    """Return points and lines of sight at two arc lengths: now and at the epoch before [m]."""
+    point, axes, before, unused = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    write_point(given.vertex, given.line[0], at[0], point, axes)
+    write_point(given.vertex, given.line[0], at[1], before, unused)
+    chord, length = point - before, math.sqrt(((point - before) ** 2).sum())
+    chord = chord * math.copysign(1.0 / length, at[0] - at[1]) if length > constants.CHORD_M else axes[0].copy()
     channels = given.channel.shape[1]
-    seen = np.empty((channels, 7))
+    distance, sights, along = np.empty(channels), np.empty((channels, 3)), np.empty((channels, 3))
     for k in range(channels):
         channel = given.channel[t, k]
         if channel.has[ix.CODE] or channel.has[ix.PHASE] or channel.has[ix.DOPPLER]:
             sat = channel.sat_ecef_m
-            distance, ux, uy, uz = sight(sat[0], sat[1], sat[2], point[0], point[1], point[2])
-            seen[k, 0], seen[k, 1], seen[k, 2], seen[k, 3] = distance, ux, uy, uz
+            distance[k], ux, uy, uz = sight(sat[0], sat[1], sat[2], point[0], point[1], point[2])
+            sights[k, 0], sights[k, 1], sights[k, 2] = ux, uy, uz
             for c in range(3):
-                seen[k, 4 + c] = ux * axes[c, 0] + uy * axes[c, 1] + uz * axes[c, 2]
-    return seen
-
-
-@inner
-def _compute_chord(point: Floats, before: Floats, axes: Floats, at: tuple[float, float]) -> tuple[float, float, float]:
-    """Return the direction of the displacement since the epoch before; that of the tangent near rest."""
-    cx, cy, cz = point[0] - before[0], point[1] - before[1], point[2] - before[2]
-    length = math.sqrt(cx * cx + cy * cy + cz * cz)
-    if length > constants.CHORD_M:
-        sign = (1.0 if at[0] >= at[1] else -1.0) / length
-        return sign * cx, sign * cy, sign * cz
-    return axes[0, 0], axes[0, 1], axes[0, 2]
+                along[k, c] = ux * axes[c, 0] + uy * axes[c, 1] + uz * axes[c, 2]
+    return Geometry(point, axes, before, chord, distance, sights, along)
 
 
 @inner
@@ -124,16 +130,16 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
 
 
 @inner
-def _write_codes(given: Given, t: int, rows: Rows, x: Floats, seen: Floats, moved: float, equations: Equations) -> None:
-    """Write the codes, each a row and a quantity of the same index.
-
-    `seen` is that of `_compute_sights`; `moved` is the mean's arc length less that of the point [m].
-    """
+def _write_codes(
+    given: Given, t: int, rows: Rows, x: Floats, geometry: Geometry, moved: float, equations: Equations
+) -> None:
+    """Write the codes, each a row and a quantity of the same index; the mean is `moved` metres beyond the point."""
     unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
         channel = given.channel[t, k]
-        along, right, up, sigma = -seen[k, 4], -seen[k, 5], -seen[k, 6], channel.code_sigma_m
+        along, right, up = -geometry.along[k, 0], -geometry.along[k, 1], -geometry.along[k, 2]
+        sigma = channel.code_sigma_m
         offset, satellite = ix.OFFSETS + channel.clock, ix.SATELLITES + channel.satellite
         unknown[j, 0], coefficient[j, 0] = ix.ARC, along
         unknown[j, 1], coefficient[j, 1] = ix.SLOW_CODE, along
@@ -144,7 +150,7 @@ def _write_codes(given: Given, t: int, rows: Rows, x: Floats, seen: Floats, move
         unknown[j, ix.CLOCK_TERM], coefficient[j, ix.CLOCK_TERM] = ix.CODE_CLOCK, 1.0
         predicted = along * (moved + x[ix.SLOW_CODE]) + right * x[ix.MAP_RIGHT] + up * x[ix.MAP_UP]
         predicted += x[offset] + x[ix.CODE_CLOCK] + sigma * x[satellite]
-        equations.value[j] = channel.measured[ix.CODE] - seen[k, 0] - predicted
+        equations.value[j] = channel.measured[ix.CODE] - geometry.distance[k] - predicted
 
 
 @inner
@@ -156,54 +162,50 @@ def _write_motion_value(value: float, j: int, motion: Floats, equations: Equatio
 
 
 @inner
-def _write_phases(
-    given: Given,
-    t: int,
-    rows: Rows,
-    motion: Floats,
-    seen: Floats,
-    before: Floats,
-    chord: tuple[float, float, float],
-    equations: Equations,
-) -> None:
-    """Write the changes of the phases.
-
-    `motion` is that of `_write_motion_quantities`, `seen` that of `_compute_sights`, `before` the point at the epoch
-    before [m], shape (3,), `chord` the direction from there.
-    """
-    design, (cx, cy, cz) = equations.design, chord
+def _write_phases(given: Given, t: int, rows: Rows, geometry: Geometry, motion: Floats, equations: Equations) -> None:
+    """Write the changes of the phases; `motion` is that of `_write_motion_quantities`."""
+    design, before, chord = equations.design, geometry.before, geometry.chord
     for j in range(rows.phase.start, rows.phase.stop):
         k = rows.channel[j]
-        channel = given.channel[t, k]
+        channel, u = given.channel[t, k], geometry.sight[k]
         sat = channel.before_ecef_m
-        distance = sight(sat[0], sat[1], sat[2], before[0], before[1], before[2])[0]
-        gradient = -(seen[k, 1] * cx + seen[k, 2] * cy + seen[k, 3] * cz)
-        design[j, ix.M_DISTANCE], design[j, ix.M_CLOCK] = gradient, 1.0
-        design[j, ix.M_RIGHT], design[j, ix.M_UP] = -seen[k, 5], -seen[k, 6]
-        _write_motion_value(channel.measured[ix.PHASE] - (seen[k, 0] - distance), j, motion, equations)
+        earlier = sight(sat[0], sat[1], sat[2], before[0], before[1], before[2])[0]
+        design[j, ix.M_DISTANCE], design[j, ix.M_CLOCK] = -(u[0] * chord[0] + u[1] * chord[1] + u[2] * chord[2]), 1.0
+        design[j, ix.M_RIGHT], design[j, ix.M_UP] = -geometry.along[k, 1], -geometry.along[k, 2]
+        _write_motion_value(channel.measured[ix.PHASE] - (geometry.distance[k] - earlier), j, motion, equations)
 
 
 @inner
-def _write_dopplers(
-    given: Given, t: int, rows: Rows, motion: Floats, seen: Floats, point: Floats, axes: Floats, equations: Equations
-) -> None:
-    """Write the range rates by Doppler, with the turning of the earth and the signal's stretching."""
-    dt, design = given.epoch[t].interval_s, equations.design
+def _write_dopplers(given: Given, t: int, rows: Rows, geometry: Geometry, motion: Floats, equations: Equations) -> None:
+    """Write the range rates by Doppler; `motion` is that of `_write_motion_quantities`."""
+    dt, design, tangent, gradient = given.epoch[t].interval_s, equations.design, geometry.axes[0], np.empty(3)
     for j in range(rows.doppler.start, rows.doppler.stop):
         k = rows.channel[j]
-        channel = given.channel[t, k]
-        sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
-        moving = seen[k, 1] * velocity[0] + seen[k, 2] * velocity[1] + seen[k, 3] * velocity[2]
-        moving += TURN * (velocity[0] * point[1] - velocity[1] * point[0])
-        stretch = 1.0 + moving / SPEED_OF_LIGHT
-        slope = (-seen[k, 4] + TURN * (sat[0] * axes[0, 1] - sat[1] * axes[0, 0])) / stretch
-        design[j, ix.M_RIGHT], design[j, ix.M_UP] = -seen[k, 5] / dt, -seen[k, 6] / dt
+        rate = write_range_rate(given.channel[t, k], geometry.point, geometry.sight[k], gradient)
+        slope = gradient[0] * tangent[0] + gradient[1] * tangent[1] + gradient[2] * tangent[2]
+        design[j, ix.M_RIGHT], design[j, ix.M_UP] = -geometry.along[k, 1] / dt, -geometry.along[k, 2] / dt
         design[j, ix.M_SPEED], design[j, ix.M_DRIFT] = slope, 1.0
-        _write_motion_value(channel.measured[ix.DOPPLER] - moving / stretch, j, motion, equations)
+        _write_motion_value(given.channel[t, k].measured[ix.DOPPLER] - rate, j, motion, equations)
 
 
 @inner
-def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, direction: float, equations: Equations) -> None:
+def write_range_rate(channel: Record, point: Floats, u: Floats, gradient: Floats) -> float:
+    """Return the satellite's part of the range rate [m/s], and write what each metre a second of the receiver adds.
+
+    ``rate = (A + g . v) / (1 + A / c)`` with A by the satellite's velocity, u the unit vector to it, and the turning of
+    the earth in both; `point`, `u` and `gradient` have the shape (3,).
+    """
+    sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
+    moving = u[0] * velocity[0] + u[1] * velocity[1] + u[2] * velocity[2]
+    moving += TURN * (velocity[0] * point[1] - velocity[1] * point[0])
+    stretch = 1.0 + moving / SPEED_OF_LIGHT
+    gradient[0], gradient[1] = (-u[0] - TURN * sat[1]) / stretch, (-u[1] + TURN * sat[0]) / stretch
+    gradient[2] = -u[2] / stretch
+    return float(moving / stretch)
+
+
+@inner
+def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: float, equations: Equations) -> None:
     """Write the sensors."""
     dt, vertex, line, value = given.epoch[t].interval_s, given.vertex, given.line[0], equations.value
     for j in range(rows.sensor.start, rows.sensor.stop):
@@ -211,8 +213,7 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, direction: float
         sensor, unknown, coefficient = given.sensor[t, column], equations.unknown[q], equations.coefficient[q]
         measured, age = sensor.value, sensor.age_s
         if column in (ix.WHEEL_COLUMN, ix.RADAR_COLUMN):
-            if sensor.unsigned:
-                measured *= math.copysign(1.0, x[ix.SPEED]) if abs(x[ix.SPEED]) > constants.DIRECTION_MPS else direction
+            measured *= wheel_sign if sensor.unsigned else 1.0
             unknown[:3], coefficient[:3] = DISTANCE, (1.0, -1.0, 1.0)
             unknown[3], coefficient[3] = ix.WHEEL if column == ix.WHEEL_COLUMN else ix.RADAR, -measured
             value[j] = measured * (1.0 + x[unknown[3]]) - (x[ix.ARC] - x[ix.PREVIOUS_ARC] + x[ix.MAP_LENGTH_ERROR])
@@ -247,16 +248,3 @@ def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations
     equations.unknown[q, :4] = ix.ARC, ix.SPEED, ix.MAP_RIGHT, ix.MAP_UP
     equations.coefficient[q, :4] = along / distance, -age * along / distance, right / distance, up / distance
     return distance
-
-
-@inner
-def shift_sensors(rows: Rows, x: Floats, other_x: Floats, other: Equations, equations: Equations) -> None:
-    """Take over the equations of the sensors, made about another mean."""
-    for j in range(rows.sensor.start, rows.sensor.stop):
-        q = rows.code.stop + ix.MOTION + j - rows.sensor.start
-        value = other.value[j]
-        for k in range(ix.TERMS):
-            unknown, coefficient = other.unknown[q, k], other.coefficient[q, k]
-            equations.unknown[q, k], equations.coefficient[q, k] = unknown, coefficient
-            value -= coefficient * (x[unknown] - other_x[unknown])
-        equations.value[j] = value

@@ -16,12 +16,8 @@ from railfix.kernels.tracking.layout import Record, Records, State
 @inner
 def log_sum(values: Floats) -> float:
     """Return the logarithm of the sum of exponentials."""
-    largest, total = values[0], 0.0
-    for value in values:
-        largest = max(largest, value)
-    for value in values:
-        total += math.exp(value - largest)
-    return float(largest + math.log(total))
+    largest = values.max()
+    return float(largest + math.log(np.exp(values - largest).sum()))
 
 
 @inner
@@ -50,30 +46,20 @@ def reweigh(
 
     Between laps within `ALIKE` times map_branch_m what codes say now is kept as `log_recent`, for `find_leading` alone.
 
-    Parameters
-    ----------
-    evidence, code_evidence : ndarray, shape (H,)
-        Logarithms of the evidence of the motion, and of the codes beside it.
-    points : ndarray, shape (H, 3) [m]
-    arc : ndarray, shape (H,) [m]
-    dt : float [s]
+    `evidence` and `code_evidence`, shape (H,), are the logarithms of the evidence of the motion, and of the codes given
+    it; `points`, shape (H, 3), and `arc`, shape (H,), are the places [m].
     """
     hypothesis, monitors, count = state.hypothesis, state.monitors[0], len(evidence)
     travel = monitors.branch_m
     independent = 1.0 + monitors.branch_s / constants.CODE_COMMON_S + travel / constants.CODE_COMMON_TRAVEL_M
-    best = 0
-    for h in range(1, count):
-        if hypothesis[h].log_probability > hypothesis[best].log_probability:
-            best = h
+    best = int(np.argmax(hypothesis["log_probability"][:count]))
     first, first_code = hypothesis[best].log_probability, hypothesis[best].log_code
     of_second = min(dt, 1.0)
     most, floor = constants.MOST_MOTION * of_second, math.log(constants.BRANCH_FLOOR)
     after, after_code = np.empty(count), np.empty(count)
     for h in range(count):
         one = hypothesis[h]
-        square = 0.0
-        for c in range(3):
-            square += (points[h, c] - points[best, c]) ** 2
+        square = ((points[h] - points[best]) ** 2).sum()
         part = square / (square + parameters.map_branch_m**2)
         reach = min(constants.MOST_ODDS * square / parameters.map_branch_m**2, travel / constants.MOTION_M)
         gained = min(max(of_second * (evidence[h] - evidence[best]), -most), most)
@@ -97,14 +83,9 @@ def reweigh(
 @inner
 def find_leading(hypothesis: Records, count: int) -> int:
     """Return the hypothesis to report: the first unless another is `SWITCH` as probable with what codes said lately."""
-    best = 0
-    for h in range(1, count):
-        lead = hypothesis[h].log_probability + hypothesis[h].log_recent
-        if lead > hypothesis[best].log_probability + hypothesis[best].log_recent:
-            best = h
-    lead = hypothesis[best].log_probability + hypothesis[best].log_recent
-    lead -= hypothesis[0].log_probability + hypothesis[0].log_recent
-    return best if lead > math.log(constants.SWITCH) else 0
+    lead = hypothesis["log_probability"][:count] + hypothesis["log_recent"][:count]
+    best = int(np.argmax(lead))
+    return best if lead[best] - lead[0] > math.log(constants.SWITCH) else 0
 
 
 @inner
@@ -113,44 +94,21 @@ def prune(parameters: Record, state: State) -> Indices:
 
     Improbable ones are dropped once the first has travelled far enough for motion to have distinguished them.
     """
-    kept, log_probability = _merge_twins(state, _rank(state.hypothesis, state.monitors[0].hypotheses))
+    count = state.monitors[0].hypotheses
+    order = np.argsort(-state.hypothesis["log_probability"][:count], kind="mergesort")
+    leads = find_leading(state.hypothesis, count)
+    kept, log_probability = _merge_twins(state, np.concatenate((np.array([leads]), order[order != leads])))
     size = min(len(kept), parameters.most_hypotheses)
     kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
     if abs(state.x[kept[0], ix.ARC] - state.hypothesis[kept[0]].origin_m) >= constants.DECIDED_TRAVEL_M:
-        size = 0
-        for j in range(len(kept)):
-            if log_probability[j] > math.log(constants.LEAST_PROBABILITY):
-                kept[size], log_probability[size] = kept[j], log_probability[j]
-                size += 1
-        kept, log_probability = kept[:size], log_probability[:size] - log_sum(log_probability[:size])
-    x, P, hypothesis = (
-        state.x[: len(state.hypothesis)].copy(),
-        state.P[: len(state.hypothesis)].copy(),
-        state.hypothesis.copy(),
-    )
-    for j in range(size):
+        likely = log_probability > math.log(constants.LEAST_PROBABILITY)
+        kept, log_probability = kept[likely], log_probability[likely] - log_sum(log_probability[likely])
+    x, P, hypothesis = state.x[:count].copy(), state.P[:count].copy(), state.hypothesis.copy()
+    for j in range(len(kept)):
         state.x[j], state.P[j], state.hypothesis[j] = x[kept[j]], P[kept[j]], hypothesis[kept[j]]
         state.hypothesis[j].log_probability = log_probability[j]
-    state.monitors[0].hypotheses = size
+    state.monitors[0].hypotheses = len(kept)
     return kept
-
-
-@inner
-def _rank(hypothesis: Records, count: int) -> Indices:
-    """Return the hypotheses in falling order of their probability, the leading one first."""
-    first = find_leading(hypothesis, count)
-    ranked = np.empty(count, dtype=np.intp)
-    ranked[0], size = first, 1
-    for h in range(count):
-        if h == first:
-            continue
-        j = size
-        while j > 1 and hypothesis[ranked[j - 1]].log_probability < hypothesis[h].log_probability:
-            ranked[j] = ranked[j - 1]
-            j -= 1
-        ranked[j] = h
-        size += 1
-    return ranked
 
 
 @inner

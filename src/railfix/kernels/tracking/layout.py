@@ -26,9 +26,10 @@ def record_of(fields: dict[str, Any]) -> np.dtype[Any]:
 
 #: One epoch.
 EPOCH: Final = record_of({
-    "time_s": float,  # since the first epoch of the chunk [s]
+    "time_s": float,  # since `TrackState.origin` [s]
     "interval_s": float,  # since the epoch before [s]
     "begins": bool,  # the state restarts before it
+    "coded": bool,  # codes of a satellite
     "motion_measured": bool,  # phases or Dopplers of at least four satellites: they carry the place on without codes
     "velocity_mps": (float, (3,)),  # ECEF, by phases or Dopplers without the line [m/s]; NaN without
     "velocity_covariance": (float, (3, 3)),  # [m2/s2]
@@ -88,7 +89,7 @@ SOURCE: Final = record_of({
 
 
 class Given(NamedTuple):
-    """What the recursion reads: T epochs, K channels, C sensors, S satellites, V vertices, N unknowns."""
+    """Inputs of the recursion: T epochs, K channels, C sensors, S satellites, V vertices, N unknowns."""
 
     epoch: Records  #: `EPOCH`; shape (T,).
     channel: Records  #: `CHANNEL`; shape (T, K).
@@ -102,9 +103,9 @@ class Given(NamedTuple):
 
 
 class State(NamedTuple):
-    """What the recursion reads and writes: H hypotheses and B sub-filters, Gaussians side by side."""
+    """State of the recursion, changed in place: H hypotheses and B sub-filters, Gaussians side by side."""
 
-    x: Floats  #: Means, hypotheses first, units of `StateIndex`; shape (H + B, N).
+    x: Floats  #: Means, hypotheses first, units as in `index.py`; shape (H + B, N).
     P: Floats  #: Covariances, products of these units; shape (H + B, N, N).
     hypothesis: Records  #: `railfix.tracking.state.HYPOTHESIS`; shape (H,).
     monitors: Records  #: `railfix.tracking.state.Monitors`; shape (1,).
@@ -114,14 +115,14 @@ class State(NamedTuple):
 
 
 class Results(NamedTuple):
-    """What the recursion writes of each epoch."""
+    """Results of the recursion, epoch by epoch."""
 
     epoch: Records  #: `railfix.tracking.result.EPOCH_RESULT`; shape (T,).
     channel: Records  #: `railfix.tracking.result.CHANNEL_RESULT`; shape (T, K).
 
 
 class Trace(NamedTuple):
-    """What the smoother needs of one epoch: H hypotheses, N unknowns, M measurements at most; H is 0 without."""
+    """Record of one epoch for the smoother: H hypotheses, N unknowns, M measurements at most; H is 0 without."""
 
     prior: Floats  #: Covariances before the measurements; shape (H, N, N).
     row: Floats  #: Measurement matrix, 0 for what was not used; shape (H, M, N).
@@ -144,3 +145,5 @@ class Rows(NamedTuple):
     variance: Floats
     left_out: Masks  #: Codes of a satellite that is left out as faulty; shape (M,).
     code_s: float  #: Time that the codes stand for [s]; 0 where they are not used.
+    degrees: float  #: Degrees of freedom of Student's t that the errors follow; no unit.
+    late_degrees: float  #: The same of codes that are longer than expected.

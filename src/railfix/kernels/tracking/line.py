@@ -40,8 +40,8 @@ def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float
 def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: Floats) -> None:
     """Write point [m] and axes (tangent, right, up) of the line at an arc length; shapes (3,), (3, 3)."""
     arc = wrap_arc(vertex, line, arc)
-    low = 1 + np.searchsorted(vertex["arc_m"][1:-1], arc, side="right")
-    here, after = vertex[low - 1], vertex[low]
+    v = np.searchsorted(vertex["arc_m"][1:-1], arc, side="right")
+    here, after = vertex[v], vertex[v + 1]
     along = arc - here.arc_m
     share = min(max(along / (after.arc_m - here.arc_m), 0.0), 1.0)
     for k in range(3):
@@ -60,13 +60,11 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
     """Return the gradient of the line, linear between the middles of segments."""
     arc = wrap_arc(vertex, line, arc)
     segments = len(vertex) - 1
-    low = np.searchsorted(vertex["middle_m"][:segments], arc, side="right")
-    if low == 0:
+    if segments == 1 or arc <= vertex[0].middle_m:
         return float(vertex[0].gradient)
-    if low == segments:
-        return float(vertex[segments - 1].gradient)
-    before, after = vertex[low - 1], vertex[low]
-    share = (arc - before.middle_m) / (after.middle_m - before.middle_m)
+    v = min(int(np.searchsorted(vertex["middle_m"][:segments], arc, side="right")), segments - 1)
+    before, after = vertex[v - 1], vertex[v]
+    share = min((arc - before.middle_m) / (after.middle_m - before.middle_m), 1.0)
     return float((1.0 - share) * before.gradient + share * after.gradient)
 
 

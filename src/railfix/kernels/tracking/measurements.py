@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Masks
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
@@ -15,8 +15,7 @@ from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.model import restart
 from railfix.kernels.tracking.update import Equations, median
 
-#: Times since that differ by less are equal: their rounding depends on where a chunk begins [s].
-TIE_S = 1e-6
+TIE_S = 1e-6  #: Times that differ by less are equal: their rounding depends on the first epoch [s].
 
 
 @inner
@@ -26,10 +25,8 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
     They are not used where phases or Dopplers carry on and others were used within the period.
     """
     epoch, period = given.epoch[t], given.parameters[0].code_period_s
-    dt, since, coded = epoch.interval_s, epoch.time_s - state.monitors[0].coded_s, False
-    for k in range(given.channel.shape[1]):
-        coded = coded or given.channel[t, k].has[ix.CODE]
-    if not coded:
+    dt, since = epoch.interval_s, epoch.time_s - state.monitors[0].coded_s
+    if not epoch.coded:
         return float(dt)
     if epoch.motion_measured and since < period - 0.5 * dt - TIE_S:
         return 0.0
@@ -82,7 +79,8 @@ def choose_measurements(given: Given, t: int, state: State) -> Rows:
             size += 1
     return Rows(
         slice(0, ends[0]), slice(ends[0], ends[1]), slice(ends[1], ends[2]), slice(ends[2], size), channel[:size],
-        variance[:size], left_out[:size], code_s,
+        variance[:size], left_out[:size], code_s, given.parameters[0].degrees_of_freedom,
+        given.parameters[0].late_degrees_of_freedom,
     )  # fmt: skip
 
 
@@ -93,11 +91,11 @@ def start_clocks(
     """Start the clocks of an epoch in a predicted Gaussian, and take them off its innovations.
 
     The median of each kind of innovation goes into its clock; clocks that have stepped restart. `restarted` gets
-    whether the clock of the phases, their drift, and the offset of the first constellation have.
+    which unknowns have, shape (N,).
     """
-    restarted[:] = False
     if rows.code.stop > 0:
-        restarted[2] = _start_code_clocks(given, t, rows, offset_known, x, P, equations)
+        first = ix.OFFSETS + given.channel[t, rows.channel[0]].clock
+        restarted[first] = _start_code_clocks(given, t, rows, offset_known, x, P, equations)
     for kind in (ix.PHASE, ix.DOPPLER):
         own = rows.phase if kind == ix.PHASE else rows.doppler
         if own.stop == own.start:
@@ -108,7 +106,7 @@ def start_clocks(
             x[unknown] += away
             equations.value[own] -= away
             restart(P, unknown, constants.UNKNOWN_CLOCK**2)
-            restarted[kind - 1] = True
+            restarted[unknown] = True
 
 
 @inner
@@ -120,38 +118,22 @@ def _start_code_clocks(
     At the first epoch the first constellation is that of the clock. Returns whether it is the first epoch.
     """
     codes, value = rows.code.stop, equations.value
-    clock_of, some = np.empty(codes, dtype=np.intp), False
+    clock_of = np.empty(codes, dtype=np.intp)
     for j in range(codes):
         clock_of[j] = given.channel[t, rows.channel[j]].clock
-        some = some or known[clock_of[j]]
-    first, begins = clock_of[0], True
-    for g in range(ix.CLOCK_COUNT):
-        begins = begins and not known[g]
+    first, begins = clock_of[0], not known.any()
     if begins:
         P[ix.OFFSETS + first, ix.OFFSETS + first] = constants.FIRST_OFFSET_M2
-    settled = np.empty(ix.CLOCK_COUNT, dtype=np.bool_)
-    for g in range(ix.CLOCK_COUNT):
-        settled[g] = known[g] if some else g == first
-    clock = _median_of_clocks(value, clock_of, settled)
+    settled = known.copy()
+    if not known[clock_of].any():
+        settled[:], settled[first] = False, True
+    clock = median(value[:codes][settled[clock_of]])
     x[ix.CODE_CLOCK] += clock
     for g in range(ix.CLOCK_COUNT):
-        own, away = np.zeros(ix.CLOCK_COUNT, dtype=np.bool_), clock
-        own[g] = True
-        if not settled[g]:
-            away = _median_of_clocks(value, clock_of, own)
-            x[ix.OFFSETS + g] += 0.0 if math.isnan(away) else away - clock
+        away, own = clock, clock_of == g
+        if not settled[g] and own.any():
+            away = median(value[:codes][own])
+            x[ix.OFFSETS + g] += away - clock
         for j in range(codes):
-            if clock_of[j] == g:
-                value[j] -= away
+            value[j] -= away if own[j] else 0.0
     return bool(begins)
-
-
-@inner
-def _median_of_clocks(value: Floats, clock_of: Indices, chosen: Masks) -> float:
-    """Return the median innovation of the codes of some clocks; NaN without any."""
-    some, size = np.empty(len(clock_of)), 0
-    for j in range(len(clock_of)):
-        if chosen[clock_of[j]]:
-            some[size] = value[j]
-            size += 1
-    return median(some[:size])

@@ -30,24 +30,15 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
         return math.nan
     reach = max(constants.REACH_M, constants.REACH_SIGMAS * math.sqrt(P[ix.ARC, ix.ARC]))
     speed = x[ix.SPEED] - epoch.velocity_age_s * x[ix.ACCELERATION]
-    square, least, point, axes = 0.0, math.inf, np.empty(3), np.empty((3, 3))
-    for c in range(3):
-        square += velocity[c] * velocity[c]
+    least, point, axes = math.inf, np.empty(3), np.empty((3, 3))
     direction = max(constants.DIRECTION_SHARE, math.sqrt(2.0) * line.sigma_plan_m / constants.MAP_CORRELATION_M)
-    floor = constants.VELOCITY_FLOOR_MPS**2 + direction**2 * square
+    floor = constants.VELOCITY_FLOOR_MPS**2 + direction**2 * (velocity**2).sum()
     for turn in (-1.0, 0.0, 1.0):
         write_point(given.vertex, line, x[ix.ARC] - epoch.velocity_age_s * speed + turn * reach, point, axes)
-        total = 0.0
-        for k in range(2):
-            away, variance = -speed if k == 0 else 0.0, floor
-            for c in range(3):
-                away += velocity[c] * axes[k, c]
-                for e in range(3):
-                    variance += axes[k, c] * covariance[c, e] * axes[k, e]
-            if k == 0:
-                variance += P[ix.SPEED, ix.SPEED]
-            total += away * away / variance
-        least = min(least, total)
+        along, across = (velocity * axes[0]).sum() - speed, (velocity * axes[1]).sum()
+        of_along = floor + (covariance * np.outer(axes[0], axes[0])).sum() + P[ix.SPEED, ix.SPEED]
+        of_across = floor + (covariance * np.outer(axes[1], axes[1])).sum()
+        least = min(least, along**2 / of_along + across**2 / of_across)
     return least
 
 

@@ -15,7 +15,7 @@ from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
-from railfix.kernels.tracking.equations import linearise, new_equations
+from railfix.kernels.tracking.equations import find_wheel_sign, linearise, new_equations
 from railfix.kernels.tracking.evidence import compute_evidence, refit_inflated_prior
 from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
 from railfix.kernels.tracking.layout import Given, Results, Rows, State, Trace
@@ -37,19 +37,17 @@ from railfix.kernels.tracking.update import (
 
 
 @inner
-def _needs_search(given: Given, t: int, state: State) -> bool:
-    """Return whether places have to be sought before an epoch: the track is lost or in doubt, or after a gap."""
+def _find_search_reasons(given: Given, t: int, state: State) -> int:
+    """Return why places have to be sought before an epoch: bits of `index.LOST_TRACK` and those after it, or 0."""
     epoch, parameters, monitors = given.epoch[t], given.parameters[0], state.monitors[0]
     lost = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
     lost = lost or monitors.across >= constants.ACROSS_LOST
     doubtful = monitors.weak_motion_s >= constants.BESIDE_AFTER_S or monitors.across >= constants.ACROSS_DOUBT
     doubtful = doubtful or monitors.motion_misfit > 1.0 - constants.MOTION_FIT
     doubtful = doubtful and monitors.measured_s > epoch.time_s - 1.5 * epoch.interval_s
-    coded = False
-    for k in range(given.channel.shape[1]):
-        coded = coded or given.channel[t, k].has[ix.CODE]
-    gap = coded and epoch.time_s - monitors.measured_s > constants.GAP_S
-    return bool(lost or gap or (doubtful and monitors.hypotheses <= parameters.most_hypotheses // 2))
+    gap = epoch.coded and epoch.time_s - monitors.measured_s > constants.GAP_S
+    doubtful = doubtful and monitors.hypotheses <= parameters.most_hypotheses // 2
+    return (ix.LOST_TRACK if lost else 0) | (ix.GAP if gap else 0) | (ix.CONTRADICTED if doubtful else 0)
 
 
 @inner
@@ -90,8 +88,10 @@ def _predict_all(given: Given, t: int, state: State) -> None:
 @inner
 def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) -> Correction:
     """Return the correction of a predicted hypothesis up to its innovations."""
-    x, P, equations, restarted = state.x[h].copy(), state.P[h].copy(), new_equations(rows), np.zeros(3, dtype=np.bool_)
-    linearise(given, t, rows, x, (x[ix.ARC], x[ix.PREVIOUS_ARC]), state.monitors[0].direction, equations)
+    x, P, equations = state.x[h].copy(), state.P[h].copy(), new_equations(rows)
+    restarted = np.zeros(len(x), dtype=np.bool_)
+    sign = find_wheel_sign(x, state.monitors[0].direction)
+    linearise(given, t, rows, x, (x[ix.ARC], x[ix.PREVIOUS_ARC]), sign, equations)
     add_bend(given, (x[ix.ARC], x[ix.PREVIOUS_ARC]), P)
     start_clocks(given, t, rows, state.offset_known, x, P, equations, restarted)
     covariance, without_clock = predict_quantities(P, equations)
@@ -106,23 +106,22 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
 
     The equations are made again about the corrected place while it moves by more than `MOVED_M`.
     """
-    parameters, count = given.parameters[0], state.monitors[0].hypotheses
-    degrees, rounds = (parameters.degrees_of_freedom, parameters.late_degrees_of_freedom), constants.PASSES
+    count = state.monitors[0].hypotheses
     corrections = [_start_correction(given, t, state, rows, h) for h in range(count)]
     for one in corrections:
         expected = one.covariance, one.without_clock
-        write_first_weights(rows, one.equations, expected, rows.variance, degrees, one.fit.weight)
+        write_first_weights(rows, one.equations, expected, rows.variance, one.fit.weight)
     leading = corrections[find_leading(state.hypothesis, count)]
     shift = compute_code_shift(rows, leading.equations, leading.covariance, leading.fit.weight)
     doubtful = False
     for one in corrections:
-        reweight(rows, one.equations, one.covariance, rows.variance, degrees, rounds, one.fit)
+        reweight(rows, one.equations, one.covariance, rows.variance, one.fit)
         code, motion = mean_weights(rows, rows.variance, one.fit.weight)
         doubtful = doubtful or code < constants.WEAK_FIT or motion < constants.WEAK_FIT
     furthest = 0.0
     for one in corrections:
         if doubtful:
-            refit_inflated_prior(rows, degrees, rounds, one)
+            refit_inflated_prior(rows, one)
         correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
         furthest = max(furthest, abs(one.x[ix.ARC] - one.x_prior[ix.ARC]))
     for _ in range(constants.RELINEARISED):
@@ -137,12 +136,11 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
 @inner
 def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction) -> float:
     """Correct a hypothesis again with equations about the corrected place; return how far it moves from there [m]."""
-    parameters, arc = given.parameters[0], one.x[ix.ARC]
-    degrees = parameters.degrees_of_freedom, parameters.late_degrees_of_freedom
-    linearise(given, t, rows, one.x_prior, (arc, one.x[ix.PREVIOUS_ARC]), state.monitors[0].direction, one.equations)
+    arc, sign = one.x[ix.ARC], find_wheel_sign(one.x_prior, state.monitors[0].direction)
+    linearise(given, t, rows, one.x_prior, (arc, one.x[ix.PREVIOUS_ARC]), sign, one.equations)
     covariance, without_clock = predict_quantities(one.P_prior, one.equations)
     one.covariance[:], one.without_clock[:] = covariance, without_clock
-    reweight(rows, one.equations, covariance, rows.variance, degrees, constants.PASSES, one.fit)
+    reweight(rows, one.equations, covariance, rows.variance, one.fit)
     one.x[:], one.P[:] = one.x_prior, one.P_prior
     correct_state(rows, one.equations, rows.variance, one.fit.weight, one.x, one.P)
     return float(abs(one.x[ix.ARC] - arc))
@@ -151,15 +149,14 @@ def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction
 @inner
 def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction]) -> None:
     """Update the probabilities of several hypotheses by the evidence of an epoch."""
-    parameters, count = given.parameters[0], len(corrections)
-    degrees = parameters.degrees_of_freedom, parameters.late_degrees_of_freedom
+    count = len(corrections)
     motion, code, arc = np.empty(count), np.empty(count), np.empty(count)
     points, axes = np.empty((count, 3)), np.empty((3, 3))
     for h in range(count):
-        motion[h], code[h] = compute_evidence(rows, degrees, constants.PASSES, corrections[h])
+        motion[h], code[h] = compute_evidence(rows, corrections[h])
         arc[h] = corrections[h].x[ix.ARC]
         write_point(given.vertex, given.line[0], arc[h], points[h], axes)
-    reweigh(parameters, state, motion, code, points, arc, given.epoch[t].interval_s)
+    reweigh(given.parameters[0], state, motion, code, points, arc, given.epoch[t].interval_s)
 
 
 @inner
@@ -209,25 +206,21 @@ def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, res
 
 
 @inner
-def _write_trace(given: Given, t: int, rows: Rows, corrections: list[Correction], trace: Trace) -> None:
-    """Write what the smoother needs of the corrections."""
+def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> None:
+    """Write the record of the corrections for the smoother."""
     for h, one in enumerate(corrections):
-        trace.prior[h] = one.P_prior
-        unknown, coefficient, codes = one.equations.unknown, one.equations.coefficient, rows.code.stop
-        for j in range(rows.sensor.stop):
-            trace.value[h, j] = one.equations.value[j]
-            trace.variance[h, j] = rows.variance[j] / one.fit.weight[j]
-            for q in range(len(unknown)):
-                if codes <= j < rows.sensor.start:
-                    factor = one.equations.design[j, q - codes] if codes <= q < codes + ix.MOTION else 0.0
-                else:
-                    factor = 1.0 if q == (j if j < codes else j - rows.sensor.start + codes + ix.MOTION) else 0.0
-                if factor != 0.0:
-                    for k in range(ix.TERMS):
-                        trace.row[h, j, unknown[q, k]] += factor * coefficient[q, k]
-        trace.restarted[h, ix.PHASE_CLOCK], trace.restarted[h, ix.DRIFT] = one.restarted[0], one.restarted[1]
-        if codes:
-            trace.restarted[h, ix.OFFSETS + given.channel[t, rows.channel[0]].clock] = one.restarted[2]
+        codes, count, equations = rows.code.stop, rows.sensor.stop, one.equations
+        H = np.zeros((len(equations.unknown), len(one.x)))  # of the quantities
+        for q in range(len(H)):
+            for k in range(ix.TERMS):
+                H[q, equations.unknown[q, k]] += equations.coefficient[q, k]
+        trace.prior[h], trace.value[h, :count] = one.P_prior, equations.value
+        trace.variance[h, :count] = rows.variance / one.fit.weight
+        trace.row[h, :codes], trace.row[h, rows.sensor] = H[:codes], H[codes + ix.MOTION :]
+        trace.row[h, codes : rows.sensor.start] = (
+            equations.design[codes : rows.sensor.start] @ H[codes : codes + ix.MOTION]
+        )
+        trace.restarted[h] = one.restarted
 
 
 @inner
@@ -259,7 +252,7 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
     result.hypotheses, result.probability = monitors.hypotheses, math.exp(state.hypothesis[0].log_probability)
     if not sigma <= constants.EXPIRED_SIGMA_M:
-        result.status = constants.EXPIRED
+        result.status = ix.EXPIRED
         return
     branches, far = find_branches(given, state)
     spread = sigma * sigma
@@ -283,10 +276,10 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
             result.level_m = math.inf
         result.amount_m = max(result.level_m, constants.SCALE_BOUND * monitors.distance_since_code_m)
         result.level_speed_mps = bound_speed(parameters, state, result.speed_sigma_mps)
-    if status != constants.LOST and monitors.ambiguity_hold_s > 0.0:
-        status = constants.SEVERAL_BRANCHES
-    elif status != constants.LOST and monitors.level_hold_s > 0.0:
-        status = constants.DOUBTFUL
+    if status != ix.LOST and monitors.ambiguity_hold_s > 0.0:
+        status = ix.SEVERAL_BRANCHES
+    elif status != ix.LOST and monitors.level_hold_s > 0.0:
+        status = ix.DOUBTFUL
     result.status = status
 
 
@@ -306,7 +299,7 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
         if believed:
             leads = _commit_update(given, t, state, rows, corrections, shift)
             if len(trace.prior):
-                _write_trace(given, t, rows, corrections, trace)
+                _write_trace(rows, corrections, trace)
         else:
             monitors.weak_motion_s += dt
         _write_measurements(t, rows, corrections[leads], believed, results)
@@ -319,26 +312,29 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
     if believed and rows.code.stop > 0:
         monitors.distance_since_code_m = 0.0
     _finish(given, t, leads, state, trace)
-    status = constants.TRACKING if believed else constants.COASTING
-    _write_place(given, t, constants.LOST if lost else status, state, results)
+    status = ix.TRACKING if believed else ix.COASTING
+    _write_place(given, t, ix.LOST if lost else status, state, results)
 
 
 @kernel
-def advance(given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], part: int) -> int:
-    """Do the epochs of a span; return the first before which places have to be sought, or the end of the span.
+def advance(
+    given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], part: int
+) -> tuple[int, int]:
+    """Do the epochs of a span; return the first before which places have to be sought, and why, or its end and 0.
 
     `part` says what of an epoch is done: `index.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
     """
     for t in range(span[0], span[1]):
         if part < ix.REST:
-            if given.epoch[t].begins or (part == ix.WHOLE and _needs_search(given, t, state)):
-                return t
+            reasons = _find_search_reasons(given, t, state) if part == ix.WHOLE else 0
+            if given.epoch[t].begins or reasons:
+                return t, reasons
             _reset_code_errors(given, t, state)
             _wrap_closed_line(given, state)
             _predict_all(given, t, state)
             if part == ix.PREDICTION:
-                return t
+                return t, 0
         _advance_epoch(given, t, state, results, trace, part == ix.REST_LOST)
         if not math.isfinite(state.x[0, ix.ARC]):
-            return t + 1
-    return span[1]
+            return t + 1, 0
+    return span[1], 0

@@ -15,7 +15,7 @@ from railfix.core.arrays import Floats, Masks
 from railfix.kernels.compiling import inner
 from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
-from railfix.kernels.tracking.equations import linearise, new_equations, shift_sensors
+from railfix.kernels.tracking.equations import find_wheel_sign, linearise, new_equations
 from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.model import add_bend, restart
@@ -82,7 +82,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
         if given.within_memory[t, k]:  # without a sub-filter before, the hypothesis has absorbed what it remembers
             absorbed[satellites + source[k].clock] = True
             needed[k] = needed[k] or not before
-    equations, found = new_equations(rows), new_fit(rows)
+    sign = find_wheel_sign(best.x_prior, state.monitors[0].direction)
     for b in range(len(source)):
         one = source[b]
         satellite = b < satellites
@@ -111,7 +111,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
         if one.running and _has_diverged(b - satellites, P, variance):
             one.running = False
             continue
-        _correct(given, t, rows, variance, best, (x, P), equations, found)
+        found = _correct(given, t, rows, variance, best, x, P, sign)
         _update_contradiction(given, t, rows, state, b, variance, found)
 
 
@@ -209,34 +209,23 @@ def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equa
 
 @inner
 def _correct(
-    given: Given,
-    t: int,
-    rows: Rows,
-    variance: Floats,
-    best: Correction,
-    gaussian: tuple[Floats, Floats],
-    equations: Equations,
-    found: Fit,
-) -> None:
+    given: Given, t: int, rows: Rows, variance: Floats, best: Correction, x: Floats, P: Floats, sign: float
+) -> Fit:
     """Correct a predicted sub-filter (x, P), in place, with the clocks that the filter has started."""
-    x, P = gaussian
-    for k in range(3):
-        if best.restarted[k]:
-            unknown = ix.PHASE_CLOCK if k == 0 else ix.DRIFT
-            if k == 2:
-                unknown = ix.OFFSETS + given.channel[t, rows.channel[0]].clock
-            x[unknown] = best.x_prior[unknown]
-            restart(P, unknown, best.P_prior[unknown, unknown])
+    equations, found = new_equations(rows), new_fit(rows)
+    for i in range(len(x)):
+        if best.restarted[i]:
+            x[i] = best.x_prior[i]
+            restart(P, i, best.P_prior[i, i])
     x[ix.CODE_CLOCK] = best.x_prior[ix.CODE_CLOCK]
-    linearise(given, t, rows, x, (x[ix.ARC], x[ix.PREVIOUS_ARC]), 1.0, equations)
-    shift_sensors(rows, x, best.x_prior, best.equations, equations)
+    linearise(given, t, rows, x, (x[ix.ARC], x[ix.PREVIOUS_ARC]), sign, equations)
     covariance, without_clock = predict_quantities(P, equations)
-    degrees = given.parameters[0].degrees_of_freedom, given.parameters[0].late_degrees_of_freedom
-    write_first_weights(rows, equations, (covariance, without_clock), variance, degrees, found.weight)
+    write_first_weights(rows, equations, (covariance, without_clock), variance, found.weight)
     for _ in range(constants.LEVEL_PASSES - 1):
         fit(rows, equations, covariance, variance, found)
-        write_weights(rows, variance, degrees, found)
+        write_weights(rows, variance, found)
     correct_state(rows, equations, variance, found.weight, x, P)
+    return found
 
 
 @inner

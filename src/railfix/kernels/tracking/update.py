@@ -41,14 +41,14 @@ class Equations(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What an epoch's measurements say of one Gaussian; shapes (M,), the last (2,)."""
+    """Fit of one Gaussian to an epoch's measurements; shapes (M,), the last two (1,)."""
 
     #: Of Student's t, no unit; 1 at an error of one standard deviation, but less for a code that is late.
     weight: Floats
     residual: Floats  #: Innovation less what the corrected quantities explain, in its unit.
     fitted: Floats  #: Variance of what they explain, in its unit squared.
-    #: ``log det(I + R^-1 H P H')`` and ``q' (H P H')^-1 q`` of the corrected mean of the quantities.
-    summary: Floats
+    log_determinant: Floats  #: ``log det(I + R^-1 H P H')``.
+    distance: Floats  #: ``q' (H P H')^-1 q`` of the corrected mean q of the quantities.
 
 
 class Correction(NamedTuple):
@@ -63,7 +63,7 @@ class Correction(NamedTuple):
     without_clock: Floats
     fit: Fit
     innovation: Floats  #: About the predicted mean; shape (M,).
-    restarted: Masks  #: Clock of the phases, drift, offset of the first constellation; shape (3,).
+    restarted: Masks  #: Unknowns that have restarted at this epoch: clocks; shape (N,).
     #: Corrected mean and covariance; shapes (N,), (N, N).
     x: Floats
     P: Floats
@@ -73,7 +73,7 @@ class Correction(NamedTuple):
 def new_fit(rows: Rows) -> Fit:
     """Return the fit of an epoch's measurements, to be written."""
     count = rows.sensor.stop
-    return Fit(np.ones(count), np.zeros(count), np.zeros(count), np.zeros(2))
+    return Fit(np.ones(count), np.zeros(count), np.zeros(count), np.zeros(1), np.zeros(1))
 
 
 @inner
@@ -87,16 +87,8 @@ def add_row(target: Floats, factor: float, matrix: Floats, i: int) -> None:
 def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float, gain: Floats) -> None:
     """Correct a Gaussian by one measurement: ``K = g / S``, ``x + K y``, ``P - K g'``.
 
-    Parameters
-    ----------
-    x, P : ndarray, shapes (N,), (N, N)
-        Changed.
-    g : ndarray, shape (N,)
-        Covariance P h of the unknowns with the measurement.
-    innovation, variance : float
-        y, and ``S = h' P h + r``.
-    gain : ndarray, shape (N,)
-        Gets K.
+    x, shape (N,), and P, shape (N, N), are changed; g, shape (N,), is P h, the innovation y, its variance
+    ``S = h' P h + r``; `gain`, shape (N,), gets K.
     """
     for a in range(len(g)):
         gain[a] = g[a] / variance
@@ -114,22 +106,18 @@ def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]
     unknown, coefficient = equations.unknown, equations.coefficient
     size = len(unknown)
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))
-    for j in range(size):
+    for q in range(size):
         g[:] = 0.0
-        for k in range(ix.CLOCK_TERM):
-            if coefficient[j, k] != 0.0:
-                add_row(g, coefficient[j, k], P, unknown[j, k])
-        total = 0.0
-        for k in range(ix.CLOCK_TERM):
-            total += coefficient[j, k] * g[unknown[j, k]]
-        without_clock[j] = total
-        if coefficient[j, ix.CLOCK_TERM] != 0.0:
-            add_row(g, coefficient[j, ix.CLOCK_TERM], P, unknown[j, ix.CLOCK_TERM])
-        for i in range(j + 1):
+        for k in range(ix.TERMS):
+            if k == ix.CLOCK_TERM:
+                without_clock[q] = _project(equations, q, g) - coefficient[q, k] * g[unknown[q, k]]
+            if coefficient[q, k] != 0.0:
+                add_row(g, coefficient[q, k], P, unknown[q, k])
+        for i in range(q + 1):
             total = 0.0
-            for k in range(ix.TERMS):
+            for k in range(ix.TERMS):  # a constant number of terms compiles to faster code
                 total += coefficient[i, k] * g[unknown[i, k]]
-            covariance[i, j] = covariance[j, i] = total
+            covariance[i, q] = covariance[q, i] = total
     return covariance, without_clock
 
 
@@ -168,35 +156,28 @@ def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats,
 
 
 @inner
-def compute_weight(square: float, late: bool, degrees: tuple[float, float]) -> float:
+def compute_weight(rows: Rows, square: float, late: bool) -> float:
     """Return the weight of a measurement by its square over its variance: `railfix.tracking.limits.Tails`."""
-    own = degrees[1] if late else degrees[0]
-    return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
+    own = rows.late_degrees if late else rows.degrees
+    return float((rows.degrees + 1.0) / rows.degrees * own / (own + square))
 
 
 @inner
 def median(values: Floats) -> float:
     """Return the median of values; NaN of none."""
     ordered, size = np.empty(len(values)), len(values)
-    for i in range(size):
-        j = i
-        while j > 0 and ordered[j - 1] > values[i]:
-            ordered[j] = ordered[j - 1]
-            j -= 1
-        ordered[j] = values[i]
-    if size == 0:
-        return math.nan
-    return float(0.5 * (ordered[(size - 1) // 2] + ordered[size // 2]))
+    for a in range(size):  # by insertion
+        b = a
+        while b > 0 and ordered[b - 1] > values[a]:
+            ordered[b] = ordered[b - 1]
+            b -= 1
+        ordered[b] = values[a]
+    return float(0.5 * (ordered[(size - 1) // 2] + ordered[size // 2])) if size else math.nan
 
 
 @inner
 def write_first_weights(
-    rows: Rows,
-    equations: Equations,
-    expected: tuple[Floats, Floats],
-    variance: Floats,
-    degrees: tuple[float, float],
-    weight: Floats,
+    rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
     """Write the weights of the innovations, of GNSS less the median of their kind, by their variance without the clock.
 
@@ -215,51 +196,65 @@ def write_first_weights(
                     if a != clock and b != clock:
                         spread += design[j, a] * design[j, b] * covariance[codes + a, codes + b]
             away = value[j] - middle
-            weight[j] = compute_weight(away * away / (spread + variance[j]), False, degrees)
+            weight[j] = compute_weight(rows, away * away / (spread + variance[j]), False)
     middle = median(value[rows.code])
     for j in range(codes):
         away = value[j] - middle
-        weight[j] = compute_weight(away * away / (without_clock[j] + variance[j]), away > 0.0, degrees)
+        weight[j] = compute_weight(rows, away * away / (without_clock[j] + variance[j]), away > 0.0)
     for j in range(rows.sensor.start, rows.sensor.stop):
         spread = without_clock[codes + ix.MOTION + j - rows.sensor.start]
-        weight[j] = compute_weight(value[j] * value[j] / (spread + variance[j]), False, degrees)
+        weight[j] = compute_weight(rows, value[j] * value[j] / (spread + variance[j]), False)
 
 
 @inner
-def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Correct the quantities, ``N(0, covariance)``, at the weights of `found`; write the rest of it."""
-    size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
-    mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
-    T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
+def correct_by_rows(
+    rows: Rows, equations: Equations, variance: Floats, weight: Floats, mean: Floats, P: Floats
+) -> tuple[float, float]:
+    """Correct a Gaussian, in place, by all measurements of finite variance at their weights, one after the other.
+
+    `mean`, shape (N,), is the change from where the innovations hold. Returns ``log det(I + R^-1 H P H')``, and
+    ``y' (H P H' + R)^-1 y`` less the squared residuals of the six rows of the motion: less those of codes and sensors,
+    over their variances, it is `Fit.distance`.
+    """
+    codes, value, log_determinant, square = rows.code.stop, equations.value, 0.0, 0.0
+    g, gain, T, z = np.empty(len(mean)), np.empty(len(mean)), np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
     compress(rows, equations, variance, weight, T, z)
-    log_determinant = square = 0.0
-    for q in range(size):
+    for q in range(len(equations.unknown)):
+        g[:] = 0.0
         if codes <= q < codes + ix.MOTION:
             r = q - codes
             if T[r, r] == 0.0:
                 continue
-            g[:], y, S, noise = 0.0, z[r], 1.0, 1.0
+            y, noise, S = z[r], 1.0, 1.0
             for c in range(r, ix.MOTION):
-                add_row(g, T[r, c], C, codes + c)
-                y -= T[r, c] * mean[codes + c]
+                y -= _add_quantity(equations, codes + c, T[r, c], P, mean, g)
             for c in range(r, ix.MOTION):
-                S += T[r, c] * g[codes + c]
+                S += T[r, c] * _project(equations, codes + c, g)
         else:
             j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
             if variance[j] == math.inf:
                 continue
-            g[:], noise = C[q], variance[j] / weight[j]
-            y, S = value[j] - mean[q], g[q] + noise
-        correct(mean, C, g, y, S, gain)
+            noise, y = variance[j] / weight[j], value[j] - _add_quantity(equations, q, 1.0, P, mean, g)
+            S = noise + _project(equations, q, g)
+        correct(mean, P, g, y, S, gain)
         log_determinant += math.log(S / noise)
         square += y * y / S
     for r in range(ix.MOTION):
         rest = z[r]
         for c in range(r, ix.MOTION):
-            rest -= T[r, c] * mean[codes + c]
+            rest -= T[r, c] * _project(equations, codes + c, mean)
         square -= rest * rest
+    return log_determinant, square
+
+
+@inner
+def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
+    """Correct the quantities, ``N(0, covariance)``, at the weights of `found`; write the rest of it."""
+    mean, C, itself = np.zeros(len(covariance)), covariance.copy(), np.arange(len(covariance)).reshape(-1, 1)
+    own = Equations(itself, np.ones(itself.shape), equations.design, equations.value)
+    log_determinant, square = correct_by_rows(rows, own, variance, found.weight, mean, C)
     square -= _write_residuals(rows, equations, mean, C, variance, found)
-    found.summary[0], found.summary[1] = log_determinant, square
+    found.log_determinant[0], found.distance[0] = log_determinant, square
 
 
 @inner
@@ -283,93 +278,64 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
 
 
 @inner
-def write_weights(rows: Rows, variance: Floats, degrees: tuple[float, float], found: Fit) -> None:
+def write_weights(rows: Rows, variance: Floats, found: Fit) -> None:
     """Write the weights that follow from the residuals of a fit and their variances."""
     for j in range(rows.sensor.stop):
         relative = (found.residual[j] ** 2 + found.fitted[j]) / variance[j]
         late = j < rows.code.stop and found.residual[j] > 0.0
-        found.weight[j] = compute_weight(relative, late, degrees)
+        found.weight[j] = compute_weight(rows, relative, late)
 
 
 @inner
-def reweight(
-    rows: Rows,
-    equations: Equations,
-    covariance: Floats,
-    variance: Floats,
-    degrees: tuple[float, float],
-    rounds: int,
-    found: Fit,
-) -> None:
-    """Fit and reweight in turn, a number of fits beginning with the weights of `found`.
+def reweight(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
+    """Fit and reweight in turn, `PASSES` fits beginning with the weights of `found`.
 
     `found` keeps the weights of the last fit, and the residuals that it left.
     """
     fit(rows, equations, covariance, variance, found)
-    for _ in range(rounds - 1):
-        write_weights(rows, variance, degrees, found)
+    for _ in range(constants.PASSES - 1):
+        write_weights(rows, variance, found)
         fit(rows, equations, covariance, variance, found)
 
 
 @inner
 def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Floats, x: Floats, P: Floats) -> None:
-    """Correct the state by all measurements of finite variance at their weights, one after the other."""
-    codes, size, value = rows.code.stop, len(equations.unknown), equations.value
-    change, g, gain = np.zeros(len(x)), np.empty(len(x)), np.empty(len(x))
-    T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
-    compress(rows, equations, variance, weight, T, z)
-    for q in range(size):
-        g[:] = 0.0
-        if codes <= q < codes + ix.MOTION:
-            r = q - codes
-            if T[r, r] == 0.0:
-                continue
-            y, S = z[r], 1.0
-            for c in range(r, ix.MOTION):
-                y -= _add_quantity(equations, codes + c, T[r, c], P, change, g)
-            for c in range(r, ix.MOTION):
-                S += T[r, c] * _project(equations, codes + c, g)
-        else:
-            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
-            if variance[j] == math.inf:
-                continue
-            y = value[j] - _add_quantity(equations, q, 1.0, P, change, g)
-            S = variance[j] / weight[j] + _project(equations, q, g)
-        correct(change, P, g, y, S, gain)
-    for a in range(len(x)):
-        x[a] += change[a]
+    """Correct the state by all measurements of finite variance at their weights."""
+    change = np.zeros(len(x))
+    correct_by_rows(rows, equations, variance, weight, change, P)
+    for i in range(len(x)):
+        x[i] += change[i]
 
 
 @inner
 def _project(equations: Equations, q: int, vector: Floats) -> float:
     """Return ``h' vector`` of a quantity h."""
     total = 0.0
-    for k in range(ix.TERMS):
+    for k in range(equations.unknown.shape[1]):
         total += equations.coefficient[q, k] * vector[equations.unknown[q, k]]
     return total
 
 
 @inner
-def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, change: Floats, g: Floats) -> float:
-    """Add a multiple of ``P h`` of a quantity h to g; return the same multiple of ``h' change``."""
+def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: Floats, g: Floats) -> float:
+    """Add a multiple of ``P h`` of a quantity h to g; return the same multiple of ``h' mean``."""
     total = 0.0
-    for k in range(ix.TERMS):
+    for k in range(equations.unknown.shape[1]):
         f = factor * equations.coefficient[q, k]
         if f != 0.0:
-            total += f * change[equations.unknown[q, k]]
+            total += f * mean[equations.unknown[q, k]]
             add_row(g, f, P, equations.unknown[q, k])
     return total
 
 
 @inner
-def compute_log_evidence(rows: Rows, variance: Floats, degrees: tuple[float, float], found: Fit) -> float:
+def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
     """Return the logarithm of the evidence of the measurements of finite variance, by Laplace with Student's t."""
-    usual, late = degrees
-    density = 0.0
+    usual, density = rows.degrees, 0.0
     for j in range(rows.sensor.stop):
-        own = late if j < rows.code.stop and found.residual[j] > 0.0 else usual
+        own = rows.late_degrees if j < rows.code.stop and found.residual[j] > 0.0 else usual
         density += own * math.log1p(found.residual[j] ** 2 / (own * variance[j]))
-    return float(-0.5 * (usual + 1.0) / usual * density - 0.5 * found.summary[1] - 0.5 * found.summary[0])
+    return float(-0.5 * (usual + 1.0) / usual * density - 0.5 * found.distance[0] - 0.5 * found.log_determinant[0])
 
 
 @inner

@@ -1,17 +1,27 @@
-"""Velocities of the antenna without the line."""
+"""Velocities of the antenna without the line, by changes of the carrier phase or by Dopplers.
+
+Least squares of velocity and clock with Student's t errors, for a train that climbs at most some per cent. Where the
+velocity points across the line, the place, the branch or the map is wrong.
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats
 from railfix.kernels.compiling import inner, kernel
-from railfix.kernels.tracking.update import median
+from railfix.kernels.sight import sight
+from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.equations import write_range_rate
+from railfix.kernels.tracking.layout import Records
+from railfix.kernels.tracking.update import correct, median
 
 #: Standard deviation of the vertical velocity [m/s].
 CLIMB_MPS = 0.3
-#: Loose prior for conditioning: standard deviations of the velocity and the clock [m/s].
-PRIOR_MPS = (1e3, 1e3, 1e3, 1e6)
+#: Loose prior for conditioning: standard deviation of the velocity, and of the clock about the median [m/s].
+PRIOR_MPS = 1e3
 #: Degrees of freedom of the errors, rounds of reweighting, rows beyond the unknowns that are needed, and least mean
 #: weight: with less the measurements do not agree with each other.
 DEGREES = 4.0
@@ -20,94 +30,78 @@ REDUNDANT = 2
 AGREEING = 0.9
 
 
-@inner
-def _invert(matrix: Floats) -> None:
-    """Invert a positive definite matrix of 4 rows in its place."""
-    for k in range(4):
-        pivot = 1.0 / matrix[k, k]
-        matrix[k, k] = 1.0
-        for c in range(4):
-            matrix[k, c] *= pivot
-        for a in range(4):
-            if a != k:
-                share = matrix[a, k]
-                matrix[a, k] = 0.0
-                for c in range(4):
-                    matrix[a, c] -= share * matrix[k, c]
-
-
 @kernel
-def fitted_velocities(
-    gradient: Floats, value: Floats, variance: Floats, has: Masks, up: Floats
-) -> tuple[Floats, Floats]:
-    """Fit velocity and clock to the rows of each epoch, ``value = gradient . v + clock``, with Student's t errors.
+def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: Floats) -> None:
+    """Write the velocities of epochs with their covariances and ages: by phases, or by Dopplers where those give none.
 
-    Parameters
-    ----------
-    gradient : ndarray, shape (T, K, 3)
-    value, variance : ndarray, shape (T, K)
-    has : ndarray of bool, shape (T, K)
-    up : ndarray, shape (T, 3)
-        Vertical direction.
-
-    Returns
-    -------
-    velocity : ndarray, shape (T, 3) [m/s]
-        NaN where the rows are too few, or do not agree.
-    covariance : ndarray, shape (T, 3, 3)
-        By the variances, larger where the residuals are.
+    The velocity is NaN where the measurements are too few, or do not agree. By phases it holds half of the interval
+    before the epoch. `epoch` and `channel` are `EPOCH` and `CHANNEL`, shapes (T,) and (T, K); `near_ecef_m`, shape
+    (T, 3), is a position right to some hundred metres, NaN where there is none; `up`, shape (T, 3), the vertical there.
     """
-    epochs, channels = has.shape
-    velocity, covariance = np.full((epochs, 3), np.nan), np.full((epochs, 3, 3), np.nan)
-    row, rest, information = np.empty((channels, 4)), np.empty(channels), np.empty(channels)
-    weight, square = np.empty(channels), np.empty(channels)
-    prior, normal, right, solved = np.empty((4, 4)), np.empty((4, 4)), np.empty(4), np.empty(4)
+    epochs, channels = channel.shape
+    h, y, r, u = np.empty((channels + 1, 4)), np.empty(channels + 1), np.empty(channels + 1), np.empty(3)
     for t in range(epochs):
-        count = 0
-        for k in range(channels):
-            if has[t, k]:
-                for a in range(3):
-                    row[count, a] = gradient[t, k, a]
-                row[count, 3] = 1.0
-                rest[count], information[count], weight[count] = value[t, k], 1.0 / variance[t, k], 1.0
+        one, point = epoch[t], near_ecef_m[t]
+        one.velocity_mps[:] = math.nan
+        if not math.isfinite(point[0]):
+            continue
+        for kind in (ix.PHASE, ix.DOPPLER):
+            count, dt = 0, one.interval_s
+            for k in range(channels):
+                from_ = channel[t, k]
+                if not from_.has[kind]:
+                    continue
+                sat, before = from_.sat_ecef_m, from_.before_ecef_m
+                distance, u[0], u[1], u[2] = sight(sat[0], sat[1], sat[2], point[0], point[1], point[2])
+                if kind == ix.PHASE:
+                    distance -= sight(before[0], before[1], before[2], point[0], point[1], point[2])[0]
+                    h[count, :3], y[count], r[count] = (
+                        -u,
+                        (from_.measured[kind] - distance) / dt,
+                        from_.variance[kind] / dt**2,
+                    )
+                else:
+                    y[count] = from_.measured[kind] - write_range_rate(from_, point, u, h[count, :3])
+                    r[count] = from_.variance[kind]
                 count += 1
-        if count - 3 < REDUNDANT:
-            continue
-        clock = median(rest[:count])
+            if fit_velocity(h, y, r, count, up[t], one.velocity_mps, one.velocity_covariance):
+                one.velocity_age_s = 0.5 * dt if kind == ix.PHASE else 0.0
+                break
+
+
+@inner
+def fit_velocity(h: Floats, y: Floats, r: Floats, count: int, up: Floats, velocity: Floats, covariance: Floats) -> bool:
+    """Fit velocity and clock to measurements ``y = h . v + clock``; return whether they are enough and agree.
+
+    h, y, r, shapes (M, 4), (M,), (M,), are coefficients, values [m/s] and variances, the first `count` of them; the
+    median is taken off y, and a vertical velocity of 0 is put behind them. `velocity`, shape (3,), is written, and
+    `covariance`, shape (3, 3), which is larger where the residuals are.
+    """
+    if count - 3 < REDUNDANT:
+        return False
+    y[:count] -= median(y[:count])
+    h[:count, 3], h[count, :3], h[count, 3], y[count], r[count] = 1.0, up, 0.0, 0.0, CLIMB_MPS**2
+    weight, square, x, P = np.ones(count + 1), np.empty(count), np.empty(4), np.empty((4, 4))
+    g, gain = np.empty(4), np.empty(4)
+    for _ in range(PASSES):
+        x[:], P[:] = 0.0, 0.0
         for a in range(4):
-            for b in range(4):
-                vertical = up[t, a] * up[t, b] / CLIMB_MPS**2 if a < 3 and b < 3 else 0.0
-                prior[a, b] = vertical + (PRIOR_MPS[a] ** -2.0 if a == b else 0.0)
-        for _ in range(PASSES):
+            P[a, a] = PRIOR_MPS**2
+        for j in range(count + 1):
+            innovation, total = y[j], r[j] / weight[j]
             for a in range(4):
-                right[a] = 0.0
+                g[a] = 0.0
                 for b in range(4):
-                    normal[a, b] = prior[a, b]
-            for k in range(count):
-                for a in range(4):
-                    scaled = row[k, a] * weight[k] * information[k]
-                    right[a] += scaled * (rest[k] - clock)
-                    for b in range(4):
-                        normal[a, b] += scaled * row[k, b]
-            _invert(normal)
+                    g[a] += P[a, b] * h[j, b]
+                innovation, total = innovation - h[j, a] * x[a], total + h[j, a] * g[a]
+            correct(x, P, g, innovation, total, gain)
+        for j in range(count):
+            residual = y[j]
             for a in range(4):
-                solved[a] = 0.0
-                for b in range(4):
-                    solved[a] += normal[a, b] * right[b]
-            for k in range(count):
-                misfit = rest[k] - clock
-                for a in range(4):
-                    misfit -= row[k, a] * solved[a]
-                square[k] = misfit * misfit * information[k]
-                weight[k] = (DEGREES + 1.0) / (DEGREES + square[k])
-        size, agreeing = 0.0, 0.0
-        for k in range(count):
-            size += weight[k] * square[k]
-            agreeing += weight[k]
-        if agreeing < AGREEING * count:
-            continue
-        for a in range(3):
-            velocity[t, a] = solved[a]
-            for b in range(3):
-                covariance[t, a, b] = normal[a, b] * max(size / (count - 3), 1.0)
-    return velocity, covariance
+                residual -= h[j, a] * x[a]
+            square[j] = residual**2 / r[j]
+            weight[j] = (DEGREES + 1.0) / (DEGREES + square[j])
+    if weight[:count].sum() < AGREEING * count:
+        return False
+    velocity[:], covariance[:] = x[:3], P[:3, :3] * max((weight[:count] * square).sum() / (count - 3), 1.0)
+    return True

@@ -253,7 +253,7 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
     assert adjusted is not None
     assert course is not None
     order, count = _points_of_line(course, ties)
-    sigma = adjusted.line_sigma_m[order]
+    sigma = np.hypot(adjusted.line_sigma_m[order], _unseen_sigma(runs))
     sigma_plan, sigma_height = (float(np.percentile(sigma[:, axis], _OF_THE_MAP)) for axis in range(2))
     notes = _notes(runs, legs, passes, count, moved[order], (sigma_plan, sigma_height), beside, apart)
     track = Track.from_ecef(
@@ -273,6 +273,15 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
         beside_m=beside,
         closed=course.closed and order[0] == order[-1],
     )
+
+
+def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
+    """Return the standard deviations in plan and height of what all positions of a single run share, shape (2,) [m].
+
+    In addition to `SurveyRun.common_sigma_m`, which is twice as large where no other run shows it: the sigmas that
+    single runs of low-cost receivers had without were half of their errors.
+    """
+    return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
 
 
 def _interpolate_positions(run: SurveyRun) -> Floats:
@@ -367,6 +376,18 @@ def _notes(
         f"{against:.0%} of it against its direction; each point is passed {count.min()} to {count.max()} times",
         f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height: 95th percentiles along it",
     ]
+    steps = np.concatenate([np.diff(leg.arc_m) for leg in legs])
+    if len(bridged := steps[steps > _TURN_M]):
+        notes.append(
+            f"{plural(bridged, 'gap')} in the runs bridged by a curve, the longest {bridged.max():.0f} m: the accuracy "
+            "there is that of its ends"
+        )
+    if len(runs) == 1:
+        plan, height = (2.0 * value for value in runs[0].common_sigma_m)
+        notes.append(
+            f"one run does not show the error that all its positions share: {plan:.1f} m in plan and {height:.1f} m in "
+            "height are in the accuracy for it; add runs of other days"
+        )
     if beside > 0.02 * driven:
         notes.append(
             f"{beside:,.0f} m of the runs do not lie on the line and are not used: branches, or wrong positions"

@@ -20,7 +20,11 @@ _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one lin
 _APART_WIDTHS: Final = 3.0
 _MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must lie on the line.
 _SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is evened out [m].
-_GAP_S: Final = 10.0  #: Longer without any row a run is not followed [s].
+#: Longer without any row [s] a run is followed over no more than a distance [m], and where it goes on in the direction
+#: of that distance: cosine of the largest angle.
+_GAP_S: Final = 10.0
+BRIDGED_M: Final = 500.0
+_GOES_ON: Final = 0.9
 _NEIGHBOURS: Final = 24  #: Neighbouring vertices that a point is compared with.
 
 
@@ -116,8 +120,8 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
     ]
     legs = []
     gap = np.flatnonzero((np.diff(time_s) > _GAP_S) & (np.linalg.norm(np.diff(point_m, axis=0), axis=1) > turn_m))
-    gaps = np.searchsorted(kept, gap, side="right")
-    edges = sorted([(0, 0), *((c, 0) for c in cuts), *((int(g), 1) for g in gaps), (len(kept) - 1, 0)])
+    gaps = [g for g in np.searchsorted(kept, gap, side="right").tolist() if not _goes_on(plan, g, reach)]
+    edges = sorted([(0, 0), *((c, 0) for c in cuts), *((g, 1) for g in gaps), (len(kept) - 1, 0)])
     for (first, _), (last, broken) in pairwise(edges):
         part = kept[first : last + 1 - broken]
         if len(part) >= 2:
@@ -125,6 +129,20 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
             arc = np.concatenate([[0.0], np.cumsum(step)])
             legs.append(Leg(run=run, row=part, arc_m=arc, point_m=point_m[part]))
     return legs
+
+
+def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
+    """Return whether a run goes on in its direction over the gap before a point."""
+    if not 0 < after < len(plan_m) - 1:
+        return False
+    gap = plan_m[after] - plan_m[after - 1]
+    length = float(np.linalg.norm(gap))
+    ways = (
+        plan_m[after - 1] - plan_m[max(after - 1 - reach, 0)],
+        plan_m[min(after + reach, len(plan_m) - 1)] - plan_m[after],
+    )
+    straight = all(way @ gap > _GOES_ON * length * np.linalg.norm(way) for way in ways)
+    return bool(straight and length <= BRIDGED_M)
 
 
 def _sample(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:

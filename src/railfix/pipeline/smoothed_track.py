@@ -53,7 +53,7 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
         for epochs, before in reversed(_pieces(replay, line, limits)):
             trace: list[Step] = []
             track(epochs, line, before, limits=limits, sensors=replay.sensors, trace=trace)
-            found, later = smooth_steps(trace, before or TrackState.empty(), later, limits)
+            found, later = smooth_steps(trace, before or TrackState(), later, limits)
             arc = found.arc_m + line.round_m(found.arc_m)
             parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
     nothing = np.empty(0)
