@@ -115,21 +115,13 @@ def position_stage(
     corrected = reject(corrected, _alone_on_clock(corrected, points.ties), Reason.ALONE_ON_ITS_CLOCK)
     checked, noise = check_ranges(corrected, points.ranges, antennas, fix, config, states)
     corrected, fix, model, scale = checked.corrected, checked.fix, checked.model, checked.scale
-    constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
+    constrained = fix.constrained
     # ranges that contradict each other in space contradict every map
     unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
-    off_map = checked.off_map & ~unresolved
-
+    on_map, off_map = np.isfinite(constrained.arc_m) & ~checked.off_map, checked.off_map & ~unresolved
     excluded = checked.lasting | checked.raim.excluded
     agreeing, free = _consistent(points.agreeing, points.free, excluded, corrected, scale, config)
-    right_m = offset_from_line(free.ecef_m, constrained.arc_m, antennas)[:, 0]
-
-    def own_absence(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
-        return off_map_epochs(
-            time[rows], on_map[rows], off_map[rows], right_m[rows], state.off_map, least_s=OFF_MAP_S
-        )  # fmt: skip
-
-    away, off_map_states = antennas.each_with_state(own_absence, states)
+    away, off_map_states = _find_absence(corrected, antennas, constrained.arc_m, (on_map, off_map), free.ecef_m, states)
     offset, map_states = map_offset(
         time, agreeing, free, OffsetErrors(corrected.nominal_m, np.maximum(scale, 1.0) ** 2), antennas,
         LinePositions(constrained.arc_m, away), [state.map_offset for state in states], limits=config.map_offset,
@@ -167,6 +159,25 @@ def position_stage(
         for k, state in enumerate(states)
     ]  # fmt: skip
     return corrected, solution, after
+
+
+def _find_absence(
+    corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, verdicts: tuple[Masks, Masks], ecef_m: Floats,
+    states: Sequence[AntennaState],
+) -> tuple[Masks, list[OffMapState]]:  # fmt: skip
+    """Return the epochs at which the train is away from the line, shape (T,), and the states of `off_map_epochs`.
+
+    `verdicts`: positions that the ranges fit, and that they contradict, shape (T,); 3-D positions of shape (T, 3).
+    """
+    (on_map, off_map), right_m = verdicts, offset_from_line(ecef_m, arc_m, antennas)[:, 0]
+    time = corrected.time
+
+    def of_antenna(_: SearchIndex, rows: slice, state: AntennaState) -> tuple[Masks, OffMapState]:
+        return off_map_epochs(
+            time[rows], on_map[rows], off_map[rows], right_m[rows], state.off_map, least_s=OFF_MAP_S
+        )  # fmt: skip
+
+    return antennas.each_with_state(of_antenna, states)
 
 
 def _alone_on_clock(corrected: CorrectedRanges, ties: InterSystemBiases) -> Masks:
