@@ -10,7 +10,7 @@ import pytest
 
 from railfix.core.errors import MismatchError
 from railfix.evaluate import intervals
-from railfix.evaluate.inputs import RunFolder
+from railfix.evaluate.evaluation_inputs import RunFolder
 from railfix.report.plots.campaign import plot_service
 
 pytestmark = pytest.mark.requirement("G4")

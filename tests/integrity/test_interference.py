@@ -25,8 +25,9 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion import MotionSigns
+from railfix.integrity.interference.motion_signs import MotionSigns
 from railfix.integrity.interference.range_fits import MotionInputs
+from railfix.integrity.interference.time_tags import _explains_more
 from railfix.positioning.search_index import SearchIndex
 
 LIMITS = InterferenceLimits()
@@ -279,11 +280,13 @@ def test_parted_constellations_are_those_of_two_fits_by_numpy() -> None:
     assert found.part_sigmas[k] == pytest.approx(np.sqrt(difference @ np.linalg.solve(both, difference)), rel=1e-6)
 
 
-def few_satellites(*, late_s: float = 0.0, wrong_m: dict[int, float] | None = None) -> MotionInputs:
+def few_satellites(
+    *, late_s: float = 0.0, wrong_m: dict[int, float] | None = None, aside_m: float = 0.0, seed: int = 4
+) -> MotionInputs:
     """Seven satellites of one constellation, each with a velocity of its own, seen by an antenna at rest for 15 s."""
-    rng, epochs = np.random.default_rng(4), 15
+    rng, epochs = np.random.default_rng(seed), 15
     line, time = synthetic.line(), times(epochs)
-    antenna = line.at_arc(500.0)
+    antenna = line.at_arc(500.0) + aside_m * line.get_axes(line.segment_at(np.array([500.0]))[0])[0, 1]
     first = synthetic.satellites(rng, 1, "G" * 7)[0]
     velocity = np.cross(first, rng.standard_normal((7, 3)))
     velocity *= 3900.0 / np.linalg.norm(velocity, axis=1, keepdims=True)
@@ -327,6 +330,30 @@ def test_bad_codes_of_seven_satellites_are_no_error_of_the_time_tags(size_m: flo
         found, _ = motion_signs(inputs._replace(used=~named, named=named), MotionSignState(), LIMITS)
         shown = (np.abs(found.tag_error_s) > LIMITS.tag_error_s) & (found.tag_error_sigmas > LIMITS.tag_sigmas)
         assert not shown.any(), bad
+
+
+@pytest.mark.requirement("C6")
+@pytest.mark.parametrize("aside_m", [60.0, 150.0, 400.0, 3000.0])
+def test_a_train_off_its_map_has_no_error_of_the_time_tags(aside_m: float) -> None:
+    for seed in range(30):
+        found, _ = motion_signs(few_satellites(aside_m=aside_m, seed=seed), MotionSignState(), LIMITS)
+        shown = (np.abs(found.tag_error_s) > LIMITS.tag_error_s) & (found.tag_error_sigmas > LIMITS.tag_sigmas)
+        assert not shown.any(), seed
+
+
+@pytest.mark.requirement("C6")
+def test_an_error_of_the_time_tags_has_to_explain_more_than_one_bad_code_with_two_redundant_rows() -> None:
+    """Seven codes and two rows of the line, five unknowns; each row costs the square of five sigmas at most."""
+    inputs = few_satellites().take(np.arange(6))
+    named = np.zeros((6, 7), dtype=bool)
+    named[4, :2] = True
+    bad = {0: (3, 0), 1: (1, 0), 2: (2, 0), 3: (9, 3), 4: (0, 0), 5: (0, 0)}
+    without, with_error = (np.array([[10.0] * n[k] + [0.0] * (9 - n[k]) for n in bad.values()]) for k in (0, 1))
+    without[4:] = np.nan
+    found = _explains_more(inputs._replace(used=~named, named=named), with_error, without)
+    # three bad codes and two are explained, one is not; three of nine rows that still disagree leave one redundant;
+    # where nothing is redundant the two that are named count, and nothing where none is
+    assert found.tolist() == [True, False, True, False, True, False]
 
 
 @pytest.mark.requirement("B8")

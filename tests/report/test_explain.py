@@ -19,7 +19,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.report.explain import FILTER_STATUS, SINGLE_STATUS, explain_epoch
 from railfix.run import RunOptions, run_files
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

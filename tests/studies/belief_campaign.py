@@ -50,14 +50,14 @@ from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.evaluate.cases import read_case
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations, carrier_frequency_hz
-from railfix.integrity.interference import Suspicion
+from railfix.integrity.interference import InterferenceLimits, Suspicion
 from railfix.io import read_navigation, read_observations
 from railfix.io.reference_log import read_reference
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import Result
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.run import truth_table, vehicle_table
 from railfix.simulate.scenario_file import list_scenarios, load_recipe
 from railfix.track import Track, antenna_trajectory, read_track, read_vehicle
@@ -244,7 +244,7 @@ def judged(case: Case, found: Tracked, first: int = 0) -> Judged:
     """Compare what was found with the reference."""
     place = on_line_m(found, case.trajectory)
     straight = straight_distance(place, case.reference_ecef_m, case.trajectory)
-    arc = Line.of(case.trajectory).nearest_m(found.arc_m, case.reference_arc_m)
+    arc = Line(case.trajectory).nearest_m(found.arc_m, case.reference_arc_m)
     chainage = np.abs(arc - case.reference_arc_m)
     known = np.isfinite(case.reference_ecef_m[:, 0])
     known[:first] = False
@@ -372,7 +372,7 @@ def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
     found = processor.process({"front": case.observations})[0].antennas["front"]
     known = np.isfinite(case.reference_arc_m)
     arc = np.where(known, case.reference_arc_m, 0.0)
-    tangent = Line.of(case.trajectory).at(arc)[1][:, 0]
+    tangent = Line(case.trajectory).at(arc)[1][:, 0]
     sat = found.satellites.position_ecef_m
     sight = sat - np.where(known[:, None], case.reference_ecef_m, 0.0)[:, None, :]
     sight /= np.linalg.norm(sight, axis=2, keepdims=True)
@@ -605,11 +605,14 @@ def whole_faults(
     yield "half of the sky 15 m late", "", with_fault(case, Fault("", late, nothing, nothing))
     step = 500.0 * (t >= 45.0)[:, None] * np.ones(obs.code_m.shape)
     yield "codes +500 m, all", "spoofing", with_fault(case, Fault("", step, nothing, nothing))
-    yield "off the map", "off the map", ended(case)
+    short = ended(case)
+    away = short.trajectory.nearest(case.reference_ecef_m)[1] > InterferenceLimits().off_map_m
+    left = len(np.unique(np.floor(t[away]))) > 10
+    yield "off the map" if left else "a map that ends", "off the map" if left else "", short
     up = np.asarray(case.trajectory.ecef_m) / np.linalg.norm(case.trajectory.ecef_m, axis=1, keepdims=True)
-    yield "map 100 m too high", "map", on_line(case, np.asarray(case.trajectory.ecef_m) + 100.0 * up)
+    yield "map 100 m too high", "", on_line(case, np.asarray(case.trajectory.ecef_m) + 100.0 * up)
     fall = np.where(t >= 45.0, 8.0, 0.0)[:, None]
-    yield "C/N0 8 dB lower", "jamming", replace(case, observations=replace(obs, cn0_dbhz=obs.cn0_dbhz - fall))
+    yield "C/N0 8 dB lower", "", replace(case, observations=replace(obs, cn0_dbhz=obs.cn0_dbhz - fall))
 
 
 def on_tags(case: Case, late_s: np.ndarray) -> Case:
@@ -692,6 +695,40 @@ def show_causes(case: Case, args: argparse.Namespace) -> Counter[tuple[str, str]
     right = sum(count for (cause, name), count in counts.items() if cause == name)
     print(f"{case.name}: {right} of {counts.total()} causes named right", flush=True)
     return counts
+
+
+def show_outliers(case: Case, args: argparse.Namespace) -> None:
+    """Print availability and errors by the size of the errors of one, two and three codes; 0: without these codes."""
+    random, along = np.random.default_rng(args.seed), sights(case)[0]
+    config = parse_config({"filter": "track", "elevation": {"mask_deg": args.mask[0]}, **args.settings})
+    found: dict[tuple[int, float], list[tuple[float, ...]]] = {}
+    for _, part in starts(case, args.fault_every, args.length):
+        obs, nothing = part.observations, np.zeros(part.observations.code_m.shape)
+        seen = (np.isfinite(obs.code_m) & (np.abs(along).max(axis=0) > 0.0)).mean(axis=0) > 0.8
+        names = np.unique(obs.satellite[seen])
+        for count in (k for k in (1, 2, 3) if len(names) >= 4 + k):
+            wrong = np.isin(obs.satellite, random.choice(names, count, replace=False))
+            for size in (0.0, 50.0, 200.0, 1e3, 3e5):
+                fault = Fault("", np.where(wrong, size or np.nan, 0.0) + nothing, nothing, nothing)
+                faulty = with_fault(part, fault)
+                processor = make_processor(config, faulty.navigation, {"front": faulty.trajectory})
+                result, _ = processor.process({"front": faulty.observations})
+                trial, single = judged(faulty, result.fusion["front"].tracked), result.antennas["front"]
+                error = straight_distance(single.arc_m, faulty.reference_ecef_m, faulty.trajectory)
+                shares = np.isfinite(trial.ground_level_m), trial.tracking, single.status <= Status.AMBIGUOUS
+                errors = np.nanpercentile(trial.straight_m, 95), np.nanpercentile(error, 95)
+                bad = int((over("", trial) | trial.over_ground).sum())
+                found.setdefault((count, size), []).append((*(100 * s.mean() for s in shares), *errors, bad))
+    print(f"| {case.name}: codes, off by | ground level, tracking, ok or ambiguous % | p95 filter, single m | over |")
+    print("|---|---|---|---:|")
+    for (count, size), rows in found.items():
+        ground, tracking, ok, filtered, alone, _ = np.mean(rows, axis=0)
+        text = f"{size:g} m" if size else "left out"
+        exceeded = int(sum(row[-1] for row in rows))
+        print(
+            f"| {count}, {text} | {ground:.0f}, {tracking:.0f}, {ok:.0f} | {filtered:.1f}, {alone:.1f} | {exceeded} |",
+            flush=True,
+        )
 
 
 def over(label: str, found: Judged) -> np.ndarray:
@@ -845,6 +882,7 @@ def main() -> int:
     parser.add_argument("--frequencies", choices=("one", "two"), default="one")
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--causes", action="store_true", help="faults of whole trials: cause put in against named")
+    parser.add_argument("--outliers", action="store_true", help="errors of one to three codes, by their size")
     parser.add_argument("--only", default="", help="with --causes or --faults: kinds with this in their name alone")
     parser.add_argument("--pairs", type=int, default=0, help="with --faults: so many pairs in their place")
     parser.add_argument("--fault-every", type=float, default=90.0)
@@ -857,7 +895,7 @@ def main() -> int:
     given = "\n".join(args.sets)
     args.settings = {"frequencies": args.frequencies} | ({"tracking": tomllib.loads(given)} if given else {})
     known = cases(paths.DATA) if paths.DATA.is_dir() else {}
-    if not (args.faults or args.causes):
+    if not (args.faults or args.causes or args.outliers):
         print(HEAD)
     named: Counter[tuple[str, str]] = Counter()
     for name in args.folders or list(known):
@@ -868,7 +906,9 @@ def main() -> int:
         case = case.part(0, len(case.observations.time), args.thin) if args.thin > 1 else case
         if args.whole:
             show_whole(case, args)
-        if args.causes:
+        if args.outliers:
+            show_outliers(case, args)
+        elif args.causes:
             named += show_causes(case, args)
         elif args.faults:
             show_faults(case, args)

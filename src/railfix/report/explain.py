@@ -23,7 +23,7 @@ from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
 from railfix.core.tables import reading_table
 from railfix.core.timescale import gps_time
-from railfix.evaluate.inputs import RunFolder, read_run
+from railfix.evaluate.evaluation_inputs import RunFolder, read_run
 from railfix.report.charts_page import read_template
 from railfix.track import Trajectory, read_track
 

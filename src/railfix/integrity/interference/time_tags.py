@@ -26,7 +26,7 @@ _ROUNDS: Final = 2  #: Fits of each step, with the weights by the residuals befo
 _FITS_WELL: Final = 3.0  #: Residuals up to this multiple of the median have full weight.
 _SHOWN: Final = 3.0  #: Errors from this many standard deviations on are tested against the other hypotheses.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's position across and above its line.
-_LEAST_FREEDOM: Final = 2  #: Redundant ranges that agree on an error at least.
+_LEAST_FREEDOM: Final = 3  #: Redundant ranges that agree on an error at least.
 #: Residuals up to this many standard deviations agree; larger ones cost no more. An error of the time tags takes one
 #: bad code in by itself, so that it has to cost less by more than one of these squared.
 _AGREES: Final = 5.0
@@ -63,35 +63,36 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     agree, and the residuals cost clearly less than those without an error and without the named satellites: of both
     the squares of all codes and of the line, each of `_AGREES` at most.
     """
-    every, start = inputs.used | inputs.named, _TagFit(np.zeros(len(inputs.time)), *[inputs.near_ecef_m] * 3)
-    error, sigma, place, _ = _fit(inputs, every, start, tags=True, line=False)
+    near, every = inputs.near_ecef_m, inputs.used | inputs.named
+    error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)
     shown = np.flatnonzero(np.isfinite(error) & (inputs.doubted | (np.abs(error) > _SHOWN * sigma)))
-    if not len(shown):
-        return error, sigma
-    part, every, start = (
-        inputs.take(shown),
-        every[shown],
-        start._replace(error_s=error[shown], place_ecef_m=place[shown]),
-    )
-    found = _fit(part, every, start, tags=True, line=True)
-    other = start._replace(error_s=np.zeros(len(shown)), place_ecef_m=part.near_ecef_m)
-    without = _fit(part, part.used, other, tags=False, line=True).residual
-    # without a redundant range the remaining ones fit in any case
-    without = np.where(np.isnan(without), np.where(_with_line(part.named, False), np.inf, 0.0), without)
-    rows = _with_line(every, True)
-    # noise of this fit, not that of the receiver, which would include an error of the tags
-    noise = np.maximum(masked_median(found.residual, rows) / _NORMAL_MEDIAN, 1.0)[:, None]
-    costs = [np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, found.residual)]
-    unknowns = 4 + (clock_columns(part) * every[..., None]).any(axis=1).sum(axis=1)
-    proven = (rows & (costs[1] < _AGREES**2)).sum(axis=1) - unknowns >= _LEAST_FREEDOM
-    proven &= costs[0].sum(axis=1) - costs[1].sum(axis=1) > _CLEARLY_LESS
-    error[shown], sigma[shown] = found.error_s, np.where(proven, found.sigma_s, np.inf)
+    if len(shown):
+        part = inputs.take(shown)
+        found = _fit(part, every[shown], error[shown], place[shown], tags=True, line=True)
+        other = _fit(part, part.used, np.zeros(len(shown)), near[shown], tags=False, line=True)
+        error[shown] = found.error_s
+        sigma[shown] = np.where(_explains_more(part, found.residual, other.residual), found.sigma_s, np.inf)
     return error, sigma
 
 
-def _fit(inputs: MotionInputs, counted: Masks, start: _TagFit, *, tags: bool, line: bool) -> _TagFit:
+def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) -> Masks:
+    """Return whether an error of the time tags explains clearly more than bad codes do, by both residuals; (T,)."""
+    every = inputs.used | inputs.named
+    rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
+    # without a redundant range the remaining ones fit in any case, and the named ones do not
+    without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
+    # noise of this fit, at most that of the receiver, which would include an error of the tags
+    noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
+    before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
+    freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
+    return np.asarray((freedom >= _LEAST_FREEDOM) & ((before - after).sum(axis=1) > _CLEARLY_LESS))
+
+
+def _fit(
+    inputs: MotionInputs, counted: Masks, late_s: Floats, place_ecef_m: Floats, *, tags: bool, line: bool
+) -> _TagFit:
     """Return positions by the codes that are `counted` (T, K), with an error of the `tags`, and near the `line`."""
-    rows, place, late = np.arange(len(inputs.time)), start.place_ecef_m.copy(), start.error_s.copy()
+    rows, late, place = np.arange(len(late_s)), late_s.copy(), place_ecef_m.copy()
     sigma, residual = np.full(len(rows), np.nan), np.full((len(rows), counted.shape[1] + 2), np.nan)
     for _ in range(_STEPS):
         moved = _move_satellites(inputs.take(rows), late[rows])._replace(near_ecef_m=place[rows])
@@ -100,8 +101,7 @@ def _fit(inputs: MotionInputs, counted: Masks, start: _TagFit, *, tags: bool, li
         rate = -(sight * moved.sat_velocity_mps).sum(axis=2, keepdims=True) / _RATE_MPS
         columns = -sight, rate * tags, np.broadcast_to(clocks, (len(near), *clocks.shape))
         point, axes = moved.nearest_on_lines() if line else (near, np.zeros((len(near), 2, 3)))
-        of_line = np.zeros((len(near), 2, 4 + clocks.shape[1]))
-        of_line[..., :3] = axes
+        of_line = np.concatenate([axes, np.zeros((len(near), 2, 1 + clocks.shape[1]))], axis=2)
         step, of_error, left = _fit_robustly(
             np.concatenate([np.concatenate(columns, axis=2), of_line], axis=1),
             np.concatenate([misfit, np.einsum("tij,tj->ti", axes, point - near)], axis=1),
@@ -110,8 +110,7 @@ def _fit(inputs: MotionInputs, counted: Masks, start: _TagFit, *, tags: bool, li
         )  # fmt: skip
         late[rows], place[rows] = late[rows] + step[:, 3] / _RATE_MPS, near + step[:, :3]
         sigma[rows], residual[rows] = of_error / _RATE_MPS, left
-        again = (np.abs(step[:, 3]) > _SETTLED_S * _RATE_MPS) | (np.linalg.norm(step[:, :3], axis=1) > _SETTLED_M)
-        rows = rows[again]
+        rows = rows[(np.abs(step[:, 3]) > _SETTLED_S * _RATE_MPS) | (np.linalg.norm(step[:, :3], axis=1) > _SETTLED_M)]
         if not len(rows):
             break
     return _TagFit(late, sigma, place, residual)
