@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
+from starlette.applications import Starlette
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
@@ -207,15 +208,8 @@ async def run_centre(
     check_keys(keys, "centre")
     database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
     gc.set_threshold(*COLLECTION)
-    end, terminated = asyncio.Event(), asyncio.Event()
+    end, terminated = _handle_signals()
     loop = asyncio.get_running_loop()
-
-    def terminate() -> None:
-        terminated.set()
-        end.set()
-
-    loop.add_signal_handler(signal.SIGINT, end.set)
-    loop.add_signal_handler(signal.SIGTERM, terminate)
     with Store(database, most_lines=settings.log_lines) as store:
         store.take_charge()
         _check_line(settings, store, path)
@@ -234,13 +228,9 @@ async def run_centre(
         apps = {page: page_app(snapshot, {} if orders else given, sessions=sessions)}
         if orders is not None:
             apps[orders] = page_app(snapshot, given, sessions=sessions)
-        servers: list[PageServer] = []
         try:
             await links.start()
-            for address, app in apps.items():
-                loopback = address[0] == "localhost" or _is_loopback(address[0])
-                certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
-                servers.append(PageServer(app, host=address[0], port=address[1], certificate=certificate))
+            servers = _create_pages(apps, keys)
         except OSError as error:
             await links.stop()
             raise SettingsError(f"{path}: {error.strerror}") from None
@@ -270,6 +260,29 @@ async def run_centre(
             "reports rejected": dict(control.rejected),
             "frames rejected": {threat.value: n for threat, n in sorted(links.threats().items(), key=str) if n},
         }
+
+
+def _handle_signals() -> tuple[asyncio.Event, asyncio.Event]:
+    """Return the event that SIGINT and SIGTERM set, and the one that SIGTERM alone sets."""
+    loop, end, terminated = asyncio.get_running_loop(), asyncio.Event(), asyncio.Event()
+
+    def terminate() -> None:
+        terminated.set()
+        end.set()
+
+    loop.add_signal_handler(signal.SIGINT, end.set)
+    loop.add_signal_handler(signal.SIGTERM, terminate)
+    return end, terminated
+
+
+def _create_pages(apps: Mapping[tuple[str, int], Starlette], keys: Path) -> list[PageServer]:
+    """Return the servers of the pages by address, beyond loopback addresses by TLS; OSError where one is in use."""
+    servers = []
+    for (host, port), app in apps.items():
+        loopback = host == "localhost" or _is_loopback(host)
+        certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
+        servers.append(PageServer(app, host=host, port=port, certificate=certificate))
+    return servers
 
 
 def _centre(

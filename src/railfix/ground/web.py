@@ -137,6 +137,19 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     async def events(_: Request) -> Response:
         return StreamingResponse(stream(), media_type="text/event-stream", headers=_HEADERS)
 
+    return Starlette(
+        routes=[
+            Route("/", page),
+            Route("/state", state),
+            Route("/events", events),
+            *_order_routes(orders, sessions),
+        ]
+    )
+
+
+def _order_routes(orders: dict[str, Order], sessions: Sessions) -> list[Route]:
+    """Return the addresses of sessions and of orders."""
+
     async def login(request: Request) -> Response:
         values, address = await _values(request), "" if request.client is None else request.client.host
         token = (
@@ -168,16 +181,11 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
         reason = given(values, sessions.name_of(token))
         return _answer({"refused": reason}, 200 if reason is None else 409)
 
-    return Starlette(
-        routes=[
-            Route("/", page),
-            Route("/state", state),
-            Route("/events", events),
-            Route("/login", login, methods=["POST"]),
-            Route("/logout", logout, methods=["POST"]),
-            Route("/orders/{name}", order, methods=["POST"]),
-        ]
-    )
+    return [
+        Route("/login", login, methods=["POST"]),
+        Route("/logout", logout, methods=["POST"]),
+        Route("/orders/{name}", order, methods=["POST"]),
+    ]
 
 
 def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:

@@ -19,7 +19,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import OutputError, SettingsError
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
-from railfix.live.console import PlaceWatch, SensorWatch, SessionLog, check_log_file, serve_metrics
+from railfix.live.console import Metrics, PlaceWatch, SensorWatch, SessionLog, check_log_file, serve_metrics
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import TABLES
 from railfix.live.session import Hooks, run_session
@@ -168,23 +168,28 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
             )
         )
 
-        def hung_up() -> None:
-            metrics.hangups += 1
-            log.say("SIGHUP: nothing is reloaded; settings, map and vehicle are those of the start; restart to change")
-
-        loop, terminated = asyncio.get_running_loop(), False
-
-        def terminate() -> None:
-            nonlocal terminated
-            terminated = True
-            session.cancel()
-
-        loop.add_signal_handler(signal.SIGINT, session.cancel)
-        loop.add_signal_handler(signal.SIGTERM, terminate)
-        loop.add_signal_handler(signal.SIGHUP, hung_up)
+        terminated = _handle_signals(session, metrics, log)
         with contextlib.suppress(asyncio.CancelledError):
             await session
-    return metrics.summary(), terminated
+    return metrics.summary(), terminated.is_set()
+
+
+def _handle_signals(session: asyncio.Task[Metrics], metrics: Metrics, log: SessionLog) -> asyncio.Event:
+    """Let SIGINT and SIGTERM end a session, and SIGHUP be logged; return the event that SIGTERM sets."""
+    loop, terminated = asyncio.get_running_loop(), asyncio.Event()
+
+    def hung_up() -> None:
+        metrics.hangups += 1
+        log.say("SIGHUP: nothing is reloaded; settings, map and vehicle are those of the start; restart to change")
+
+    def terminate() -> None:
+        terminated.set()
+        session.cancel()
+
+    loop.add_signal_handler(signal.SIGINT, session.cancel)
+    loop.add_signal_handler(signal.SIGTERM, terminate)
+    loop.add_signal_handler(signal.SIGHUP, hung_up)
+    return terminated
 
 
 def _hooks(
