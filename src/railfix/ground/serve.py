@@ -9,13 +9,12 @@ import ipaddress
 import json
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
-from starlette.applications import Starlette
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
@@ -208,8 +207,15 @@ async def run_centre(
     check_keys(keys, "centre")
     database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
     gc.set_threshold(*COLLECTION)
-    end, terminated = _handle_signals()
+    end, terminated = asyncio.Event(), asyncio.Event()
     loop = asyncio.get_running_loop()
+
+    def terminate() -> None:
+        terminated.set()
+        end.set()
+
+    loop.add_signal_handler(signal.SIGINT, end.set)
+    loop.add_signal_handler(signal.SIGTERM, terminate)
     with Store(database, most_lines=settings.log_lines) as store:
         store.take_charge()
         _check_line(settings, store, path)
@@ -228,9 +234,13 @@ async def run_centre(
         apps = {page: page_app(snapshot, {} if orders else given, sessions=sessions)}
         if orders is not None:
             apps[orders] = page_app(snapshot, given, sessions=sessions)
+        servers: list[PageServer] = []
         try:
             await links.start()
-            servers = _create_pages(apps, keys)
+            for address, app in apps.items():
+                loopback = address[0] == "localhost" or _is_loopback(address[0])
+                certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
+                servers.append(PageServer(app, host=address[0], port=address[1], certificate=certificate))
         except OSError as error:
             await links.stop()
             raise SettingsError(f"{path}: {error.strerror}") from None
@@ -238,16 +248,7 @@ async def run_centre(
             await server.start()
             announce(server.url)
         try:
-            work = asyncio.create_task(_work(control, field_points))
-            ending = asyncio.create_task(end.wait())
-            judging = asyncio.create_task(_judge(control, settings, path))
-            await asyncio.wait([work, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
-            if work.done():
-                work.result()
-            for task in (work, ending, judging):
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
+            await _run_until(end, _work(control, field_points), _judge(control, settings, path), for_s=for_s)
         finally:
             done = True
             await links.stop()
@@ -262,27 +263,18 @@ async def run_centre(
         }
 
 
-def _handle_signals() -> tuple[asyncio.Event, asyncio.Event]:
-    """Return the event that SIGINT and SIGTERM set, and the one that SIGTERM alone sets."""
-    loop, end, terminated = asyncio.get_running_loop(), asyncio.Event(), asyncio.Event()
-
-    def terminate() -> None:
-        terminated.set()
-        end.set()
-
-    loop.add_signal_handler(signal.SIGINT, end.set)
-    loop.add_signal_handler(signal.SIGTERM, terminate)
-    return end, terminated
-
-
-def _create_pages(apps: Mapping[tuple[str, int], Starlette], keys: Path) -> list[PageServer]:
-    """Return the servers of the pages by address, beyond loopback addresses by TLS; OSError where one is in use."""
-    servers = []
-    for (host, port), app in apps.items():
-        loopback = host == "localhost" or _is_loopback(host)
-        certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
-        servers.append(PageServer(app, host=host, port=port, certificate=certificate))
-    return servers
+async def _run_until(
+    end: asyncio.Event, work: Coroutine[Any, Any, None], judge: Coroutine[Any, Any, None], *, for_s: float | None
+) -> None:
+    """Run the centre's tasks until the event, the end of `work`, or for a time; an error of `work` is raised."""
+    working, ending, judging = (asyncio.create_task(each) for each in (work, end.wait(), judge))
+    await asyncio.wait([working, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
+    if working.done():
+        working.result()
+    for task in (working, ending, judging):
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
 
 
 def _centre(
