@@ -12,6 +12,8 @@ This example calls them one by one for one antenna, so that you can replace any 
 # -----------------------------------
 
 import dataclasses
+import os
+import pathlib
 
 import numpy as np
 
@@ -67,12 +69,20 @@ int(raim.excluded.any(axis=1).sum()), float(np.nanmedian(level.level_m))
 # The stages are compared with the pipeline for two and for four constellations, and for a navigation file without
 # ionospheric coefficients. In that case typical coefficients are used, with a standard deviation larger by 2 m.
 
+# A recording is compared as well if the environment variable ``RECORDING`` names its folder, with ``log.obs``,
+# ``log.nav`` and the antenna's path as ``path.csv``.
+
 silent = dataclasses.replace(navigation, klobuchar={})
 cases = {
     "GPS and QZSS": (log, navigation, line, ("G", "J")),
     "four constellations": (log, navigation, line, ("G", "J", "E", "C")),
     "without ionosphere": (log, silent, line, ("G", "J", "E", "C")),
 }
+if "RECORDING" in os.environ:
+    folder = pathlib.Path(os.environ["RECORDING"])
+    path = railfix.Trajectory.from_antenna_path(railfix.read_track(folder / "path.csv"))
+    recorded = railfix.read_observations(folder / "log.obs"), railfix.read_navigation(folder / "log.nav")
+    cases["recording"] = (*recorded, path, ("G", "J", "E", "C"))
 compared = {}
 for name, (own_log, own_navigation, own_line, systems) in cases.items():
     config = railfix.Config(systems=systems, screens=("elevation",), filter="off")
@@ -80,7 +90,7 @@ for name, (own_log, own_navigation, own_line, systems) in cases.items():
     result, _ = processor.process({"front": own_log})
     compared[name] = positions_by_hand(own_log, own_navigation, own_line, systems)[1], result["front"]
 {
-    name: float(np.nanmax(np.abs(fix.constrained.arc_m - found.constrained.arc_m)))
+    name: float(np.nanmax(np.abs(fix.constrained.arc_m - found.fix.constrained.arc_m)))
     for name, (fix, found) in compared.items()
 }
 

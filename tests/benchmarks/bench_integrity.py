@@ -40,7 +40,7 @@ from railfix.ranges.error_model import ErrorModel, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fit_bins
 from railfix.ranges.sbas import SbasCorrections, read_sbas
 from railfix.run.driver import RunOptions
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -149,7 +149,7 @@ def parts_of_sbas(log: Log, rounds: int) -> None:
         spent: dict[str, float] = {}
         for first in range(0, len(result), size):
             rows = slice(first, first + size)
-            when, at = result.time[rows], result.satellites.position_ecef_m[rows]
+            when, at = result.time[rows], result.corrected.satellites.position_ecef_m[rows]
             here = np.broadcast_to(place, (len(when), 3))
             elevation, azimuth = elevation_azimuth(at, here)
             sight = (at - place) / np.linalg.norm(at - place, axis=-1, keepdims=True)

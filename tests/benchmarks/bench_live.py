@@ -29,7 +29,7 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies"))
 import paths
 import belief_campaign
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 
 
 def main() -> int:

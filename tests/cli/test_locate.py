@@ -15,10 +15,10 @@ from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.io.positions import read_positions
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import locate
 from railfix.pipeline.received import known_from_start
+from railfix.pipeline.without_map import locate
 from railfix.run.locate import reasons_text, solution_text
 
 pytestmark = pytest.mark.requirement("A6")

@@ -32,9 +32,9 @@ from railfix.evaluate import (
     evaluate_run,
     evaluate_runs,
 )
-from railfix.evaluate.epochs import distance_travelled, with_missing
-from railfix.evaluate.figures import block_limits
-from railfix.evaluate.inputs import list_position_tables, read_sections
+from railfix.evaluate.accuracy import block_limits
+from railfix.evaluate.epoch_table import distance_travelled, with_missing
+from railfix.evaluate.evaluation_inputs import list_position_tables, read_sections
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.io.reference_log import AntennaReference
 from railfix.run import run_files

@@ -18,7 +18,7 @@ import recordings_score
 from railfix.evaluate import Score, along_track_error, interpolate_reference
 from railfix.io import read_observations
 from railfix.io.positions import read_positions
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 
 
 def hold(found: Score, *, rate: float, p50_m: float, p95_m: float, wrong_place: float) -> None:

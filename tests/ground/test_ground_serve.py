@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import json
 import random
+import shutil
 import signal
 import socket
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import time
+import urllib.request
 from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -22,8 +25,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from postgresql_server import Server
 from railfix.cli.ground import app
-from railfix.ground.authority import Authority
+from railfix.ground.authority import Authority, BrakeOrder
 from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.field import SimulatedPoints
@@ -38,6 +42,7 @@ from railfix.ground.traffic import SimulatedTrain, line_with_loops
 from railfix.ground.train import run_train
 from railfix.ground.triangle import MonitorLimits, TriangleVerdict
 from railfix.io.train_message import MessageStatus, SuspectedInterference, encode, to_json
+from test_ground_demo import Browser
 
 pytestmark = pytest.mark.requirement("F2")
 
@@ -496,6 +501,80 @@ def test_a_database_that_fails_is_an_alarm(
     told = [text for _, _, text in control.store.log()]
     assert "train 1: heard" in told
     assert "the database is written again" in control.lines[-1]
+
+
+@pytest.mark.slow
+def test_postgresql_that_hangs_is_an_alarm_and_holds_up_no_order(folder: Path, tmp_path: Path) -> None:
+    """Its processes are stopped (SIGSTOP): the page has the alarm within 2 s, and goes on; an order to stop leaves."""
+    pytest.importorskip("psycopg")
+    if not list(Path("/usr/lib/postgresql").glob("*/bin")):
+        pytest.skip("no PostgreSQL is installed in /usr/lib/postgresql")
+    place = Path(tempfile.mkdtemp())
+    server = Server(place)
+    text = (folder / "line.toml").read_text().replace('"keys"', f'"{folder / "keys"}"')
+    (tmp_path / "line.toml").write_text(f'database = "{Server.ADDRESS}"\n{text}')
+    (tmp_path / "password").write_text("secret\n")
+    (tmp_path / "password").chmod(0o600)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "railfix", "ground", "centre", str(tmp_path / "line.toml"), "--page", "127.0.0.1:0",
+         "--password", str(tmp_path / "password"), "--for", "60"], stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    browser = Browser(process.stdout.readline().split()[-1])
+
+    def state() -> tuple[dict[str, Any], float]:
+        """The values of the page, and how long they took."""
+        begin = time.monotonic()
+        with urllib.request.urlopen(browser.url + "state", timeout=5.0) as answer:
+            return json.load(answer), time.monotonic() - begin
+
+    def wait(alarm: bool, most_s: float) -> float:
+        """How long it takes until the page has the alarm of the database, or has it no more."""
+        begin, longest_s = time.monotonic(), 0.0
+        while time.monotonic() - begin < most_s:
+            values, took_s = state()
+            longest_s = max(longest_s, took_s)
+            if any("the database has not answered" in text for text in values["alarms"]) == alarm:
+                assert longest_s < 0.5
+                return time.monotonic() - begin
+            time.sleep(0.05)
+        raise AssertionError(values["alarms"])
+
+    async def order_to_stop() -> str:
+        """What reaches the train, which had an authority, once the database hangs."""
+        came: asyncio.Queue[Authority] = asyncio.Queue()
+        links = TrainLinks(
+            1, folder / "keys", create_bearers(addresses(folder), LOCAL),
+            received=lambda payload: came.put_nowait(Authority.decode(payload)),
+        )  # fmt: skip
+        await links.start()
+        try:
+            placed = SimulatedTrain(number=1, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0))
+            links.send(encode(placed.message(0.0)))
+            assert not (await asyncio.wait_for(came.get(), 20.0)).stopped
+            server.hang()
+            assert await asyncio.to_thread(wait, alarm=True, most_s=5.0) < 2.0
+            begin = time.monotonic()
+            assert await asyncio.to_thread(browser.post, "orders/stop-all") == (200, None)
+            assert time.monotonic() - begin < 0.5
+            while not isinstance(order := await asyncio.wait_for(came.get(), 2.0), BrakeOrder):
+                pass
+            return order.reason
+        finally:
+            await links.stop()
+
+    try:
+        assert browser.post("login", {"password": "secret"}) == (200, None)
+        assert asyncio.run(order_to_stop()) == "stopped by hand"
+        server.go_on()
+        wait(alarm=False, most_s=15.0)
+        assert "the database is written again" in " ".join(state()[0]["log"])
+    finally:
+        server.go_on()
+        process.terminate()
+        process.communicate()
+        server.kill()
+        shutil.rmtree(place)
 
 
 def test_a_centre_counts_what_does_not_count(centre: tuple[ControlCentre, list[Authority], list[float]]) -> None:

@@ -12,9 +12,9 @@ import polars as pl
 from railfix.gnss.observations import Observations
 from railfix.live.stream import single_epochs
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
+from railfix.pipeline.result_tables import observations_table, passing_table, positions_table, train_table
 from railfix.pipeline.results import Result
-from railfix.pipeline.state import State
-from railfix.pipeline.tables import observations_table, passing_table, positions_table, train_table
 
 TABLES = {
     "positions": (positions_table, ("time_gpst", "antenna")),

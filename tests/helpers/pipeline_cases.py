@@ -6,7 +6,7 @@ import atexit
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -19,8 +19,8 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.simulate import Scenario, write_run
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
@@ -120,17 +120,26 @@ def in_pieces(
     }, state
 
 
-#: What belongs to the channels of a log or to the settings, not to its epochs.
-NO_EPOCHS = {"satellite", "signal", "columns", "clocks", "kind", "basis"}
+#: What belongs to the channels of a log, the line or the settings, not to its epochs.
+NO_EPOCHS = {
+    "satellite", "signal", "columns", "kind", "basis", "channels", "frequency_hz", "observations", "trajectory",
+    "geodetic",
+}  # fmt: skip
+
+
+def members(value: Any) -> dict[str, Any]:
+    """Fields of a dataclass; of a result also what tables show of it."""
+    names = [item.name for item in fields(value)]
+    if isinstance(value, AntennaResult):
+        shown = [(n, v) for kind in type(value).__mro__ for n, v in vars(kind).items() if not n.startswith("_")]
+        names += [name for name, item in shown if isinstance(item, property | cached_property)]
+    return {name: getattr(value, name) for name in names}
 
 
 def flat(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
     """Every array of a result that has epochs on its first axis, by its dotted name."""
     found: dict[str, np.ndarray] = {}
-    if isinstance(value, Mapping):
-        items = list(value.items())
-    else:
-        items = [(item.name, getattr(value, item.name)) for item in fields(value)]
+    items = (value if isinstance(value, Mapping) else members(value)).items()
     for name, inner in items:
         if name in NO_EPOCHS or inner is None or isinstance(inner, float):
             continue

@@ -9,7 +9,7 @@ import numpy as np
 import synthetic
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.integrity.raim import LinearModel, linear_model
-from railfix.integrity.raim.model import _model
+from railfix.integrity.raim.position_model import _model
 from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
 from railfix.positioning.range_arrays import InterSystemBiases, Ranges
 from railfix.ranges.channels import clock_groups

@@ -17,8 +17,8 @@ from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.state import State
-from railfix.run.processor import make_processor
+from railfix.pipeline.processor_state import State
+from railfix.run.processor_setup import make_processor
 from railfix.run.sensors import read_listed_balises, read_sensors, read_units
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table

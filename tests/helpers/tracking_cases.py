@@ -62,7 +62,7 @@ class Ride:
 
     @property
     def line(self) -> Line:
-        return Line.of(self.trajectory)
+        return Line(self.trajectory)
 
 
 def ride(
@@ -83,7 +83,7 @@ def ride(
     speed = speed_mps(t)
     whole = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) / rate_hz)])
     arc = start_m + whole
-    line = Line.of(trajectory)
+    line = Line(trajectory)
     place, axes = line.at(arc)
     enu = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
     azimuth, elevation = np.radians(np.array(list(SKY.values()))).T

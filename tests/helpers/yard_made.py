@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases
-from railfix.positioning.which_track import (
+from railfix.positioning.track_choice import (
     StandstillErrors,
     StandstillFix,
     YardTrack,

@@ -24,7 +24,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -102,9 +102,9 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
     assert result.protection is not None
     level = result.protection.level.level_m * (1.0 if local_prior else 0.3)
     ranges = ranges_of(result)
-    rows = np.flatnonzero(np.isfinite(level) & np.isfinite(result.arc_m) & (result.section.excess > 10.83))[::15]
-    ranges, level, arc = ranges.take(rows), level[rows], result.constrained.arc_m[rows]
-    section = result.constrained.section[rows]
+    rows = np.flatnonzero(np.isfinite(level) & np.isfinite(result.arc_m) & (result.fix.section.excess > 10.83))[::15]
+    ranges, level, arc = ranges.take(rows), level[rows], result.fix.constrained.arc_m[rows]
+    section = result.fix.constrained.section[rows]
     systems = [name[0] for name in result.satellite[result.columns].tolist()]
     model = linear_model(ranges, line, arc, section=section)
     scale = np.maximum(result.noise_scale[rows], 1.0)
@@ -149,13 +149,14 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
         .antennas["front"]
     )
     assert result.protection is not None
-    level, arc = share * result.protection.level.level_m, result.constrained.arc_m
-    model = linear_model(ranges_of(result), path, arc, section=np.maximum(result.constrained.section, 0))
+    level, arc = share * result.protection.level.level_m, result.fix.constrained.arc_m
+    model = linear_model(ranges_of(result), path, arc, section=np.maximum(result.fix.constrained.section, 0))
     systems = [name[0] for name in result.satellite[result.columns].tolist()]
     scale, rows = np.maximum(result.noise_scale, 1.0), np.flatnonzero(np.isfinite(level))
     columns = result.columns
     right = (
-        np.sin(np.radians(result.azimuth_deg[:, columns] - path.heading_deg[result.constrained.section][:, None])) > 0
+        np.sin(np.radians(result.azimuth_deg[:, columns] - path.heading_deg[result.fix.constrained.section][:, None]))
+        > 0
     )
     low = result.elevation_deg[:, columns] < 45.0
     sides = np.stack([low & ~right, low & right], axis=1)

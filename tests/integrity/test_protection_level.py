@@ -23,7 +23,7 @@ from railfix.integrity.protection import (
     availability,
     protection_level,
 )
-from railfix.integrity.protection.level import MapDeviation, RangeBounds
+from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, linear_model
 from railfix.positioning.range_arrays import UNTIED_M
 from raim_cases import point_model

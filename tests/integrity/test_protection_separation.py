@@ -16,7 +16,7 @@ import raim_cases
 import raim_oracle as oracle
 from railfix import kernels
 from railfix.integrity.protection import RiskBudget, protection_level
-from railfix.integrity.protection.level import Asked, Errors, MapDeviation, RangeBounds
+from railfix.integrity.protection.solution_separation import Asked, Errors, MapDeviation, RangeBounds
 from railfix.integrity.raim import linear_model
 from railfix.positioning.range_arrays import UNTIED_M, Ranges
 

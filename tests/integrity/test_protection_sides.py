@@ -13,7 +13,7 @@ import protection_oracle
 import raim_cases
 import raim_oracle as oracle
 from railfix.integrity.protection import Cause, RiskBudget, protection_level
-from railfix.integrity.protection.level import MapDeviation, RangeBounds
+from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import linear_model
 
 pytestmark = pytest.mark.requirement("C2")

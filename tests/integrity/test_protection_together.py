@@ -11,7 +11,7 @@ import raim_cases
 import raim_oracle as oracle
 from railfix.core.geodesy import range_with_rotation
 from railfix.integrity.protection import RiskBudget, protection_level, risk
-from railfix.integrity.protection.level import MapDeviation
+from railfix.integrity.protection.solution_separation import MapDeviation
 from railfix.integrity.raim import linear_model
 from railfix.positioning.range_arrays import Ranges
 

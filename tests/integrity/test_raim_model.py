@@ -14,7 +14,7 @@ import raim_oracle as oracle
 import synthetic
 from railfix import kernels
 from railfix.integrity.raim import linear_model
-from railfix.integrity.raim.model import _model, compact
+from railfix.integrity.raim.position_model import _model, compact
 from railfix.positioning.normal_equations import point_position, position_on_line
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases
 from raim_cases import point_model

@@ -21,7 +21,7 @@ from railfix.integrity.raim import (
     noncentrality,
     reliability,
 )
-from railfix.integrity.raim.model import compact
+from railfix.integrity.raim.position_model import compact
 from railfix.io import read_observations
 from railfix.positioning.normal_equations import Constrained, position_on_line
 from railfix.positioning.range_arrays import Ranges
@@ -66,13 +66,13 @@ def station(request: pytest.FixtureRequest, recordings: Path) -> Station:
     used = result.reason[:, columns] == 0
     place = read_observations(recordings / "static" / "rtklib_geonet2005" / f"{name}0920.05o").header
     ranges = Ranges(
-        sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, 2.6e7),
+        sat_ecef_m=np.where(used[..., None], result.corrected.satellites.position_ecef_m, 2.6e7),
         code_m=np.where(used, result.corrected_code_m[:, columns], 0.0),
         weight=np.where(used, 1.0 / result.sigma_m[:, columns] ** 2, 0.0),
         groups=clock_groups([str(s)[0] for s in result.satellite[columns]]),
     )
     return Station(
-        place.approximate_ecef_m, trajectory, ranges, result.constrained, result.single_point.ecef_m, result.noise_scale
+        place.approximate_ecef_m, trajectory, ranges, result.fix.constrained, result.point.ecef_m, result.noise_scale
     )
 
 

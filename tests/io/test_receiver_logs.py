@@ -19,11 +19,12 @@ import railfix
 import ubx_made
 from pipeline_cases import demo_observations
 from railfix.cli import app
+from railfix.core.checksums import crc24q
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
-from railfix.io.receiver.framing import crc24q, find_frames
+from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.measurements import Tracking, join_observations
 from ubx_made import log_of

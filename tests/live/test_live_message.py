@@ -27,8 +27,8 @@ from railfix.motion.samples import RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.motion.slip import MotionState
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import Result
-from railfix.pipeline.state import State
 from railfix.simulate.demonstration import demo_files
 from railfix.tracking import Kind, TrackStatus
 

@@ -30,8 +30,8 @@ from railfix.live.stream import FOREVER, Sensed, SensorLines
 from railfix.motion.samples import SENSORS, BaliseReadings, RadarSpeeds, SensorSamples, StationRanges
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.state import State
-from railfix.run.processor import make_processor
+from railfix.pipeline.processor_state import State
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.run import vehicle_table
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 from railfix.tracking import Kind

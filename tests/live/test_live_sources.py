@@ -384,7 +384,7 @@ def test_an_epoch_without_its_last_message_does_not_hold_up_the_stream() -> None
 
 def msm7(tow_ms: np.ndarray, *, more: bool = False) -> bytes:
     """RTCM 3 messages 1077 of four satellites, one signal each."""
-    from railfix.io.receiver.framing import crc24q
+    from railfix.core.checksums import crc24q
 
     out = b""
     for k, tow in enumerate(tow_ms.tolist()):

@@ -25,7 +25,7 @@ from railfix.live.settings import LiveSettings
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.stream import Sensed, single_epochs
 from railfix.motion.samples import RadarSpeeds, SensorSamples
-from railfix.pipeline.state import State
+from railfix.pipeline.processor_state import State
 from railfix.simulate.demonstration import demo_files
 from ubx_made import log_of
 

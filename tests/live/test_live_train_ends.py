@@ -22,7 +22,7 @@ from railfix.live.forms import cbor_bytes, forms, json_bytes
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
 from railfix.live.train_ends import CHANGED_ENDS_M, RunningEnd, TrainFrame
-from railfix.pipeline.state import State
+from railfix.pipeline.processor_state import State
 from railfix.simulate.demonstration import demo_files
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import AntennaOffset, Vehicle

@@ -44,7 +44,7 @@ def test_way_by_the_radar_is_free_of_a_periodic_pitch() -> None:
 def gated(measured_m: np.ndarray, unit_arc_m: np.ndarray, *, place_m: float, sigma_m: float) -> np.ndarray:
     """Which ranges to units 3 m beside a straight line the filter keeps, whose place is `place_m` to 1 cm."""
     ecef = np.array([6.378e6, 0.0, 0.0]) + np.array([[0.0, 0.0, 0.0], [0.0, 400.0, 0.0]])
-    line = Line.of(Trajectory.from_antenna_path(Track.from_ecef(ecef)))
+    line = Line(Trajectory.from_antenna_path(Track.from_ecef(ecef)))
     point, axes = line.at(unit_arc_m)
     time = np.array(["2024-03-05T00:00:00"], dtype="datetime64[ns]")
     ranges = RangeEpochs(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import is_dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -13,21 +13,22 @@ import numpy as np
 import pytest
 
 import integrity_tables
+from pipeline_cases import NO_EPOCHS, members
 from railfix.core.epoch_rows import EVERY, join_epochs, take_epochs
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline import processor as processing
-from railfix.pipeline.antennas import filter_verdicts, position_verdicts
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import Models, correct_ranges
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
+from railfix.pipeline.screen_stage import screen_filtered, screen_positions
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.error_model import ErrorModel
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.screens import FilteredMotion, PairedEpochs, Screened
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
@@ -124,17 +125,14 @@ def _values(result: AntennaResult, name: str, channels: list[tuple[str, str]]) -
 def _assert_same(parts: list[AntennaResult], expected: AntennaResult) -> None:
     """Results epoch by epoch are those of a whole log."""
     keys = list(zip(expected.satellite.tolist(), expected.signal.tolist(), strict=True))
-    for item in fields(AntennaResult):
-        values = getattr(expected, item.name)
-        if item.name in ("satellite", "signal", "columns", "clock_offset_m", "clock_offset_sigma_m"):
+    for name, values in members(expected).items():
+        if name in NO_EPOCHS or not isinstance(values, np.ndarray):
             continue
-        if not isinstance(values, np.ndarray):
-            continue
-        got = np.concatenate([_values(part, item.name, keys) for part in parts])
+        got = np.concatenate([_values(part, name, keys) for part in parts])
         if values.dtype == np.float64:
-            np.testing.assert_allclose(got, values, rtol=1e-9, atol=_SAME, err_msg=item.name)
+            np.testing.assert_allclose(got, values, rtol=1e-9, atol=_SAME, err_msg=name)
         else:
-            np.testing.assert_array_equal(got, values, err_msg=item.name)
+            np.testing.assert_array_equal(got, values, err_msg=name)
     assert expected.protection is not None
     level = np.concatenate([part.protection.level.level_m for part in parts if part.protection is not None])
     np.testing.assert_allclose(level, expected.protection.level.level_m, rtol=1e-7)
@@ -283,14 +281,19 @@ def test_verdicts_on_pairs_go_to_the_epochs_of_each_antenna() -> None:
         front_epoch=np.array([1, 2, 3]), rear_epoch=np.array([0, 2, 4]), front_ecef_m=nowhere, rear_ecef_m=nowhere,
         along_m=along,
     )  # fmt: skip
-    published = position_verdicts([(screen, None)], pair, chainage)
+    rows = slice(0, 4), slice(4, 9)
+    antennas = SimpleNamespace(parts=rows, chainage_at=lambda arc_m: arc_m)
+    chunk = SimpleNamespace(
+        names=("front", "rear"), antennas=antennas, pair=pair, rows=dict(zip(chainage, rows, strict=True))
+    )
+    solution = SimpleNamespace(status=np.zeros(9, dtype=np.int8), arc_m=np.concatenate([*chainage.values()]))
+    status, published = screen_positions(chunk, solution, [(screen, None)], parse_config({}))  # type: ignore[arg-type]
     motions = {name: FilteredMotion(values, values, values, values) for name, values in chainage.items()}
-    filtered = filter_verdicts([(screen, None)], pair, motions)
-    for name, rows in (("front", [1, 2]), ("rear", [0, 2])):
-        (verdict,) = published[name]
-        assert (verdict.name, verdict.status) == ("spacing", 9)
-        for screened in (verdict.screened, filtered[name]):
-            assert np.flatnonzero(screened.reject).tolist() == rows
+    filtered = screen_filtered([(screen, None)], pair, motions)
+    for name, refused in (("front", [1, 2]), ("rear", [0, 2])):
+        assert np.flatnonzero(status[chunk.rows[name]] == 9).tolist() == refused
+        for screened in (published[name]["spacing"], filtered[name]):
+            assert np.flatnonzero(screened.reject).tolist() == refused
             known = np.isfinite(screened.metric)
             assert np.flatnonzero(known).tolist() == {"front": [1, 2, 3], "rear": [0, 2, 4]}[name]
             assert screened.metric[known].tolist() == [40.0, 30.0, 20.0]

@@ -18,11 +18,11 @@ from railfix.io import read_navigation, read_observations
 from railfix.live.engine import LiveEngine
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import single_epochs
-from railfix.pipeline.base_station import Stations
+from railfix.pipeline.base_station_stage import Stations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.ranges.base_station import BaseErrors
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory

@@ -56,6 +56,6 @@ def test_a_position_that_fails_is_kept_with_its_status() -> None:
     after = front_alone(with_code(observations, step), settings)
     assert (after.conventional_status[60:] == PointStatus.RESIDUALS).mean() > 0.9
     np.testing.assert_array_equal(after.conventional_status[:60], before.conventional_status[:60])
-    assert np.isfinite(after.conventional_ecef_m).all()
+    assert np.isfinite(after.point.ecef_m).all()
     none = with_code(observations, np.full(observations.code_m.shape, np.nan))
     assert (front_alone(none, settings).conventional_status == PointStatus.NO_POSITION).all()

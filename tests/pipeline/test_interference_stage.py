@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ from railfix.core.reasons import Reason, Status
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.integrity.interference import Sign, Suspicion
 from railfix.integrity.protection import LevelStatus
-from railfix.pipeline.results import Result
+from railfix.pipeline.interference_stage import Interference
+from railfix.pipeline.results import Result, add_wheel_sign
+from railfix.pipeline.solution import Solution
 from railfix.run.tally import AntennaTally
 from railfix.tracking import TrackStatus
 from railfix.tracking.result import is_bounded
@@ -293,3 +297,17 @@ def test_positions_that_are_only_imprecise_leave_the_filter_tracking() -> None:
     assert (result["front"].status == Status.UNCERTAIN).all()
     assert not result["front"].interference.suspicion.any()
     assert (result.fusion["front"].tracked.status[10:] == TrackStatus.TRACKING).mean() > 0.95
+
+
+@pytest.mark.requirement("B8")
+def test_the_sign_of_the_wheel_changes_the_status_of_its_own_epochs_alone() -> None:
+    """An epoch that another sign suspects keeps the status that a later check has given it."""
+    nothing: Any = None
+    causes = np.array([0, int(Sign.RECEIVER_SPOOFING), 0], dtype=np.int64)
+    statuses = np.array([Status.OK, Status.ANTENNAS_DISAGREE, Status.OK], dtype=np.int8)
+    solution = object.__new__(Solution)  # the other outputs are not looked at
+    vars(solution)["status"] = statuses
+    wheel: Any = SimpleNamespace(parted=np.array([False, False, True]))
+    found, interference = add_wheel_sign(solution, Interference(causes=causes, power=nothing, motion=nothing), wheel)
+    assert found.status.tolist() == [Status.OK, Status.ANTENNAS_DISAGREE, Status.SPOOFING_SUSPECTED]
+    assert interference.causes.tolist() == [0, int(Sign.RECEIVER_SPOOFING), int(Sign.WHEEL_PARTS)]

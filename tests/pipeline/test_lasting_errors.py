@@ -10,8 +10,8 @@ import pytest
 from pipeline_cases import clean_observations, processor
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
+from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import AntennaState
 from railfix.run.tally import Tally
 
 #: A fault that RAIM with the noise of the log passes, from the first epoch to this one [m].

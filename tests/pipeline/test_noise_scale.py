@@ -16,11 +16,11 @@ from railfix.core.timescale import timedelta
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.result_tables import antenna_positions
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.tables import antenna_positions
+from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, noise_scale, robust_fit
-from railfix.positioning.windows import Windows
 from railfix.simulate.demonstration import demo_files
 
 
@@ -47,8 +47,8 @@ def test_a_fault_from_the_first_epoch_on_teaches_nothing(clean: AntennaResult, s
     ok = (found.status == Status.OK) & (clean.status == Status.OK)
     assert np.median(np.abs(found.chainage_m - clean.chainage_m)[ok]) < 1.0
     assert found.noise_scale[-1] == pytest.approx(clean.noise_scale[-1], rel=0.15)
-    known = found.clock_offset_sigma_m[-1] < 100.0
-    assert np.abs(found.clock_offset_m[-1] - clean.clock_offset_m[-1])[known].max() < 1.0
+    known = found.ties.sigma_m[-1] < 100.0
+    assert np.abs(found.ties.offset_m[-1] - clean.ties.offset_m[-1])[known].max() < 1.0
     assert found.protection is not None
     assert (found.protection.status == 0).mean() > 0.8
 
@@ -120,7 +120,7 @@ def test_the_statistic_of_raim_is_recomputed_from_the_tables_by_its_scale() -> N
     kept = (table["raim_outcome"] == "passed").to_numpy()
     statistic = table["raim_statistic"].to_numpy() * table["raim_scale"].to_numpy() ** 2
     assert kept.sum() > 100
-    np.testing.assert_allclose(statistic[kept], found.constrained.wsse[kept], rtol=1e-5)
+    np.testing.assert_allclose(statistic[kept], found.fix.constrained.wsse[kept], rtol=1e-5)
 
 
 @pytest.mark.requirement("C3")

@@ -150,7 +150,7 @@ CUTS = [(), (16,), (17, 19), (3, 15, 18, 21), tuple(range(1, 30))]
 def test_codes_after_an_outage_count_from_the_third_that_agrees_however_the_log_is_cut(cuts: tuple[int, ...]) -> None:
     """Ten seconds without codes; of those after it, the first and the fourth are 100 m aside."""
     k = np.arange(30)
-    time, line = START + timedelta(k.astype(np.float64)), Line.of(clean_trajectories()["front"])
+    time, line = START + timedelta(k.astype(np.float64)), Line(clean_trajectories()["front"])
     observed, place = (k < 5) | (k > 14), 10.0 * k + np.where((k == 15) | (k == 18), 100.0, 0.0)
     state, parts = ReturnState(place_m=-10.0, sigma_m=1.0), []
     for first, last in pairwise((0, *cuts, 30)):

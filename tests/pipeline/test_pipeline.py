@@ -34,7 +34,7 @@ from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 
 #: Epochs a chunk, and epochs of the log.
 CHUNKS = {1: 60, 7: 200, 1000: 1200}
@@ -194,13 +194,13 @@ def with_offsets(observations: Observations) -> Observations:
 @pytest.mark.requirement("A4")
 def test_offset_between_clocks_is_found():
     found = front_alone(with_offsets(clean_observations()["front"]), {"screens": ["elevation"]})
-    galileo, gps = found.clocks.index("E"), found.clocks.index("G")
-    assert found.clock_offset_m[-1, gps] == 0.0
-    assert found.clock_offset_m[-1, galileo] == pytest.approx(-4.0, abs=0.4)
-    assert found.clock_offset_sigma_m[0, galileo] > 1e5
-    assert 1.0 <= found.clock_offset_sigma_m[-1, galileo] < 1.5
+    galileo, gps = found.corrected.channels.clocks.index("E"), found.corrected.channels.clocks.index("G")
+    assert found.ties.offset_m[-1, gps] == 0.0
+    assert found.ties.offset_m[-1, galileo] == pytest.approx(-4.0, abs=0.4)
+    assert found.ties.sigma_m[0, galileo] > 1e5
+    assert 1.0 <= found.ties.sigma_m[-1, galileo] < 1.5
     # What is known of an offset is from the epochs before.
-    assert np.all(np.diff(found.clock_offset_sigma_m[:, galileo]) <= 1e-12)
+    assert np.all(np.diff(found.ties.sigma_m[:, galileo]) <= 1e-12)
 
 
 @pytest.mark.requirement("A4")
@@ -229,7 +229,7 @@ def test_separate_clocks_equal_an_independent_solution():
     k = found.columns
     for t in range(len(found)):
         used = found.reason[t, k] == 0
-        sat, code = found.satellites.position_ecef_m[t, used], found.corrected_code_m[t, k][used]
+        sat, code = found.corrected.satellites.position_ecef_m[t, used], found.corrected_code_m[t, k][used]
         letters = found.satellite[k][used].astype("<U1")
         clocks = np.stack([letters == "E", letters != "E"], axis=1).astype(float)
         root = 1.0 / found.sigma_m[t, k][used]
@@ -242,7 +242,7 @@ def test_separate_clocks_equal_an_independent_solution():
 
         start = np.r_[clean_trajectories()["front"].ecef_m[0], 0.0, 0.0]
         place = least_squares(residual, start, jac=jacobian, x_scale="jac", xtol=1e-14, ftol=1e-14).x
-        assert found.conventional_ecef_m[t] == pytest.approx(place[:3], abs=1e-3)
+        assert found.point.ecef_m[t] == pytest.approx(place[:3], abs=1e-3)
 
 
 @pytest.mark.requirement("B7")

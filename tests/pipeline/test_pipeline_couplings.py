@@ -124,8 +124,8 @@ def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.Mon
     result = front_alone(front(), BASE)
     (sides,) = caught
     line, columns = clean_trajectories()["front"], result.columns
-    section = result.constrained.section
-    sight = result.satellites.position_ecef_m - line.at_arc(result.constrained.arc_m)[:, None]
+    section = result.fix.constrained.section
+    sight = result.corrected.satellites.position_ecef_m - line.at_arc(result.fix.constrained.arc_m)[:, None]
     level = np.cross(
         line.ecef_m[section] / np.linalg.norm(line.ecef_m[section], axis=1)[:, None], line.tangent[section]
     )
@@ -277,10 +277,10 @@ def test_the_error_of_the_map_does_not_grow_with_the_noise() -> None:
     noisy = with_code(log, rng.normal(0.0, 6.0, log.code_m.shape))
     found = front_alone(noisy, {"screens": ["elevation", "raim"], "map_plan_sigma_m": 30.0, "map_height_sigma_m": 30.0})
     late = slice(200, None)
-    by_map = (found.constrained.sigma_m**2 - found.constrained.exact_map_sigma_m**2)[late]
-    ratio = (found.along_sigma_m[late] ** 2 - by_map) / found.own_sigma_m[late] ** 2
+    by_map = (found.fix.constrained.sigma_m**2 - found.fix.constrained.exact_map_sigma_m**2)[late]
+    ratio = (found.along_sigma_m[late] ** 2 - by_map) / found.epoch_sigma_m[late] ** 2
     assert np.median(found.noise_scale[late]) > 2.5
-    assert np.median(by_map / found.constrained.exact_map_sigma_m[late] ** 2) > 0.3
+    assert np.median(by_map / found.fix.constrained.exact_map_sigma_m[late] ** 2) > 0.3
     assert 0.5 < np.median(ratio) < 1.05
 
 
@@ -290,7 +290,7 @@ def test_a_noisy_receiver_on_the_map_is_not_off_it() -> None:
     rng = np.random.default_rng(11)
     log = clean_observations()["front"][300:500]
     found = front_alone(with_code(log, rng.normal(0.0, 12.0, log.code_m.shape)), {"screens": ["elevation"]})
-    plain = found.constrained.wsse - found.single_point.wsse
+    plain = found.fix.constrained.wsse - found.point.wsse
     assert (plain > 27.6).mean() > 0.05
     assert (found.status == Status.OFF_MAP).mean() < 0.01
 
@@ -303,9 +303,9 @@ def test_the_noise_of_a_3d_fit_is_that_of_its_redundant_ranges() -> None:
     gps = [s for s in fault_free().satellite[order].tolist() if s[0] == "G"][:6]
     noisy = with_code(only(log, gps), rng.normal(0.0, 15.0, (len(log), only(log, gps).code_m.shape[1])))
     found = front_alone(noisy, {"screens": ["elevation"], "interference": {"use": "off"}})
-    shown = np.maximum(1.0, found.single_point.wsse / (found.n_used - 4))
-    lost = (found.constrained.wsse - found.single_point.wsse) / shown > chi2.isf(1e-6, 2)
-    inside = found.constrained.overshoot_m == 0
+    shown = np.maximum(1.0, found.point.wsse / (found.n_used - 4))
+    lost = (found.fix.constrained.wsse - found.point.wsse) / shown > chi2.isf(1e-6, 2)
+    inside = found.fix.constrained.overshoot_m == 0
     assert 0.01 < lost[inside].mean() < 0.5
     np.testing.assert_array_equal((found.status == Status.OFF_MAP)[inside], lost[inside])
 

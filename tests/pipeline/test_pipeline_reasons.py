@@ -25,8 +25,8 @@ from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection import LevelStatus
+from railfix.pipeline.result_tables import observations_table
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.tables import observations_table
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -99,7 +99,7 @@ def test_two_satellites_are_enough_when_allowed():
     assert positioned.mean() > 0.9
     assert np.all(found.n_used == 2)
     # On the true section two ranges give the place: the residuals vanish.
-    assert np.nanmax(np.abs(found.residual_m[found.constrained.overshoot_m == 0])) < 1e-3
+    assert np.nanmax(np.abs(found.residual_m[found.fix.constrained.overshoot_m == 0])) < 1e-3
 
 
 @pytest.mark.requirement("A3")
@@ -126,7 +126,7 @@ def test_off_map_beyond_the_end():
     here = int(np.searchsorted(clean_trajectories()["front"].arc_m, whole().arc_m.min()))
     found = front_alone(front(), MASK_ONLY, trajectories=line(clean_trajectories()["front"].ecef_m[: here - 8]))
     all_are(found, Status.OFF_MAP)
-    assert (found.constrained.overshoot_m > 5.0).all()
+    assert (found.fix.constrained.overshoot_m > 5.0).all()
     assert np.all(found.arc_m == found.arc_m.max())
 
 
@@ -137,7 +137,7 @@ def test_a_position_clamped_to_an_end_within_the_noise_is_not_ok():
     end = there.at_arc(at.arc_m[:1] - 1.0)
     found = front_alone(front()[:1], MASK_ONLY, trajectories=line(np.concatenate([there.ecef_m[kept], end])))
     all_are(found, Status.MAP_END)
-    assert found.constrained.overshoot_m[0] == pytest.approx(1.0, abs=0.1)
+    assert found.fix.constrained.overshoot_m[0] == pytest.approx(1.0, abs=0.1)
     assert found.protection is not None
     assert found.protection.status[0] == LevelStatus.UNAVAILABLE
 
@@ -158,7 +158,7 @@ def test_unobservable():
 def test_no_convergence():
     """One step allowed: epochs whose nearest point lies ahead of them would have had to walk into its section."""
     found = front_alone(front(), MASK_ONLY | {"constrained": {"max_iterations": 1}})
-    walked = whole().constrained.iterations > 1
+    walked = whole().fix.constrained.iterations > 1
     assert 0 < walked.sum() < len(walked)
     assert np.array_equal(found.status == Status.NO_CONVERGENCE, walked)
     assert np.array_equal(np.isnan(found.arc_m), walked)

@@ -17,15 +17,15 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import concatenate
 from railfix.gnss.orbits import satellite_states
-from railfix.pipeline.base_station import BaseStation
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.base_station_stage import BaseStation
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import parse_config
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.decode import read_fields
 from railfix.ranges.sbas.dfmc import LAYOUTS, DfmcService, DfmcState
 from railfix.ranges.sbas.messages import with_parity
-from railfix.ranges.sources import DFMC_REASONS
-from railfix.run.processor import make_processor
+from railfix.ranges.sbas.sbas_sources import DFMC_REASONS
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import Scenario, Simulation, write_run
 from railfix.simulate import sbas_stream as stream
 from railfix.simulate.errors import SatelliteFault

@@ -21,22 +21,22 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
 from railfix.integrity.fault_exclusion import compute_statistic
-from railfix.integrity.protection.level import RangeBounds
+from railfix.integrity.protection.solution_separation import RangeBounds
 from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import fit_ranges
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.line_fix import fix_on_line
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.normal_equations import point_position
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
-from railfix.ranges.sources import REASONS
-from railfix.run.processor import make_processor
+from railfix.ranges.sbas.sbas_sources import REASONS
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv
 from railfix.track.trajectory import Trajectory
@@ -57,7 +57,7 @@ class Recording:
         self.navigation: Navigation = read_navigation([self.nav])
         without = make_processor(parse_config({"filter": "off"}), self.navigation, {"front": self.line_at(None)})
         found = without.process({"front": self.observations[:200]})[0].antennas["front"]
-        self.parked = np.nanmedian(found.conventional_ecef_m, axis=0)
+        self.parked = np.nanmedian(found.point.ecef_m, axis=0)
         self.line = self.line_at(self.parked)
 
     def line_at(self, place: np.ndarray | None) -> Trajectory:
@@ -115,7 +115,7 @@ def test_a_corrected_code_is_the_sum_of_its_parts(recording: Recording, correcte
     states = satellite_states(
         corrected.time, satellite, corrected.signal[columns], code, recording.navigation, record=fixes.record
     )
-    place = corrected.conventional_ecef_m
+    place = corrected.point.ecef_m
     latitude, longitude, height = geodetic_from_ecef(np.where(np.isnan(place), recording.parked, place))
     elevation, azimuth = corrected.elevation_deg[:, columns], corrected.azimuth_deg[:, columns]
     grid = engine.ionosphere(corrected.time, latitude, longitude, elevation, azimuth)
@@ -148,8 +148,8 @@ def test_any_cutting_gives_the_same(recording: Recording, corrected: AntennaResu
 def test_the_parked_antenna_stays_where_it_is(recording: Recording, corrected: AntennaResult) -> None:
     """Corrections of metres move a position by metres, not by more: it agrees with the uncorrected one within 15 m."""
     plain = recording.process(parse_config({"filter": "off", "elevation": {"mask_deg": 10.0}}))
-    both = np.isfinite(corrected.conventional_ecef_m[:, 0]) & (np.arange(len(plain)) < 200)
-    moved = np.linalg.norm(corrected.conventional_ecef_m - plain.conventional_ecef_m, axis=1)[both]
+    both = np.isfinite(corrected.point.ecef_m[:, 0]) & (np.arange(len(plain)) < 200)
+    moved = np.linalg.norm(corrected.point.ecef_m - plain.point.ecef_m, axis=1)[both]
     assert both.sum() > 20
     assert 0.1 < np.median(moved) < 15.0
 

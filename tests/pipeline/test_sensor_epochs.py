@@ -243,7 +243,7 @@ def test_features_are_placed_alike_however_the_ride_is_cut_and_the_vehicle_faces
     slope = 0.02 / (1.0 + np.exp(-(arc - 800.0) / 4.0)) - 0.015 / (1.0 + np.exp(-(arc - 1200.0) / 4.0))
     series = LineSeries(arc_m=arc, gradient=slope, curvature_1pm=np.where((arc > 500.0) & (arc < 1500.0), 2e-3, 0.0))
     features = tuple(map_features(series))
-    line = LineFeatures(series=series, features=features, antenna_m=arc, body_m=arc, line=Line.of(bent_line()))
+    line = LineFeatures(series=series, features=features, antenna_m=arc, body_m=arc, line=Line(bent_line()))
     way = np.arange(300.0, 1750.0, 1.3)
     way = way[::-1] if falling else way
     whole = _ridden(line, way, facing, [])
@@ -260,7 +260,7 @@ def test_features_are_placed_alike_however_the_ride_is_cut_and_the_vehicle_faces
 @pytest.mark.requirement("E4", "E5")
 def test_ranges_are_held_against_the_place_of_the_unit_on_the_vehicle() -> None:
     """Its unit is 3 m ahead, 4 m to the right and 6 m below the antenna; echoes come late, and nothing comes early."""
-    line, lever = Line.of(bent_line()), np.array([3.0, 4.0, -6.0])
+    line, lever = Line(bent_line()), np.array([3.0, 4.0, -6.0])
     time = START + timedelta(np.array([1.0, 2.0]))
     fixed = FilterFix(time=START, arc_m=500.0, sigma_m=0.05, speed_mps=10.0)
     age = np.array([[0.25, 0.0], [0.0, 0.5]])

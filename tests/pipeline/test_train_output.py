@@ -18,7 +18,7 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS
-from railfix.pipeline.tables import SMOOTHED_COLUMNS, TRAIN_COLUMNS
+from railfix.pipeline.result_tables import SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.simulate import demo_files
 from railfix.simulate.demonstration import demo_inputs

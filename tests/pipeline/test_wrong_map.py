@@ -42,7 +42,7 @@ def on_a_map(*, across_m: float = 0.0, up_m: float = 0.0, map_prior: float = 1e-
 
 def in_the_middle(result: AntennaResult) -> np.ndarray:
     """Epochs with a position that is not clamped to an end of the line."""
-    return np.isfinite(result.constrained.arc_m) & (result.constrained.overshoot_m == 0.0)
+    return np.isfinite(result.fix.constrained.arc_m) & (result.fix.constrained.overshoot_m == 0.0)
 
 
 @pytest.fixture(scope="module")

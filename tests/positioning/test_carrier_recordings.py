@@ -10,7 +10,7 @@ import pytest
 
 import carrier_score
 from railfix.evaluate import Score, score
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 
 
 @cache

@@ -9,7 +9,7 @@ import carrier_cases
 from railfix.core.errors import SettingsError
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import SmoothingLimits, SmoothingState, find_slips, smooth_codes
-from railfix.positioning.carrier.smoothing import linear_recursion
+from railfix.positioning.carrier.code_smoothing import linear_recursion
 
 
 def smoothed(obs: Observations, slip: np.ndarray | None = None, **limits: object) -> np.ndarray:

@@ -35,7 +35,7 @@ from railfix.positioning.normal_equations import point_position
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.atmosphere import klobuchar_delay_m
 from railfix.ranges.channels import clock_groups
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
@@ -138,10 +138,10 @@ def weights_of_rtklib(found: AntennaResult, navigation: Navigation) -> np.ndarra
     satellite, signal = found.satellite[found.columns], found.signal[found.columns]
     elevation, azimuth = found.elevation_deg[:, found.columns], found.azimuth_deg[:, found.columns]
     sine = np.sin(np.radians(elevation))
-    accuracy = found.satellites.accuracy_m
+    accuracy = found.corrected.satellites.accuracy_m
     table = URA_M[np.minimum(np.searchsorted(URA_M, np.nan_to_num(accuracy)), len(URA_M) - 1)]
     accuracy = np.where(satellite.astype("<U1") == "E", accuracy, table)
-    latitude, longitude, _ = geodetic_from_ecef(found.conventional_ecef_m)
+    latitude, longitude, _ = geodetic_from_ecef(found.point.ecef_m)
     ionosphere = klobuchar_delay_m(
         found.time, latitude, longitude, elevation, azimuth, navigation.klobuchar["G"],
         carrier_frequency_hz(satellite, signal, {}),
@@ -154,12 +154,12 @@ def solved_again(found: AntennaResult, weight: np.ndarray) -> np.ndarray:
     """Single points from the ranges of a result with other weights, shape (T, 3)."""
     used = (found.reason[:, found.columns] == 0) & np.isfinite(weight)
     ranges = Ranges(
-        sat_ecef_m=np.where(used[..., None], found.satellites.position_ecef_m, 2.6e7),
+        sat_ecef_m=np.where(used[..., None], found.corrected.satellites.position_ecef_m, 2.6e7),
         code_m=np.where(used, found.corrected_code_m[:, found.columns], 0.0),
         weight=np.where(used, weight, 0.0),
         groups=clock_groups(found.satellite[found.columns].astype("<U1")),
     )
-    start = np.where(np.isfinite(found.conventional_ecef_m), found.conventional_ecef_m, 6.4e6)
+    start = np.where(np.isfinite(found.point.ecef_m), found.point.ecef_m, 6.4e6)
     return point_position(ranges, start).ecef_m
 
 
@@ -210,7 +210,7 @@ def test_single_point_with_the_same_choices(logs: dict[str, Log], tmp_path: Path
     time, place, satellites = rtklib(log, tmp_path)
     found, _, navigation = positions(log, with_choices_of_rtklib)
     own = solved_again(found, 1.0 / found.sigma_m[:, found.columns] ** 2)
-    assert own == pytest.approx(found.conventional_ecef_m, abs=1e-5, nan_ok=True)
+    assert own == pytest.approx(found.point.ecef_m, abs=1e-5, nan_ok=True)
 
     row = paired(found, time)
     again = solved_again(found, weights_of_rtklib(found, navigation))
@@ -244,8 +244,8 @@ def test_single_point_as_it_comes(logs: dict[str, Log], tmp_path: Path, name: st
     time, place, _ = rtklib(log, tmp_path)
     found, trajectory, _ = positions(log, lambda navigation: navigation)
     row = paired(found, time)
-    both = np.flatnonzero((row >= 0) & np.isfinite(found.conventional_ecef_m[:, 0]))
-    own, other = found.conventional_ecef_m[both], place[row[both]]
+    both = np.flatnonzero((row >= 0) & np.isfinite(found.point.ecef_m[:, 0]))
+    own, other = found.point.ecef_m[both], place[row[both]]
     p50, p95 = percentiles(name, "own weights, records, delays", np.linalg.norm(own - other, axis=1))
     assert p50 < p50_m
     assert p95 < p95_m
@@ -263,6 +263,6 @@ def test_up_error_of_a_station(logs: dict[str, Log], name: str):
     found, _, _ = positions(log, lambda navigation: navigation)
     place = read_observations(log.observations).header.approximate_ecef_m
     latitude, longitude, _ = geodetic_from_ecef(place)
-    up = (found.conventional_ecef_m - place) @ enu_axes(latitude, longitude)[2]
+    up = (found.point.ecef_m - place) @ enu_axes(latitude, longitude)[2]
     print(f"{name:12s} median up error {np.nanmedian(up):6.2f} m over {np.isfinite(up).sum()} epochs")
     assert abs(np.nanmedian(up)) < 1.5

@@ -10,10 +10,10 @@ import pytest
 from helpers import synthetic
 from helpers.pipeline_cases import clean_navigation, clean_observations, clean_truth
 from railfix.gnss.observations import Observations
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import Located, NoPosition, locate
 from railfix.pipeline.received import known_from_start
+from railfix.pipeline.without_map import Located, NoPosition, locate
 from railfix.positioning.gross_errors import gross_in_space, least_absolute
 
 pytestmark = pytest.mark.requirement("A6")

@@ -28,7 +28,7 @@ from railfix.positioning.two_frequencies import (
     share_of_second,
 )
 from railfix.ranges.second_codes import SecondCodes, signal_delays
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import from_positions
 from railfix.track.trajectory import Trajectory
 
@@ -219,7 +219,7 @@ def test_open_sky_is_better_by_half(open_sky: dict[str, tuple[AntennaResult, Flo
     error = {}
     for name, (result, reference) in open_sky.items():
         up = reference / np.linalg.norm(reference, axis=1, keepdims=True)
-        apart = result.conventional_ecef_m - reference
+        apart = result.point.ecef_m - reference
         across = apart - np.einsum("ti,ti->t", apart, up)[:, None] * up
         error[name] = np.nanmedian(np.linalg.norm(across, axis=1)[60:])
     assert error["two"] < 0.5 * error["one"]

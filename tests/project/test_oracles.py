@@ -43,7 +43,7 @@ def test_oracles_import_types_of_data_alone() -> None:
     [
         "import railfix.core",
         "from railfix.core.constants import SPEED_OF_LIGHT",
-        "from railfix.integrity.raim.model import _model",
+        "from railfix.integrity.raim.position_model import _model",
         "from railfix.core.geodesy import enu_axes",
         "from railfix.positioning import normal_equations",
     ],

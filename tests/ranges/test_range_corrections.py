@@ -34,8 +34,8 @@ from railfix.ranges.sbas import (
     SbasCorrections,
     read_sbas,
 )
-from railfix.ranges.sources import apply_long_term, sbas_delays
-from railfix.run.processor import make_processor
+from railfix.ranges.sbas.sbas_sources import apply_long_term, sbas_delays
+from railfix.run.processor_setup import make_processor
 from recordings_score import straight_line
 
 pytestmark = pytest.mark.requirement("A4")
@@ -245,19 +245,19 @@ def test_sigmas_of_a_run_are_those_of_its_noise_model_and_weights_their_inverse_
     expected = code_sigma_m(result.cn0_dbhz[:, columns], result.elevation_deg[:, columns])
     used = result.reason[:, columns] == 0
     np.testing.assert_allclose(result.sigma_m[:, columns][used], expected[used], rtol=1e-12)
-    satellites, code = result.satellites.position_ecef_m, result.corrected_code_m[:, columns]
+    satellites, code = result.corrected.satellites.position_ecef_m, result.corrected_code_m[:, columns]
     differences = dict.fromkeys((1, 2), 0.0)
     for t in range(len(result)):
         at = np.flatnonzero(used[t])
         for power in differences:
-            place, clock = result.conventional_ecef_m[t].copy(), 0.0
+            place, clock = result.point.ecef_m[t].copy(), 0.0
             for _ in range(4):
                 distance, sight = range_with_rotation(satellites[t, at], place)
                 design = np.column_stack([-sight, np.ones(len(at))])
                 root = expected[t, at] ** (-power / 2.0)
                 step, *_ = np.linalg.lstsq(design * root[:, None], (code[t, at] - distance - clock) * root, rcond=None)
                 place, clock = place + step[:3], clock + step[3]
-            difference = float(np.linalg.norm(place - result.conventional_ecef_m[t]))
+            difference = float(np.linalg.norm(place - result.point.ecef_m[t]))
             differences[power] = max(differences[power], difference)
     assert differences[2] < 1e-3 < 0.05 < differences[1]
 
@@ -351,7 +351,7 @@ def test_the_phase_of_the_filter_is_without_clock_and_troposphere() -> None:
         found.append(result)
     front = [result.antennas["front"] for result in found]
     columns = front[0].columns
-    phase = np.concatenate([r.fusion["front"].replay[0].epochs.phase_m for r in found])
+    phase = np.concatenate([r.replays["front"][0].epochs.phase_m for r in found])
     corrected = np.concatenate([r.corrected_code_m[:, columns] for r in front])
     size = len(phase)
     correction = corrected - observations.code_m[:size, columns]  # clock less troposphere, group delay
@@ -369,10 +369,10 @@ def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
     observations, navigation = cases.clean_observations()["front"][:10], cases.clean_navigation()
     result = cases.front_alone(observations, {"screens": [], "systems": ["G"]})
     columns, used = result.columns, result.reason[:, result.columns] == 0
-    seen = SeenFrom.of(result.conventional_ecef_m, result.satellites.position_ecef_m)
+    seen = SeenFrom.of(result.point.ecef_m, result.corrected.satellites.position_ecef_m)
     frequency = np.full(len(columns), FREQUENCY_L1)
     delays = model_delays(result.time, seen, frequency, klobuchar=navigation.klobuchar["G"], troposphere="saastamoinen")
-    states = result.satellites
+    states = result.corrected.satellites
     code = observations.code_m[:, columns] + states.clock_m - states.group_delay_m
     expected = code - delays.ionosphere_m - delays.troposphere_m
     assert (delays.troposphere_m[used] > 2.0).all()
@@ -451,7 +451,9 @@ def test_a_run_with_sbas_adds_the_sbas_variance_to_that_of_the_noise_model(recor
     fixes = engine.satellites(result.time, result.satellite[columns], navigation)
     elevation, azimuth = result.elevation_deg[:, columns], result.azimuth_deg[:, columns]
     middle = len(line.ecef_m) // 2
-    seen = SeenFrom.of(np.broadcast_to(line.ecef_m[middle], (len(result), 3)), result.satellites.position_ecef_m)
+    seen = SeenFrom.of(
+        np.broadcast_to(line.ecef_m[middle], (len(result), 3)), result.corrected.satellites.position_ecef_m
+    )
     grid = engine.ionosphere(result.time, seen.latitude_deg, seen.longitude_deg, elevation, azimuth)
     troposphere = 0.12 * 1.001 / np.sqrt(0.002001 + np.sin(np.radians(elevation)) ** 2)
     local = code_sigma_m(result.cn0_dbhz[:, columns], elevation)

@@ -33,7 +33,7 @@ from railfix.ranges.error_model import read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run import RunOptions, read_record, run_files
 from railfix.run.driver import open_inputs
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import Scenario, Simulation, demo_files
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import from_positions
@@ -282,7 +282,7 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
     log = read_observations(folder / "cres_20080526.bin.obs")[:200]
     line = straight_line(log.header.approximate_ecef_m, 45.0)
     found, _ = make_processor(plain, navigation, {"front": line}).process({"front": log})
-    place = np.nanmedian(found.antennas["front"].conventional_ecef_m, axis=0)
+    place = np.nanmedian(found.antennas["front"].point.ecef_m, axis=0)
     line = straight_line(place, 45.0)
     processor = make_processor(config, navigation, {"front": line})
     result, _ = processor.process({"front": log})

@@ -14,7 +14,7 @@ from railfix.io.rinex import read_navigation
 from railfix.ranges.sbas import SbasMessages, read_sbas
 from railfix.ranges.sbas.dfmc import DfmcService, DfmcState, residual_ionosphere_m, slot_satellite
 from railfix.ranges.sbas.messages import message_type, with_parity
-from railfix.ranges.sources import apply_dfmc
+from railfix.ranges.sbas.sbas_sources import apply_dfmc
 from railfix.simulate import sbas_stream as stream
 from railfix.simulate.sbas_stream import write_sbas
 from sbas_account import account

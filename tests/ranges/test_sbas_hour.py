@@ -14,7 +14,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.ranges.atmosphere import SeenFrom
 from railfix.ranges.sbas import SatelliteState
-from railfix.ranges.sources import sbas_delays
+from railfix.ranges.sbas.sbas_sources import sbas_delays
 from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("C2")

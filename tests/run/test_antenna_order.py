@@ -16,7 +16,7 @@ from railfix import Config, EpochProcessor, antenna_trajectory, read_track, read
 from railfix.cli import app
 from railfix.live.engine import LiveEngine
 from railfix.live.settings import LiveSettings
-from railfix.pipeline.antennas import AntennaOrder
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.simulate.demonstration import demo_files
 from railfix.track.trajectory import Trajectory
 

@@ -11,7 +11,7 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.run.checks import check_base
 from railfix.run.inputs import RunOptions
-from railfix.run.processor import BaseLog, base_log
+from railfix.run.processor_setup import BaseLog, base_log
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally, Tally
 from railfix.track import Track

@@ -11,7 +11,7 @@ import pytest
 from railfix.evaluate import along_track_error
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import demo_files
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle

@@ -21,10 +21,10 @@ from railfix.evaluate import evaluate_run
 from railfix.io import read_navigation, read_observations, scan_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.result_tables import TRAIN_COLUMNS, observations_table, positions_table, to_xarray, train_table
 from railfix.pipeline.results import Result
-from railfix.pipeline.tables import TRAIN_COLUMNS, observations_table, positions_table, to_xarray, train_table
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -288,7 +288,7 @@ def test_tables_hold_the_arrays(result: Result) -> None:
         mine = positions.filter(pl.col("antenna") == name)
         np.testing.assert_array_equal(mine["chainage_m"].to_numpy(), antenna.chainage_m)
         np.testing.assert_array_equal(mine["y_m"].to_numpy(), antenna.ecef_m[:, 1])
-        np.testing.assert_array_equal(mine["conventional_z_m"].to_numpy(), antenna.conventional_ecef_m[:, 2])
+        np.testing.assert_array_equal(mine["conventional_z_m"].to_numpy(), antenna.point.ecef_m[:, 2])
         np.testing.assert_array_equal(mine["time_gpst"].to_numpy(), antenna.time)
     rows = observations_table(result).filter(antenna="rear", satellite="G01")
     rear = result.antennas["rear"]

@@ -23,7 +23,7 @@ from railfix.core.errors import OutputError
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import RadarSpeeds, SensorSamples
-from railfix.pipeline.tables import round_floats
+from railfix.pipeline.result_tables import round_floats
 from railfix.run.driver import _screen_chunks
 from railfix.run.output import OutputFolder
 from railfix.run.sources import align_logs

@@ -17,7 +17,7 @@ from railfix.cli import app
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.evaluate import evaluate_run, interpolate_reference
-from railfix.evaluate.inputs import EvaluationOptions, read_run
+from railfix.evaluate.evaluation_inputs import EvaluationOptions, read_run
 from railfix.evaluate.place import read_run_track
 from railfix.pipeline.config import Config
 from railfix.run import RunInputs, RunOptions, RunSummary, TrackReading, run_files

@@ -13,10 +13,10 @@ from railfix.integrity.raim import Outcome, threshold
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.result_tables import observations_table, positions_table
 from railfix.pipeline.results import Result
-from railfix.pipeline.tables import observations_table, positions_table
 from railfix.ranges.cn0_curve import read_cn0_curve
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.sources import TrackReading, open_line
 from railfix.simulate.demonstration import demo_inputs
 
@@ -77,7 +77,7 @@ def test_protection_level_is_known_where_no_fault_is_left(result: Result) -> Non
     # a level is noise (3.29 sigma at a risk of 0.001) and a fault on top; satellites and atmosphere are no part of P4's
     for antenna in result.antennas.values():
         known = np.isfinite(antenna.raim.protection_level_m)
-        noise = antenna.noise_scale * antenna.constrained.exact_map_sigma_m
+        noise = antenna.noise_scale * antenna.fix.constrained.exact_map_sigma_m
         assert (antenna.raim.protection_level_m[known] > 3.29 * noise[known]).all()
 
 

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from railfix.pipeline.config import Config
-from railfix.pipeline.tables import PASSING_COLUMNS
+from railfix.pipeline.result_tables import PASSING_COLUMNS
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs
 

@@ -19,7 +19,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.positioning.standstill_phase import CodePlace
-from railfix.positioning.which_track import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
+from railfix.positioning.track_choice import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
 from railfix.run.standstill import StandstillCodes, standstill_codes
 from railfix.run.which_track import (
     WhichTrackInputs,

@@ -20,12 +20,12 @@ from railfix.core.tables import Table, listing
 from railfix.evaluate.tables import _ERRORS
 from railfix.io import read_observations, write_observations
 from railfix.pipeline.config import Config
+from railfix.pipeline.result_tables import observations_table, positions_table, train_table
 from railfix.pipeline.results import Result
-from railfix.pipeline.tables import observations_table, positions_table, train_table
 from railfix.report.page import budget, summary
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.tally import AntennaTally
 from railfix.simulate.demonstration import demo_inputs
 from railfix.tracking import Kind

@@ -21,7 +21,7 @@ from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline.base_station import Stations
+from railfix.pipeline.base_station_stage import Stations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.track.trajectory import Trajectory

@@ -57,7 +57,7 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import Result
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.run import truth_table, vehicle_table
 from railfix.simulate.scenario_file import list_scenarios, load_recipe
 from railfix.track import Track, antenna_trajectory, read_track, read_vehicle
@@ -244,7 +244,7 @@ def judged(case: Case, found: Tracked, first: int = 0) -> Judged:
     """Compare what was found with the reference."""
     place = on_line_m(found, case.trajectory)
     straight = straight_distance(place, case.reference_ecef_m, case.trajectory)
-    arc = Line.of(case.trajectory).nearest_m(found.arc_m, case.reference_arc_m)
+    arc = Line(case.trajectory).nearest_m(found.arc_m, case.reference_arc_m)
     chainage = np.abs(arc - case.reference_arc_m)
     known = np.isfinite(case.reference_ecef_m[:, 0])
     known[:first] = False
@@ -372,7 +372,7 @@ def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
     found = processor.process({"front": case.observations})[0].antennas["front"]
     known = np.isfinite(case.reference_arc_m)
     arc = np.where(known, case.reference_arc_m, 0.0)
-    tangent = Line.of(case.trajectory).at(arc)[1][:, 0]
+    tangent = Line(case.trajectory).at(arc)[1][:, 0]
     sat = found.satellites.position_ecef_m
     sight = sat - np.where(known[:, None], case.reference_ecef_m, 0.0)[:, None, :]
     sight /= np.linalg.norm(sight, axis=2, keepdims=True)

@@ -43,10 +43,10 @@ from railfix.positioning.carrier import (
     track_jumps,
 )
 from railfix.positioning.normal_equations import position_on_line
-from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
+from railfix.positioning.range_arrays import UNTIED_M, Ranges
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.channels import clock_groups
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -102,10 +102,10 @@ def ranges_of(result: AntennaResult, code_m: np.ndarray, weight: np.ndarray) -> 
     columns = result.columns
     reason = result.reason[:, columns]
     used = (reason == 0) & np.isfinite(code_m) & np.isfinite(weight)
-    ties = InterSystemBiases(offset_m=result.clock_offset_m, sigma_m=result.clock_offset_sigma_m)
+    ties = result.ties
     groups = clock_groups(result.satellite[columns].astype("<U1"))
     return Ranges(
-        sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, (2.6e7, 0.0, 0.0)),
+        sat_ecef_m=np.where(used[..., None], result.corrected.satellites.position_ecef_m, (2.6e7, 0.0, 0.0)),
         code_m=np.where(used, code_m, 0.0),
         weight=np.where(used, weight, 0.0),
         groups=groups,
@@ -117,7 +117,7 @@ def delays(case: Case, result: AntennaResult) -> tuple[np.ndarray, np.ndarray]:
     """Ionosphere and troposphere of the channels in `result.columns`, from what the pipeline took off the codes."""
     columns = result.columns
     total = case.observations.code_m[:, columns] - result.corrected_code_m[:, columns]
-    total = total + result.satellites.clock_m - result.satellites.group_delay_m
+    total = total + result.corrected.satellites.clock_m - result.corrected.satellites.group_delay_m
     latitude, _, height = geodetic_from_ecef(case.trajectory.ecef_m.mean(axis=0))
     elevation = result.elevation_deg[:, columns]
     shape = len(elevation)
@@ -127,7 +127,7 @@ def delays(case: Case, result: AntennaResult) -> tuple[np.ndarray, np.ndarray]:
 
 def solved_on_line(ranges: Ranges, case: Case, result: AntennaResult) -> np.ndarray:
     """Constrained positions of other codes, from the pipeline's sections; its epochs only."""
-    vertex = np.where(np.isfinite(result.arc_m), result.section.vertex, -1)
+    vertex = np.where(np.isfinite(result.arc_m), result.fix.section.vertex, -1)
     return position_on_line(ranges, case.trajectory, vertex).arc_m
 
 
@@ -135,11 +135,12 @@ def on_track(case: Case, result: AntennaResult, slips: Slips, used: np.ndarray) 
     """Corrected phases of the used channels, and their jumps against the line."""
     obs, columns = case.observations, result.columns
     ionosphere, troposphere = delays(case, result)
-    phase = corrected_phase_m(slips.phase_m[:, columns], result.satellites.clock_m, ionosphere, troposphere)
+    phase = corrected_phase_m(slips.phase_m[:, columns], result.corrected.satellites.clock_m, ionosphere, troposphere)
     phase = np.where(used, phase, np.nan)
     jumps, _ = track_jumps(
         obs.time, obs.satellite[columns], obs.signal[columns],
-        TrackedPhases(phase, result.satellites.position_ecef_m, slips.slip[:, columns]), case.trajectory, result.arc_m,
+        TrackedPhases(phase, result.corrected.satellites.position_ecef_m, slips.slip[:, columns]), case.trajectory,
+        result.arc_m,
     )  # fmt: skip
     return phase, jumps
 

@@ -32,14 +32,14 @@ from railfix.integrity.raim import (
     reliability,
     threshold,
 )
-from railfix.integrity.raim.model import compact
+from railfix.integrity.raim.position_model import compact
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import position_on_line
-from railfix.positioning.range_arrays import InterSystemBiases, Ranges
+from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.channels import clock_groups
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
@@ -151,14 +151,14 @@ def clean(recording: Recording) -> Clean:
     used = result.reason[:, columns] == 0
     trajectory = recording.trajectory
     ranges = Ranges(
-        sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, 2.6e7),
+        sat_ecef_m=np.where(used[..., None], result.corrected.satellites.position_ecef_m, 2.6e7),
         code_m=np.where(used, result.corrected_code_m[:, columns], 0.0),
         weight=np.where(used, 1.0 / result.sigma_m[:, columns] ** 2, 0.0),
         groups=clock_groups([str(s)[0] for s in result.satellite[columns]]),
-        ties=InterSystemBiases(offset_m=result.clock_offset_m, sigma_m=result.clock_offset_sigma_m),
+        ties=result.ties,
     )
-    located = np.flatnonzero(np.isfinite(result.constrained.arc_m))
-    arc = result.constrained.arc_m[located]
+    located = np.flatnonzero(np.isfinite(result.fix.constrained.arc_m))
+    arc = result.fix.constrained.arc_m[located]
     vertex = np.argmin(np.abs(trajectory.arc_m - arc[:, None]), axis=1)
     return solved(ranges.take(located), trajectory, vertex, float(np.median(result.noise_scale[located])))
 

@@ -26,7 +26,7 @@ from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.pipeline import along_track
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.smoothing import Replay, SmoothedTrack, smooth
+from railfix.pipeline.smoothed_track import Replay, SmoothedTrack, smooth
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
@@ -55,7 +55,7 @@ class Case:
         limits = TrackingLimits.model_validate(changes)
         return track(
             self.epochs if epochs is None else epochs,
-            Line.of(self.trajectory),
+            Line(self.trajectory),
             limits=limits,
             sensors=sensors,
             levels=levels,
@@ -65,7 +65,7 @@ class Case:
         """Places from both directions."""
         limits = TrackingLimits()
         replay = Replay(epochs=self.epochs, sensors=sensors or SensorEpochs(), before=None)
-        return smooth([replay], Line.of(self.trajectory), limits)
+        return smooth([replay], Line(self.trajectory), limits)
 
     def part(self, first: int, end: int) -> Case:
         """Some epochs of it."""
@@ -180,7 +180,7 @@ def show_codes(all_cases: list[Case]) -> None:
     """
     lags = (1, 10, 30, 60, 120)
     for case in all_cases:
-        epochs, line = case.epochs, Line.of(case.trajectory)
+        epochs, line = case.epochs, Line(case.trajectory)
         known = np.isfinite(case.reference[:, 0])
         arc, _ = case.trajectory.nearest(np.where(known[:, None], case.reference, case.reference[known][0]))
         distance, sight = range_with_rotation(epochs.sat_ecef_m, case.reference[:, None, :])
@@ -290,7 +290,7 @@ def _levelled(found: Tracked) -> np.ndarray:
 def show_terms(all_cases: list[Case]) -> None:
     """Which hypothesis spends most of the risk at the level, and how it differs; levels by other priors."""
     for case in all_cases:
-        limits, line = TrackingLimits(), Line.of(case.trajectory)
+        limits, line = TrackingLimits(), Line(case.trajectory)
         given, state = budget(limits), None
         named: dict[str, list[tuple[float, float, float]]] = {}
         for t in range(len(case.epochs)):

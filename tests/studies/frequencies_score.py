@@ -25,7 +25,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
@@ -79,7 +79,7 @@ def row(log: Observations, navigation: Path, reference: Floats, line: Trajectory
     antenna = result.antennas["front"]
     inside = np.isfinite(reference[:, 0])
     latitude, longitude, _ = geodetic_from_ecef(reference)
-    away = antenna.conventional_ecef_m - reference
+    away = antenna.point.ecef_m - reference
     across = np.linalg.norm(np.einsum("tij,tj->ti", enu_axes(latitude, longitude), away)[:, :2], axis=1)
     texts = [_percentiles(straight_distance(antenna.arc_m, reference, line)[inside]), _percentiles(across[inside])]
     texts.append(_filtered(processor, log, reference, line) if tracked else f"{'':17}")

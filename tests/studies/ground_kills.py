@@ -15,9 +15,7 @@ import json
 import multiprocessing
 import os
 import random
-import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -27,12 +25,11 @@ from itertools import combinations
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
-from typing import Final
 
 import numpy as np
-import psutil
 
 from ground_load import BEARERS_OF, centre_file
+from postgresql_server import Server
 from railfix.cli import main as main_of_railfix
 from railfix.ground.authority import Authority
 from railfix.ground.layout import overlap
@@ -61,40 +58,6 @@ def carry(words: list[str], there: Connection) -> None:
     sys.stdin, sys.stdout = open(0), open(1, "w")  # noqa: SIM115
     sys.argv[1:] = words
     main_of_railfix()
-
-
-class Server:
-    """PostgreSQL in a folder, as the user postgres where the study is run by root, who may not."""
-
-    ADDRESS: Final = "postgresql+psycopg://postgres@127.0.1.1:54329/postgres"
-
-    def __init__(self, folder: Path) -> None:
-        self._data = folder / "postgres"
-        self._programs = max(Path("/usr/lib/postgresql").glob("*/bin"))
-        self._user = ["runuser", "-u", "postgres", "--"] if os.getuid() == 0 else []
-        self._data.mkdir()
-        if self._user:
-            folder.chmod(0o755)
-            shutil.chown(self._data, "postgres")
-        self._call("initdb", "--username", "postgres", "--auth", "trust")
-        self.start()
-
-    def _call(self, program: str, *options: str) -> None:
-        command = [*self._user, self._programs / program, "-D", self._data, *options]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-    def start(self) -> None:
-        """Start it, until it can be connected to."""
-        listen = f"-h 127.0.1.1 -p 54329 -k {self._data}"
-        self._call("pg_ctl", "-w", "-l", f"{self._data}/log", "-o", listen, "start")
-
-    def kill(self) -> None:
-        """End all its processes by SIGKILL."""
-        first = psutil.Process(int((self._data / "postmaster.pid").read_text().split()[0]))
-        all_of_it = [first, *first.children()]
-        for process in all_of_it:
-            process.kill()
-        psutil.wait_procs(all_of_it)
 
 
 class TrainProgram:

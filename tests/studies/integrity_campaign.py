@@ -28,11 +28,11 @@ from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.stanford import Region, stanford
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.ranges.error_model import ErrorBins, ErrorModel, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, fit_bins
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe

@@ -34,12 +34,12 @@ from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import misfit, position_on_line
-from railfix.positioning.range_arrays import FILLER_SATELLITE_M, InterSystemBiases, Ranges
+from railfix.positioning.range_arrays import FILLER_SATELLITE_M, Ranges
 from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorBins, read_error_model, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run.driver import open_inputs
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.record import read_record
 from railfix.track.trajectory import Trajectory
 
@@ -303,7 +303,7 @@ def judged(
 def _bias(file: Path, result: AntennaResult, one: Recording) -> np.ndarray:
     """Largest nominal bias of each range by the model, shape (T, K)."""
     columns = result.columns
-    arc, _ = one.trajectory.nearest(np.nan_to_num(result.conventional_ecef_m))
+    arc, _ = one.trajectory.nearest(np.nan_to_num(result.point.ecef_m))
     turned = result.azimuth_deg[:, columns] - one.trajectory.body_azimuth_deg(arc)[:, None]
     _, bias = read_error_model(file).at(result.elevation_deg[:, columns], turned, result.cn0_dbhz[:, columns])
     return np.nan_to_num(bias)
@@ -312,7 +312,7 @@ def _bias(file: Path, result: AntennaResult, one: Recording) -> np.ndarray:
 def _with_scale(one: Recording, result: AntennaResult, config: Config, scale: np.ndarray) -> ProtectionLevel:
     """The levels of the run with another scale of the ranges' sigmas."""
     has = np.isfinite(result.protection.level.level_m)
-    arc, section = np.where(has, result.constrained.arc_m, np.nan), np.maximum(result.constrained.section, 0)
+    arc, section = np.where(has, result.fix.constrained.arc_m, np.nan), np.maximum(result.fix.constrained.section, 0)
     return protection_level(
         linear_model(ranges_of(result), one.trajectory, arc, section=section),
         [name[0] for name in result.satellite[result.columns].tolist()],
@@ -329,13 +329,11 @@ def ranges_of(result: AntennaResult, reasons: int = -1) -> Ranges:
     sigma, code = result.sigma_m[:, columns], result.corrected_code_m[:, columns]
     used = ((result.reason[:, columns] & reasons) == 0) & np.isfinite(sigma) & np.isfinite(code)
     return Ranges(
-        sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, FILLER_SATELLITE_M),
+        sat_ecef_m=np.where(used[..., None], result.corrected.satellites.position_ecef_m, FILLER_SATELLITE_M),
         code_m=np.where(used, code, 0.0),
         weight=np.where(used, 1.0 / np.where(used, sigma, 1.0) ** 2, 0.0),
         groups=clock_groups(result.satellite[columns].astype("<U1")),
-        ties=InterSystemBiases(offset_m=result.clock_offset_m, sigma_m=result.clock_offset_sigma_m)
-        if len(result.clocks) > 1
-        else None,
+        ties=result.ties if len(result.corrected.channels.clocks) > 1 else None,
     )
 
 
@@ -343,15 +341,15 @@ def _moved(one: Recording, result: AntennaResult, used: np.ndarray, place: np.nd
     """What a metre of each range does to the position along the line, and code less range to the true place less
     their median: errors of all clocks together, for constellations too small for a clock of their own."""
     ranges = ranges_of(result)
-    arc = np.where(np.isfinite(result.arc_m), result.constrained.arc_m, np.nan)
-    section = np.maximum(result.constrained.section, 0)
+    arc = np.where(np.isfinite(result.arc_m), result.fix.constrained.arc_m, np.nan)
+    section = np.maximum(result.fix.constrained.section, 0)
     model = linear_model(ranges, one.trajectory, arc, section=section)
     gain = np.einsum("tkj,tj->tk", model.design, model.covariance_m2[:, 0]) * model.root_weight
     offset = np.zeros(used.shape)
     if ranges.ties is not None:
         for g, group in enumerate(ranges.groups):
             offset[:, group] = np.where(ranges.ties.sigma_m[:, g] < 1e5, ranges.ties.offset_m[:, g], 0.0)[:, None]
-    distance, _ = range_with_rotation(result.satellites.position_ecef_m, place[:, None, :])
+    distance, _ = range_with_rotation(result.corrected.satellites.position_ecef_m, place[:, None, :])
     misfit = result.corrected_code_m[:, result.columns] - distance - offset
     says = np.where(used, misfit, np.nan)
     some = np.isfinite(says).any(axis=1)
@@ -410,7 +408,7 @@ def _where(one: Judged, t: int) -> str:
     again = float(np.linalg.norm(line.at_arc(other.arc_m)[0] - one.place_ecef_m[t]))
     return (
         f"found {straight:.0f} m away in a straight line, {abs(float(result.arc_m[t] - true_arc[0])):.0f} m along it, "
-        f"cosine of the directions {turned:+.2f}, own sigma {result.own_sigma_m[t]:.0f} m; "
+        f"cosine of the directions {turned:+.2f}, own sigma {result.epoch_sigma_m[t]:.0f} m; "
         f"best fit without those off: {again:.0f} m away"
     )
 
@@ -570,7 +568,7 @@ def constant_parts(groups: list[Group]) -> list[str]:
         (one,) = group
         at = np.flatnonzero(np.isfinite(one.error_m) & (np.abs(one.error_m) < 50.0))
         latitude, longitude, _ = geodetic_from_ecef(one.place_ecef_m[at[0]])
-        level = one.trajectory.tangent[one.result.constrained.section[at]] @ enu_axes(latitude, longitude)[:2].T
+        level = one.trajectory.tangent[one.result.fix.constrained.section[at]] @ enu_axes(latitude, longitude)[:2].T
         shift, *_ = np.linalg.lstsq(level, one.error_m[at], rcond=None)
         left = one.error_m[at] - level @ shift
         rows.append(

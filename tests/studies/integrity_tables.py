@@ -254,7 +254,7 @@ def start_rows() -> Iterator[str]:
     yield f"{'estimator':24s}     clean" + "".join(f"{f'{size} m: median':>17s}   worst" for size in (10, 20, 100))
     case = cases()["demo"]
     clean = case.solved(parse_config({"filter": "off", "screens": ["elevation"]}))
-    has = np.flatnonzero(np.isfinite(clean.constrained.arc_m))[::20]
+    has = np.flatnonzero(np.isfinite(clean.fix.constrained.arc_m))[::20]
     columns = clean.columns
     used = (clean.reason[has][:, columns] == 0) & np.isfinite(clean.sigma_m[has][:, columns])
     ranges = Ranges(
@@ -268,11 +268,11 @@ def start_rows() -> Iterator[str]:
     offset = np.zeros(used.shape)
     for g, letter in enumerate(clean.clocks):
         mine = np.isin(systems, ["G", "J"] if letter == "G" else [letter])
-        offset[:, mine] = clean.clock_offset_m[has][:, g, None]
+        offset[:, mine] = clean.ties.offset_m[has][:, g, None]
     ranges = replace(ranges, code_m=np.where(used, ranges.code_m - offset, 0.0))
-    arc = clean.constrained.arc_m[has]
+    arc = clean.fix.constrained.arc_m[has]
     place = case.trajectory.at_arc(arc)
-    prior = map_information(case.trajectory, np.maximum(clean.constrained.section[has], 0))
+    prior = map_information(case.trajectory, np.maximum(clean.fix.constrained.section[has], 0))
     for name, estimate in ESTIMATORS.items():
         base = estimate(ranges, place, prior)
         known = base > 0.0  # not where too few ranges are left to agree
@@ -474,7 +474,7 @@ def late_rows() -> Iterator[str]:
         result = case.solved()
         assert result.protection is not None
         for how in REWEIGHTINGS:
-            fixed, movement = result.constrained, np.zeros(len(result))
+            fixed, movement = result.fix.constrained, np.zeros(len(result))
             if how is not None:
                 arc = np.where(np.isfinite(result.arc_m), fixed.arc_m, np.nan)
                 movement = reweighted(ranges_of(result), case.trajectory, arc, fixed.section, result.noise_scale, how)

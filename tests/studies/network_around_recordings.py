@@ -31,10 +31,10 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.core.timescale import timedelta
 from railfix.evaluate import interpolate_reference
 from railfix.io import read_navigation, read_observations
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import locate
 from railfix.pipeline.received import known_from_start
+from railfix.pipeline.without_map import locate
 from railfix.run import RunInputs, RunOptions, TrackReading, run_files
 from railfix.track import Track, from_positions
 from railfix.track.network_match import match, plan_log

@@ -368,7 +368,7 @@ def breaking_lines(campaign: Campaign, way: str) -> Iterator[str]:
             yield (
                 f"{passage.run} {passage.antenna:5s} {str(passage.time[t])[11:21]} {passage.chainage_m[t]:6.0f} m "
                 f"{passage.environment[t]:9s} {passage.speed_mps[t]:4.1f} m/s {item.error_m:+7.1f} m "
-                f"{Status(int(found.status[t])).text} own {found.own_sigma_m[t]:.1f} m dilution {item.dilution:.1f} "
+                f"{Status(int(found.status[t])).text} own {found.epoch_sigma_m[t]:.1f} m dilution {item.dilution:.1f} "
                 f"late {item.late} of {found.n_used[t]}: {item.signals}"
                 + (f" (largest of {together_in_time})" if together_in_time > 1 else "")
             )

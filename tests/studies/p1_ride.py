@@ -22,10 +22,10 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.sensors import read_sensors
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
@@ -305,7 +305,7 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
     """Errors of one way out of a result."""
     conventional = way.positions in ("conventional", "validated")
     chainage = got.conventional_chainage_m if conventional else got.chainage_m
-    place = got.conventional_ecef_m if conventional else got.ecef_m
+    place = got.point.ecef_m if conventional else got.ecef_m
     if way.positions == "filtered":
         assert track is not None
         chainage, place = track.chainage_m, track.ecef_m
@@ -315,13 +315,13 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
     if way.positions == "checked":
         kept = ~np.isin(got.status, CHECK_FAILED)
     if way.positions not in ("conventional", "validated", "filtered"):
-        kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
+        kept &= (got.epoch_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
     error = chainage - truth.chainage_m
     return Found(
         error_m=np.where(kept, error, np.nan),
         status=got.status,
         n_used=got.n_used,
-        own_sigma_m=got.own_sigma_m,
+        own_sigma_m=got.epoch_sigma_m,
         horizontal_m=horizontal_m(place - truth.ecef_m, truth.ecef_m),
     )
 
@@ -342,7 +342,7 @@ def broken(piece: Piece, got: AntennaResult, found: Found, t: int, *, passage: i
         passage=passage,
         epoch=before + t,
         error_m=float(found.error_m[t]),
-        dilution=float(got.constrained.dilution[t]),
+        dilution=float(got.fix.constrained.dilution[t]),
         late=int(np.count_nonzero(np.abs(wrong[used] - np.quantile(wrong[used], 0.25)) > LATE_M)) if len(used) else 0,
         signals=" ".join(
             f"{observed.satellite[k]}({geometry.elevation_deg[t, k]:.0f},{around[k]:+.0f},"

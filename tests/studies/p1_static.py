@@ -20,7 +20,7 @@ from railfix.core.reasons import Status
 from railfix.core.settings import write_toml
 from railfix.gnss.observations import Observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.line_file import Element, LineSettings
@@ -155,7 +155,7 @@ def subsets(start: np.datetime64, seed: int, size: int, place: Place, places: Se
             continue
         result, _ = processor.process({"front": only(observations, chosen, epochs)})
         got = result.antennas["front"]
-        fitted = got.constrained
+        fitted = got.fix.constrained
         has = np.isfinite(fitted.arc_m)
         chainage = processor.trajectories["front"].chainage_at(fitted.arc_m)
         parts.append(
@@ -166,7 +166,7 @@ def subsets(start: np.datetime64, seed: int, size: int, place: Place, places: Se
                 sigma_m=fitted.sigma_m[has],
                 dilution=fitted.dilution[has],
                 status=got.status[has],
-                excess=got.section.excess[has],
+                excess=got.fix.section.excess[has],
             )
         )
     return joined(parts)

@@ -77,7 +77,7 @@ def sense(
     """The slip detection of a run, with or without the line's gradient and the gyro."""
     scenario = simulation.scenario
     trajectory = trajectory_of(simulation)
-    course = Line.of(trajectory)
+    course = Line(trajectory)
     kept: list[SlipResult] = []
 
     def sine_at(arc_m: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from railfix.integrity.raim import Outcome, RaimLimits
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.results import AntennaResult
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -146,7 +146,7 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
     latitude, longitude, _ = geodetic_from_ecef(place)
     axes = enu_axes(latitude, longitude)[:2].T
     along = along_track_error(result.arc_m, reference, trajectory)
-    on_line, in_space = (result.ecef_m - place) @ axes, (result.conventional_ecef_m - place) @ axes
+    on_line, in_space = (result.ecef_m - place) @ axes, (result.point.ecef_m - place) @ axes
     return Day(observations, result, along, on_line, in_space)
 
 

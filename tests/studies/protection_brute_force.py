@@ -25,7 +25,7 @@ import synthetic
 from railfix.core.geodesy import range_with_rotation
 from railfix.integrity.protection import ProtectionLevel, RiskBudget, protection_level
 from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, exclude, linear_model
-from railfix.integrity.raim.model import compact
+from railfix.integrity.raim.position_model import compact
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.channels import clock_groups
 from railfix.track.trajectory import Trajectory

@@ -24,6 +24,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.noise_windows import Windows
 from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
 from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.receiver_noise import (
@@ -37,10 +38,9 @@ from railfix.positioning.receiver_noise import (
 )
 from railfix.positioning.search_index import SearchIndex
 from railfix.positioning.section_search import find_section
-from railfix.positioning.windows import Windows
 from railfix.ranges.channels import clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.track import Track, from_positions
 from railfix.track.trajectory import Trajectory
 

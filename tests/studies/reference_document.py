@@ -30,7 +30,7 @@ from railfix.evaluate import (
 from railfix.evaluate.intervals import BRANCH_COLUMNS, OUTAGE_COLUMNS
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS, UNITS, Column
-from railfix.pipeline.tables import PASSING_COLUMNS, SMOOTHED_COLUMNS, TRAIN_COLUMNS
+from railfix.pipeline.result_tables import PASSING_COLUMNS, SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
 

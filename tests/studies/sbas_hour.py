@@ -22,7 +22,7 @@ import paths
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.gnss.orbits import satellite_states
 from railfix.integrity.protection import protection_level
-from railfix.integrity.protection.level import RangeBounds
+from railfix.integrity.protection.solution_separation import RangeBounds
 from railfix.integrity.raim import linear_model
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
@@ -33,7 +33,7 @@ from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorModel, read_error_model
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
-from railfix.ranges.sources import apply_long_term
+from railfix.ranges.sbas.sbas_sources import apply_long_term
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

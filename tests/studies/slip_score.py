@@ -81,7 +81,7 @@ def scored(simulation: Simulation, scores: dict[str, Score]) -> None:
     samples, _ = sensors_of(simulation)
     begin = scenario.start
     trajectory = Trajectory.from_antenna_path(line.track())
-    course = Line.of(trajectory)
+    course = Line(trajectory)
 
     def sine_at(arc: np.ndarray) -> np.ndarray:
         slope = course.gradient_at(arc)

@@ -83,9 +83,9 @@ def parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
 #: Modules of the public stages by hand with the filter, and of the processor with the tables of results.
 STAGES = (
     "ranges.corrected", "ranges.sources", "positioning.approximate", "positioning.inter_system", "positioning.line_fix",
-    "integrity.fault_exclusion", "integrity.protection.level", "screens.elevation", "tracking.filter",
+    "integrity.fault_exclusion", "integrity.protection.solution_separation", "screens.elevation", "tracking.filter",
 )  # fmt: skip
-PROCESSOR = ("pipeline.processor", "pipeline.tables")
+PROCESSOR = ("pipeline.processor", "pipeline.result_tables")
 
 
 def import_closure(trees: dict[Path, ast.Module], source: Path, modules: tuple[str, ...]) -> set[Path]:
@@ -99,7 +99,12 @@ def import_closure(trees: dict[Path, ast.Module], source: Path, modules: tuple[s
             continue
         found.add(path)
         for node in ast.walk(trees[path]):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "kernels":
+                # kernels are imported where they are called, so is their file counted
+                waiting.extend(names[each] for each in (f"kernels.{node.attr}",) if each in names)
             if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("railfix"):
+                continue
+            if node.module == "railfix" and path.name != "__init__.py":
                 continue
             inner = (node.module or "").removeprefix("railfix").lstrip(".")
             for name in (inner, *(f"{inner}.{alias.name}".lstrip(".") for alias in node.names)):

@@ -34,7 +34,7 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.raim import detect
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.screens import DopplerLimits
 from recordings_score import straight_line, trajectory_of
 

@@ -134,9 +134,12 @@ def test_the_level_follows_from_what_the_result_tells(groups):
     """Sigma of the position once more from sigmas, satellites and clocks in the result."""
     (one,) = groups["urbannav_f9p", "all others"]
     result = one.result
-    arc = np.where(np.isfinite(result.arc_m), result.constrained.arc_m, np.nan)
+    arc = np.where(np.isfinite(result.arc_m), result.fix.constrained.arc_m, np.nan)
     model = linear_model(
-        integrity_recordings.ranges_of(result), one.trajectory, arc, section=np.maximum(result.constrained.section, 0)
+        integrity_recordings.ranges_of(result),
+        one.trajectory,
+        arc,
+        section=np.maximum(result.fix.constrained.section, 0),
     )
     level, scale = result.protection.level, result.noise_scale
     has = np.isfinite(level.sigma_m) & np.isfinite(result.arc_m)

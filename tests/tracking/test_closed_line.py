@@ -18,7 +18,7 @@ from railfix.evaluate import evaluate_run
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensor_epochs import SensorLimits
-from railfix.pipeline.smoothing import Replay, smooth
+from railfix.pipeline.smoothed_track import Replay, smooth
 from railfix.positioning.normal_equations import point_position, position_on_line
 from railfix.positioning.search_index import SearchIndex
 from railfix.positioning.section_search import SectionLimits, find_section
@@ -47,11 +47,11 @@ def ring(laps: float, *, apart_m: float = 0.0, backward: bool = False) -> Trajec
 
 
 def test_where_a_line_closes() -> None:
-    closed = Line.of(ring(1.0))
+    closed = Line(ring(1.0))
     length = closed.arc_m[-1]
     # The end is the start; both lie on the other's vertex, of which no segment ends there.
     assert closed.joins_m == pytest.approx((length, 0.0), abs=1e-3)
-    overlapping = Line.of(ring(1.2))
+    overlapping = Line(ring(1.2))
     assert overlapping.joins_m == pytest.approx((length, 0.2 * length), abs=0.5)
     np.testing.assert_allclose(
         overlapping.round_m(np.array([-5.0, 10.0, 1.2 * length + 5.0])), [length, 0.0, -length], atol=0.5
@@ -60,8 +60,8 @@ def test_where_a_line_closes() -> None:
 
 @pytest.mark.parametrize("line", [bent_line(), ring(0.9), ring(1.0, apart_m=4.0)], ids=["bent", "gap", "4 m beside"])
 def test_open_lines_do_not_close(line: Trajectory) -> None:
-    assert np.isnan(Line.of(line).joins_m).all()
-    whole = Line.of(line).records[1][0]
+    assert np.isnan(Line(line).joins_m).all()
+    whole = Line(line).records[1][0]
     assert (whole["start_m"], whole["end_m"]) == pytest.approx((0.0, line.arc_m[-1]))
 
 
@@ -71,7 +71,7 @@ def test_the_filter_goes_round(backward: bool) -> None:
     closed, laps = ring(1.0), ring(3.0, backward=backward)
     length = closed.arc_m[-1]
     case = ride(300, trajectory=laps, start_m=100.0, noise=1.0)
-    found, _ = track(case.epochs, Line.of(closed))
+    found, _ = track(case.epochs, Line(closed))
     true = np.mod(-case.arc_m if backward else case.arc_m, length)
     error = np.mod(found.arc_m - true + 0.5 * length, length) - 0.5 * length
     assert case.arc_m[-1] > 1.5 * length
@@ -87,7 +87,7 @@ def round_the_ring(found_m: np.ndarray, true_m: np.ndarray, length_m: float) -> 
 
 @pytest.mark.requirement("E5")
 def test_beyond_the_end_the_ring_goes_on() -> None:
-    line, laps = Line.of(ring(1.0)), Line.of(ring(3.0))
+    line, laps = Line(ring(1.0)), Line(ring(3.0))
     length = float(line.arc_m[-1])
     arc = np.array([-0.4, 0.3, 1.001, 1.2, 2.7]) * length
     for given, expected in zip(line.at(arc), laps.at(np.mod(arc, length)), strict=True):
@@ -97,8 +97,8 @@ def test_beyond_the_end_the_ring_goes_on() -> None:
     np.testing.assert_allclose(
         line.nearest_m(both, np.array(2.0 * length + 5.0)), [2.0 * length + 3.0, 2.0 * length - 3.0]
     )
-    open_line = Line.of(bent_line())
-    into_itself, last = Line.of(bent_line()), float(open_line.arc_m[-1])
+    open_line = Line(bent_line())
+    into_itself, last = Line(bent_line()), float(open_line.arc_m[-1])
     into_itself.__dict__["joins_m"] = (np.nan, 200.0)  # its end goes on at 200 m
     either = np.array([last - 3.0, 203.0])
     np.testing.assert_allclose(into_itself.nearest_m(either, np.array(last + 5.0)), [last - 3.0, last + 3.0])
@@ -127,8 +127,8 @@ def test_an_outage_across_the_join_changes_nothing(kind: str) -> None:
         out[cross - 8 : cross + 8] = True
         epochs, true = without_epochs(epochs, out), case.arc_m
         sensors = wheel(case) if kind == "wheel" else None
-    found, _ = track(epochs, Line.of(closed), sensors=sensors)
-    same, _ = track(epochs, Line.of(laps), sensors=sensors)
+    found, _ = track(epochs, Line(closed), sensors=sensors)
+    same, _ = track(epochs, Line(laps), sensors=sensors)
     np.testing.assert_allclose(round_the_ring(found.arc_m, same.arc_m, length)[30:], 0.0, atol=0.05)
     assert set(found.status[30:].tolist()) <= {TrackStatus.TRACKING, TrackStatus.COASTING, TrackStatus.DOUBTFUL}
     assert np.abs(round_the_ring(found.arc_m, true, length)[~out[: len(true)]][30:]).max() < 1.0
@@ -139,7 +139,7 @@ def test_smoothed_places_go_round() -> None:
     closed, laps = ring(1.0), ring(2.0)
     length = float(closed.arc_m[-1])
     case = ride(60, trajectory=laps, start_m=length - 250.0, noise=1.0)
-    both = smooth([Replay(epochs=case.epochs, sensors=SensorEpochs(), before=None)], Line.of(closed), TrackingLimits())
+    both = smooth([Replay(epochs=case.epochs, sensors=SensorEpochs(), before=None)], Line(closed), TrackingLimits())
     assert case.arc_m[-1] > length + 100.0
     assert (both.arc_m >= 0.0).all()
     assert (both.arc_m <= length).all()
@@ -148,7 +148,7 @@ def test_smoothed_places_go_round() -> None:
 
 @pytest.mark.requirement("E5")
 def test_codes_that_come_back_beyond_the_join_count() -> None:
-    line = Line.of(ring(1.0))
+    line = Line(ring(1.0))
     length = float(line.arc_m[-1])
     time = START + timedelta(np.arange(8.0))
     observed = np.arange(8) >= 3

@@ -11,7 +11,7 @@ from railfix.motion.features import line_series
 from railfix.motion.samples import GroundUnits, RadarSpeeds
 from railfix.motion.slip import MotionState
 from railfix.motion.tachometer import TachometerLimits
-from railfix.pipeline.tables import antenna_train
+from railfix.pipeline.result_tables import antenna_train
 from railfix.run.sensor_checks import doppler_speeds, sensor_notes
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind

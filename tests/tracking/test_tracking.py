@@ -314,7 +314,7 @@ def test_a_train_that_leaves_the_map_has_no_level(speed_mps: float, stop_s: int)
     case = ride(
         60, trajectory=whole, start_m=start_m, noise=0.5, speed_mps=lambda t: np.where(t < stop_s, speed_mps, 0.0)
     )
-    result, _ = track(case.epochs, Line.of(Trajectory.from_antenna_path(Track.from_ecef(points))), levels=True)
+    result, _ = track(case.epochs, Line(Trajectory.from_antenna_path(Track.from_ecef(points))), levels=True)
     over = np.abs(np.clip(result.arc_m, 0.0, 1500.0) - case.arc_m) > result.level_m
     assert not over.any()
     assert np.isfinite(result.level_m[20:30]).all()

@@ -14,7 +14,7 @@ from railfix.core.geodesy import enu_axes
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking.constants import BIAS_FAULTY, BIAS_SHORT
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.tally import Tally
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -105,7 +105,7 @@ def test_many_faulty_satellites_are_a_wrong_map() -> None:
     )
     north = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))[1]
     aside = Track.from_ecef(np.asarray(turning.ecef_m) + 10.0 * north)
-    line = Line.of(Trajectory.from_antenna_path(aside))
+    line = Line(Trajectory.from_antenna_path(aside))
     wrong, _ = track(case.epochs, line, levels=True)
     many = wrong.faulty.sum(axis=1) > 2
     assert many.sum() > 50

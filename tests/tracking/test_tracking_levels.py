@@ -133,7 +133,7 @@ def test_the_bound_of_an_epoch_between_by_hand() -> None:
     state = LevelState(
         since=AccumulatedIncrement(start=case.epochs.time[0], number=0),
         time=case.epochs.time[0],
-        values=np.array([100.0, 10.0, 5.0, 6.0, 3.0, 0.5, 2.0, 7.0, 0.0]),
+        values=np.array([100.0, 10.0, 5.0, 6.0, 3.0, 0.5, 2.0, 0.0, 7.0, 0.0]),
     )
     none = np.empty(0, dtype=np.intp)
     levels, after = carried_levels(found, epochs, none, Tracked.empty(epochs.time[:0], 10), case.line, state, LIMITS)

@@ -11,7 +11,7 @@ import filter_score
 import recordings_score
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 
 #: Recording: median, 95th percentile, largest error [m], 95th percentile of error over sigma.
 BOUNDS = {

@@ -95,7 +95,7 @@ def describe_errors(evaluation: Evaluation) -> str:
 
 def _judge(row: Mapping[str, Any]) -> str:
     """Return one run and antenna in a sentence."""
-    from railfix.evaluate.figures import WRONG_PLACE_M
+    from railfix.evaluate.accuracy import WRONG_PLACE_M
 
     name = f"{row['run']}, {row['antenna']}"
     if not row["errors"]:

@@ -33,7 +33,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.settings import validate
 from railfix.core.tables import Column, listing, number, percent, plain_table, signed
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
-from railfix.evaluate.inputs import POSITIONS_TABLE, TABLES, EvaluationInputs, list_position_tables
+from railfix.evaluate.evaluation_inputs import POSITIONS_TABLE, TABLES, EvaluationInputs, list_position_tables
 from railfix.evaluate.range_errors import ModelInputs, StationBeside, error_model_from_runs
 from railfix.evaluate.tables import P1_COMMERCIAL, P1_TABLE_4, error_tables, group_tables, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
@@ -45,7 +45,7 @@ from railfix.reference import ReferenceInputs, ReferenceOptions, ReferenceSettin
 from railfix.run import read_record
 from railfix.run.inputs import LogReading
 from railfix.run.output import OutputFolder
-from railfix.run.processor import parse_position
+from railfix.run.processor_setup import parse_position
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation

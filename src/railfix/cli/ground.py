@@ -88,7 +88,7 @@ def monitor(
     Exit codes are those of `railfix --help`; 5 where the logs have no satellite or no epoch in common.
     """
     from railfix.ground.station_fixes import read_fixes
-    from railfix.ground.triangle import TriangleVerdict, draw_triangle, monitor_log
+    from railfix.ground.triangle import draw_triangle, monitor_log
 
     if len(logs) != 3:
         raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
@@ -114,15 +114,21 @@ def monitor(
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
     console = TableConsole()
-    counted = zip(*np.unique(result.triangle.verdict, return_counts=True), strict=True)
-    rows = [[TriangleVerdict(int(value)).name.lower(), str(count)] for value, count in counted]
-    show_table(console, plain_table(["verdict", "epochs"], rows, texts=2, boxed=True))
+    _show_verdicts(console, Counter(result.triangle.verdict.tolist()))
     for time, order, cause, receiver in result.orders:
         named = "" if receiver < 0 else f", receiver {receiver}"
         console.print(f"{np.datetime_as_string(time, unit='s')} {order.value}: {cause.name.lower()}{named}")
     if not result.orders:
         console.print("no stop")
     show_files(console, files)
+
+
+def _show_verdicts(console: TableConsole, epochs: Counter[int]) -> None:
+    """Print how many epochs have each verdict."""
+    from railfix.ground.triangle import TriangleVerdict
+
+    rows = [[TriangleVerdict(verdict).name.lower(), str(count)] for verdict, count in sorted(epochs.items())]
+    show_table(console, plain_table(["verdict", "epochs"], rows, texts=2, boxed=True))
 
 
 def _monitor_live(
@@ -133,10 +139,10 @@ def _monitor_live(
     import time
 
     from railfix.ground.station_fixes import stream_fixes
-    from railfix.ground.triangle import LiveMonitor, TriangleVerdict
+    from railfix.ground.triangle import LiveMonitor
     from railfix.io import read_navigation
     from railfix.live.sources import check_source, is_file
-    from railfix.run.processor import parse_position
+    from railfix.run.processor_setup import parse_position
 
     if not choices.point:
         raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")
@@ -144,7 +150,7 @@ def _monitor_live(
         check_source(source)
     points = np.stack([parse_position(text, "--point") for text in choices.point])
     navigation = read_navigation(choices.nav) if choices.nav else None
-    monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[str](), TableConsole()
+    monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[int](), TableConsole()
     recorded = all(is_file(source) for source in sources)
 
     def show(orders: tuple[Order, ...], when: str) -> None:
@@ -160,7 +166,7 @@ def _monitor_live(
             judged, orders = monitor.judge(fixes, tag_s if recorded else time.monotonic())
             judged.table().write_csv(file, include_header=not counts)
             file.flush()
-            counts[TriangleVerdict(int(judged.triangle.verdict[0])).name.lower()] += 1
+            counts[int(judged.triangle.verdict[0])] += 1
             show(orders, np.datetime_as_string(fixes.time[0], unit="s"))
 
     async def watch() -> None:
@@ -185,8 +191,7 @@ def _monitor_live(
             asyncio.run(session())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-    rows = [[name, str(count)] for name, count in sorted(counts.items())]
-    show_table(console, plain_table(["verdict", "epochs"], rows, texts=2, boxed=True))
+    _show_verdicts(console, counts)
     if not monitor.state.stopped:
         console.print("no stop")
     show_files(console, [path])

@@ -22,9 +22,9 @@ from railfix.cli.options import (
 )
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.tables import plain_table, plural
-from railfix.evaluate.inputs import TABLES, list_position_tables, read_run
+from railfix.evaluate.evaluation_inputs import TABLES, list_position_tables, read_run
 from railfix.io.positions_export import style_file, write_positions
-from railfix.pipeline.tables import round_floats
+from railfix.pipeline.result_tables import round_floats
 from railfix.run.convert import write_mcap
 from railfix.run.inputs import LogReading, input_path
 from railfix.run.locate import LocateInputs, locate_files

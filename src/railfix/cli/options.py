@@ -21,7 +21,7 @@ from railfix.core.settings import INPUTS, Settings, option, read_toml
 from railfix.core.timescale import utc_to_gpst
 from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
 from railfix.run.output import FileKind, Overwrite, check_output_file
-from railfix.run.processor import with_measured_priors
+from railfix.run.processor_setup import with_measured_priors
 
 _DAY: Final = "%Y-%m-%d"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
@@ -18,14 +18,7 @@ EVERY: Final = slice(None)  #: All rows.
 
 
 class OnDemand:
-    """Base of dataclasses with fields computed at first access, as most are not used for each epoch."""
-
-    @classmethod
-    def create(cls: type[Value], later: Callable[[str], Mapping[str, Any]], **members: Any) -> Value:
-        """Return an instance with some fields; `later` returns another field by name, with fields computed in the same
-        step.
-        """
-        return cast(Value, _make(cls, {**members, "_later": later}))
+    """Base of dataclasses whose fields are taken at first access, as most are not used for each epoch."""
 
     if not TYPE_CHECKING:
 
@@ -33,8 +26,7 @@ class OnDemand:
             own = self.__dict__
             if "_later" not in own or name not in _members(self.__class__):
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            own.update(own["_later"](name))
-            return own[name]
+            return own.setdefault(name, own["_later"](name))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all fields, for another process."""
@@ -85,16 +77,13 @@ def _take_epochs(value: Any, rows: slice | Indices) -> Any:
         return value[rows]
     if not (has_rows := _members(value.__class__)):
         return value
-    own, members = value.__dict__, {}
+    own, members = value.__dict__, dict[str, Any]()
     if isinstance(value, OnDemand):
-        for name, item in own.items():
-            if item.__class__ is np.ndarray and has_rows[name]:
-                members[name] = item[rows]
+        members = {n: item[rows] for n, item in own.items() if item.__class__ is np.ndarray and has_rows[n]}
         for name in _defaults(cast(Any, value.__class__)):  # they would hide that a field is to be taken
             members[name] = _take_epochs(own[name], rows)
-        return value.create(
-            lambda n: {n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)}, **members
-        )
+        members["_later"] = lambda n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)
+        return _make(type(value), members)
     for name, of_rows in has_rows.items():
         item = own[name]
         if of_rows and item is not None:

@@ -4,10 +4,10 @@ The error is the distance along the map from the reference's own point on it to 
 the line whichever way the train runs (P1 3.3, 5).
 """
 
-from railfix.evaluate.epochs import EPOCH_COLUMNS
+from railfix.evaluate.accuracy import FIGURE_COLUMNS, WRONG_PLACE_M, Score, score
+from railfix.evaluate.epoch_table import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_run, evaluate_runs
-from railfix.evaluate.figures import FIGURE_COLUMNS, WRONG_PLACE_M, Score, score
-from railfix.evaluate.inputs import EvaluationOptions
+from railfix.evaluate.evaluation_inputs import EvaluationOptions
 from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS, Integrity
 from railfix.evaluate.intervals import INTERVAL_COLUMNS, LEVEL_COLUMNS
 from railfix.evaluate.place import TrackFiles, along_track_error, interpolate_reference, straight_distance

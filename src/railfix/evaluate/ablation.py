@@ -15,19 +15,19 @@ import polars as pl
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.core.reasons import Status
-from railfix.evaluate.figures import Score, score
+from railfix.evaluate.accuracy import Score, score
 from railfix.evaluate.place import along_track_error, interpolate_reference
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.filter_result import AlongTrack
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.driver import Progress, collect_notes, open_inputs, read_samples_and_units
 from railfix.run.inputs import ColumnNames, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.record import NO_FIGURES, RunProvenance, package_versions, run_record
 from railfix.run.sensors import load_balises
 from railfix.run.sources import align_logs
@@ -147,36 +147,22 @@ def ablate_files(
     began = clock.perf_counter()
     options = options or RunOptions()
     inputs, config = inputs.prepare(config or Config())
-    with (
-        OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
-        ThreadPoolExecutor(max_workers=1) as pool,
-    ):
+    given = OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths)
+    with given as folder, ThreadPoolExecutor(max_workers=1) as pool:
         entries = inputs.entries(pool, out)
-        antennas = tuple(inputs.logs)
-        truth = (
-            None
-            if inputs.truth is None
-            else read_reference(inputs.truth, antennas, **(reading or ColumnNames()).arguments)
-        )
+        antennas, truth = tuple(inputs.logs), {}
+        if inputs.truth is not None:
+            truth = read_reference(inputs.truth, antennas, **(reading or ColumnNames()).arguments)
         navigation, line, logs = open_inputs(inputs, options, config)
         screens, left_out = judging_screens(config, line.trajectories)
-        # protection levels are not part of the result
-        plain = config.model_copy(update={"protection": "off", "filter": "off"})
-        settings = {name: plain.model_copy(update={"screens": chosen}) for name, chosen in choices(screens).items()}
-        if config.filter == "track":
-            filtered = plain.model_copy(update={"filter": "track", "screens": screens})
-            settings |= {
-                name: filtered.model_copy(update={"filter_sources": chosen})
-                for name, chosen in filter_choices(inputs, config.filter_sources).items()
-            }
+        settings = _settings_of_choices(inputs, config, screens)
         sensors, units = read_samples_and_units(inputs)
         balises = load_balises(inputs.balises, inputs.balise_list, None, line.track, config)
         processors = {
             name: make_processor(chosen, navigation, line.trajectories, track=line.track, units=units, balises=balises)
             for name, chosen in settings.items()
         }
-        received = np.datetime64("NaT", "ns")
-        states = dict.fromkeys(processors, State())
+        received, states = np.datetime64("NaT", "ns"), dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
         parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
         for chunk in align_logs({name: log.parts() for name, log in logs.items()}):
@@ -187,8 +173,8 @@ def ablate_files(
                 result, states[name] = processor.process(chunk, states[name], sensors=since)
                 tallies[name].add(result)
                 for antenna, positions in result.antennas.items():
-                    reference = None if truth is None else truth[antenna]
-                    columns = _columns(positions, result.fusion.get(antenna), reference, line.trajectories[antenna])
+                    reference, trajectory = truth.get(antenna), line.trajectories[antenna]
+                    columns = _columns(positions, result.fusion.get(antenna), reference, trajectory)
                     parts.setdefault((name, antenna), []).append(columns)
             check_same_day(navigation, tallies[NONE])
             check_same_place(tallies[NONE], antennas="all")
@@ -200,8 +186,8 @@ def ablate_files(
             for antenna in inputs.logs
             for name, processor in processors.items()
         )
-        threshold = config.map_offset.note_threshold
-        notes = (*left_out, *collect_notes(line, navigation, tallies[ALL], logs, note_statistic=threshold))
+        found = collect_notes(line, navigation, tallies[ALL], logs, note_statistic=config.map_offset.note_threshold)
+        notes = (*left_out, *found)
         wall = clock.perf_counter() - began
         made_from = RunProvenance(
             files=[entry.result() for entry in entries],
@@ -218,6 +204,17 @@ def ablate_files(
         folder.write_json("ablation.json", record | {"choices": rows})
         files = folder.commit({})
     return Ablation(effects=effects, notes=notes, files=files, wall_s=wall)
+
+
+def _settings_of_choices(inputs: RunInputs, config: Config, screens: tuple[str, ...]) -> dict[str, Config]:
+    """Return the settings of every choice; protection levels are not part of the result."""
+    plain = config.model_copy(update={"protection": "off", "filter": "off"})
+    settings = {name: plain.model_copy(update={"screens": chosen}) for name, chosen in choices(screens).items()}
+    if config.filter == "track":
+        filtered = plain.model_copy(update={"filter": "track", "screens": screens})
+        for name, sources in filter_choices(inputs, config.filter_sources).items():
+            settings[name] = filtered.model_copy(update={"filter_sources": sources})
+    return settings
 
 
 def _columns(

@@ -24,10 +24,10 @@ from railfix.core.files import fingerprint, read_bytes, write_whole
 from railfix.core.geodesy import sigma_along
 from railfix.core.reasons import Status
 from railfix.core.timescale import nearest_rows, seconds
+from railfix.evaluate.accuracy import ALL, FIGURE_COLUMNS, has_position
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_runs
-from railfix.evaluate.figures import ALL, FIGURE_COLUMNS, has_position
-from railfix.evaluate.inputs import CONVENTIONAL, POSITIONS_TABLE, floats, list_position_tables, read_run
+from railfix.evaluate.evaluation_inputs import CONVENTIONAL, POSITIONS_TABLE, floats, list_position_tables, read_run
 from railfix.evaluate.integrity import STANFORD_COLUMNS
 from railfix.evaluate.place import TrackFiles, find_trajectory
 from railfix.io.file_kind import find_kind

@@ -13,9 +13,9 @@ import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
-from railfix.evaluate.epochs import antenna_epochs, below
-from railfix.evaluate.figures import ALL, KEYS, USED, figures_by
-from railfix.evaluate.inputs import (
+from railfix.evaluate.accuracy import ALL, KEYS, USED, figures_by
+from railfix.evaluate.epoch_table import antenna_epochs, below
+from railfix.evaluate.evaluation_inputs import (
     NO_MORE,
     POSITIONS_TABLE,
     TABLES,
@@ -48,7 +48,7 @@ class RunAndReference:
     run: Path
     reference: Reference = None  #: None: the file of `BESIDE_THE_LOG` in the folder of the run's log.
     configuration: str | None = None  #: Name of its settings; None: composed of those that differ between the runs.
-    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.inputs.list_position_tables`.
+    table: str = POSITIONS_TABLE  #: See `railfix.evaluate.evaluation_inputs.list_position_tables`.
     #: Another run on the same log, whose conventional positions replace the run's own: a run with the elevation and
     #: C/N0 screens alone has those that P1 compares with.
     conventional: Path | None = None
@@ -190,21 +190,9 @@ def _evaluate(
     if item.conventional is not None:
         notes.append(f"the conventional positions are those of {item.conventional}")
         inputs.append(fingerprint("conventional", read_run(item.conventional, columns=NO_MORE).positions_path))
-    if isinstance(item.reference, Mapping):
-        references, source = item.reference, "given"
-        if missing := [name for name in folder.antennas if name not in references]:
-            raise MismatchError(f"{folder.path}: the references given have none of the {missing[0]} antenna; add it")
-    else:
-        path = item.reference or reference_beside(folder)
-        if item.reference is None:
-            notes.append(f"the reference was found beside the log: {path}")
-        if path.resolve().parent == item.run.resolve() and path.name.split(".")[0] in TABLES:
-            raise MismatchError(f"{path}: is a table of the run itself; give a reference that was measured otherwise")
-        key = path, tuple(folder.antennas)
-        if key not in read:
-            reading = options.columns.arguments
-            read[key] = read_reference(path, folder.antennas, quality=options.reference_quality, **reading)
-        references, source = read[key], str(path)
+    references, path = _references(item, folder, read, options)
+    if path is not None:
+        notes += [f"the reference was found beside the log: {path}"] if item.reference is None else []
         inputs.append(fingerprint("reference", path))
     stretches = None
     if sections is not None:
@@ -233,7 +221,7 @@ def _evaluate(
     stated = folder.table != POSITIONS_TABLE or "protection_status" in folder.positions.columns
     if folder.level_kind is not None and not stated:
         notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
-    more = [note for antenna in antennas.values() for note in antenna.errors.notes]
+    notes += [note for antenna in antennas.values() for note in antenna.errors.notes]
     facts = {fact: {name: getattr(antenna, fact) for name, antenna in antennas.items()} for fact in _FACTS}
     run = EvaluatedRun(
         name="",
@@ -241,16 +229,37 @@ def _evaluate(
         line=folder.line_name,
         path=folder.path,
         table=folder.table,
-        reference=source,
+        reference="given" if path is None else str(path),
         method={name: antenna.errors.method for name, antenna in antennas.items()},
         **facts,
         protection=folder.protection,
         settings=folder.settings,
         inputs=tuple(inputs + entries),
-        notes=tuple(dict.fromkeys([*notes, *more])),
+        notes=tuple(dict.fromkeys(notes)),
     )
     level = None if kind is None else (kind, folder.alarm_limit_m)
     return run, [antenna.table for antenna in antennas.values()], level
+
+
+def _references(
+    item: RunAndReference,
+    folder: RunFolder,
+    read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]],
+    options: EvaluationOptions,
+) -> tuple[Mapping[str, AntennaReference], Path | None]:
+    """Return the references of a run by antenna, and their file, None for arrays; a file read is kept in `read`."""
+    if isinstance(item.reference, Mapping):
+        if missing := [name for name in folder.antennas if name not in item.reference]:
+            raise MismatchError(f"{folder.path}: the references given have none of the {missing[0]} antenna; add it")
+        return item.reference, None
+    path = item.reference or reference_beside(folder)
+    if path.resolve().parent == item.run.resolve() and path.name.split(".")[0] in TABLES:
+        raise MismatchError(f"{path}: is a table of the run itself; give a reference that was measured otherwise")
+    key = path, tuple(folder.antennas)
+    if key not in read:
+        reading = options.columns.arguments
+        read[key] = read_reference(path, folder.antennas, quality=options.reference_quality, **reading)
+    return read[key], path
 
 
 def reference_beside(run: RunFolder) -> Path:

@@ -14,8 +14,8 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats, Masks, Strings
-from railfix.evaluate.figures import ALL, KEYS, PASSED
-from railfix.evaluate.inputs import WINDOWS_S, EvaluationOptions, floats, words
+from railfix.evaluate.accuracy import ALL, KEYS, PASSED
+from railfix.evaluate.evaluation_inputs import WINDOWS_S, EvaluationOptions, floats, words
 from railfix.integrity.stanford import Region, Stanford, stanford
 
 LevelsOf = Literal["usable", "all"]
@@ -96,7 +96,7 @@ Level = tuple[str, float | None]
 class Integrity:
     """Levels of one kind against the errors."""
 
-    stanford: pl.DataFrame  #: `railfix.evaluate.figures.KEYS`, then `STANFORD_COLUMNS`.
+    stanford: pl.DataFrame  #: `railfix.evaluate.accuracy.KEYS`, then `STANFORD_COLUMNS`.
     beyond: pl.DataFrame  #: `BEYOND_COLUMNS`, the largest excess first.
 
 

@@ -11,9 +11,18 @@ import numpy as np
 import polars as pl
 
 from railfix.core.errors import MismatchError
-from railfix.evaluate.epochs import OF_FILTER, level_columns
-from railfix.evaluate.figures import AIDED, ALL, KEYS, POSITIONS, WRONG_PLACE_M, at_largest, edges_reached, has_position
-from railfix.evaluate.inputs import RunFolder, list_position_tables, read_run
+from railfix.evaluate.accuracy import (
+    AIDED,
+    ALL,
+    KEYS,
+    POSITIONS,
+    WRONG_PLACE_M,
+    at_largest,
+    edges_reached,
+    has_position,
+)
+from railfix.evaluate.epoch_table import OF_FILTER, level_columns
+from railfix.evaluate.evaluation_inputs import RunFolder, list_position_tables, read_run
 
 #: Columns of the table of intervals besides its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {

@@ -19,7 +19,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.core.timescale import seconds
-from railfix.evaluate.inputs import LARGEST_GAP_S, Method, RunFolder
+from railfix.evaluate.evaluation_inputs import LARGEST_GAP_S, Method, RunFolder
 from railfix.run.inputs import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.track import ANOTHER_PLACE_M

@@ -25,19 +25,19 @@ from railfix.evaluate.place import bracket, interpolate_reference
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
 from railfix.io.reference_log import AntennaReference, read_reference
-from railfix.pipeline.base_station import BaseStation
+from railfix.pipeline.base_station_stage import BaseStation
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import collect_conditions
 from railfix.pipeline.results import AntennaResult
-from railfix.pipeline.state import State
 from railfix.positioning.receiver_noise import RobustClock, robust_clock
 from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import Conditions, ErrorModel, ErrorModelSource, condition_differences
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fault_rate, faulty_stretches, fit_bins
 from railfix.run.driver import open_inputs
 from railfix.run.inputs import ColumnNames, input_option
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.run.record import read_record
 from railfix.run.sources import align_logs
 from railfix.track.trajectory import Trajectory
@@ -174,7 +174,7 @@ def range_errors(
 
     MismatchError: fewer than two reference positions have a sigma within the limit.
     """
-    columns = result.columns
+    corrected = result.corrected
     good = ~(reference.sigma_m > _LARGEST_REFERENCE_SIGMA_M)
     if np.count_nonzero(good) < 2:
         raise MismatchError(
@@ -184,10 +184,9 @@ def range_errors(
     place = interpolate_reference(
         result.time, reference.time[good], reference.ecef_m[good], largest_gap_s=_LARGEST_REFERENCE_GAP_S
     )
-    distance, _ = range_with_rotation(result.satellites.position_ecef_m, place[:, None, :])
-    reason = result.reason[:, columns]
-    satellite = result.satellite[columns]
-    residual = np.where((reason & NO_RANGE) == 0, result.corrected_code_m[:, columns] - distance, np.nan)
+    distance, _ = range_with_rotation(corrected.satellites.position_ecef_m, place[:, None, :])
+    reason, satellite = corrected.reason, corrected.satellite
+    residual = np.where((reason & NO_RANGE) == 0, corrected.corrected_code_m - distance, np.nan)
     if base is not None:
         residual = residual - base.at(result.time, satellite, largest_gap_s=_LARGEST_BASE_GAP_S)
     used = (reason == Reason.USED) & np.isfinite(residual)
@@ -196,22 +195,20 @@ def range_errors(
         if name in result.screens:
             used &= ~result.screens[name].reject
     groups = clock_groups(satellite.astype("<U1"))
-    clock = robust_clock(
-        np.where(used, residual, np.nan), result.sigma_m[:, columns], groups, least_ranges=_LEAST_RANGES
-    )
+    clock = robust_clock(np.where(used, residual, np.nan), corrected.sigma_m, groups, least_ranges=_LEAST_RANGES)
     widths = [group.stop - group.start for group in groups]
     error = (residual - np.repeat(clock.clock_m, widths, axis=1)) / np.sqrt(1.0 - clock.share)
     arc, _ = trajectory.nearest(place)
-    turned = result.azimuth_deg[:, columns] - trajectory.body_azimuth_deg(arc)[:, None]
-    epoch, channel = np.nonzero(np.isfinite(error) & (result.elevation_deg[:, columns] > 0.0))
+    turned = corrected.azimuth_deg - trajectory.body_azimuth_deg(arc)[:, None]
+    epoch, channel = np.nonzero(np.isfinite(error) & (corrected.elevation_deg > 0.0))
     numbers = np.array([ord(name[0]) * 1000 + int(name[1:]) for name in satellite.tolist()], dtype=np.int64)
     time_block = (seconds(result.time - np.datetime64("2000-01-01T00:00:00", "ns")) // block_s).astype(np.int64)
     return RangeErrors(
         samples=ErrorSamples(
             error_m=error[epoch, channel],
-            elevation_deg=result.elevation_deg[:, columns][epoch, channel],
+            elevation_deg=corrected.elevation_deg[epoch, channel],
             relative_azimuth_deg=turned[epoch, channel] % 360.0,
-            cn0_dbhz=result.cn0_dbhz[:, columns][epoch, channel],
+            cn0_dbhz=corrected.cn0_dbhz[epoch, channel],
             block=time_block[epoch] * 1_000_000 + numbers[channel],
             used=used[epoch, channel],
             sigma_m=_level_sigma_m(result)[epoch, channel],
@@ -225,9 +222,8 @@ def range_errors(
 
 def _level_sigma_m(result: AntennaResult) -> Floats:
     """Return the standard deviation of each range in the protection level of the run, shape (T, K) [m]."""
-    columns = result.columns
-    stated = result.sigma_m[:, columns] * np.maximum(result.noise_scale, 1.0)[:, None]
-    return np.asarray(np.fmax(stated, result.bound_sigma_m[:, columns]))
+    stated = result.corrected.sigma_m * np.maximum(result.noise_scale, 1.0)[:, None]
+    return np.asarray(np.fmax(stated, result.corrected.bound_sigma_m))
 
 
 class StationBeside(Settings):

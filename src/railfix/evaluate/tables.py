@@ -14,9 +14,9 @@ import polars as pl
 
 from railfix import __version__
 from railfix.core.tables import Column, Table, count, listing, number, percent, signed
-from railfix.evaluate.epochs import EPOCH_COLUMNS
+from railfix.evaluate.accuracy import FIGURE_COLUMNS, WITH_SATELLITES, WRONG_PLACE_M
+from railfix.evaluate.epoch_table import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import Evaluation
-from railfix.evaluate.figures import FIGURE_COLUMNS, WITH_SATELLITES, WRONG_PLACE_M
 from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS, Integrity
 from railfix.evaluate.intervals import BRANCH_COLUMNS, INTERVAL_COLUMNS, LEVEL_COLUMNS, OUTAGE_COLUMNS
 from railfix.run.output import OutputFolder

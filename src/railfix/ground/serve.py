@@ -9,7 +9,7 @@ import ipaddress
 import json
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -248,16 +248,7 @@ async def run_centre(
             await server.start()
             announce(server.url)
         try:
-            work = asyncio.create_task(_work(control, field_points))
-            ending = asyncio.create_task(end.wait())
-            judging = asyncio.create_task(_judge(control, settings, path))
-            await asyncio.wait([work, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
-            if work.done():
-                work.result()
-            for task in (work, ending, judging):
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
+            await _run_until(end, _work(control, field_points), _judge(control, settings, path), for_s=for_s)
         finally:
             done = True
             await links.stop()
@@ -270,6 +261,20 @@ async def run_centre(
             "reports rejected": dict(control.rejected),
             "frames rejected": {threat.value: n for threat, n in sorted(links.threats().items(), key=str) if n},
         }
+
+
+async def _run_until(
+    end: asyncio.Event, work: Coroutine[Any, Any, None], judge: Coroutine[Any, Any, None], *, for_s: float | None
+) -> None:
+    """Run the centre's tasks until the event, the end of `work`, or for a time; an error of `work` is raised."""
+    working, ending, judging = (asyncio.create_task(each) for each in (work, end.wait(), judge))
+    await asyncio.wait([working, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
+    if working.done():
+        working.result()
+    for task in (working, ending, judging):
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
 
 
 def _centre(

@@ -22,7 +22,7 @@ from railfix.io import read_navigation, read_observations, read_positions
 from railfix.io.position_log import PositionLog
 from railfix.live.settings import LiveSettings
 from railfix.live.stream import ReceivedData, arrivals, fresh_state, next_arrival
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
@@ -31,7 +31,7 @@ from railfix.positioning.range_arrays import Ranges, usable_ranges
 from railfix.ranges.atmosphere import SeenFrom, model_delays
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
-from railfix.run.processor import parse_position
+from railfix.run.processor_setup import parse_position
 
 #: Median C/N0 over the satellites that is this far below that of the log counts as fallen [dB-Hz].
 FALLEN_DBHZ = 6.0

@@ -13,6 +13,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -137,6 +138,20 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
     async def events(_: Request) -> Response:
         return StreamingResponse(stream(), media_type="text/event-stream", headers=_HEADERS)
 
+    return Starlette(
+        routes=[
+            Route("/", page),
+            Route("/state", state),
+            Route("/events", events),
+            *_session_routes(sessions),
+            Route("/orders/{name}", partial(_give_order, orders, sessions), methods=["POST"]),
+        ]
+    )
+
+
+def _session_routes(sessions: Sessions) -> list[Route]:
+    """Return the routes that open and end a session."""
+
     async def login(request: Request) -> Response:
         values, address = await _values(request), "" if request.client is None else request.client.host
         token = (
@@ -155,29 +170,22 @@ def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *
         sessions.log_out(request.cookies.get(_COOKIE, ""))
         return _answer({"refused": None})
 
-    async def order(request: Request) -> Response:
-        given = orders.get(request.path_params["name"])
-        if given is None:
-            return _answer({"refused": "no such order"}, 404)
-        token = request.cookies.get(_COOKIE, "")
-        if not sessions.valid(token):
-            return _answer({"refused": "log in first"}, 403)
-        values = await _values(request)
-        if values is None:
-            return _answer({"refused": "a JSON object was expected"}, 400)
-        reason = given(values, sessions.name_of(token))
-        return _answer({"refused": reason}, 200 if reason is None else 409)
+    return [Route("/login", login, methods=["POST"]), Route("/logout", logout, methods=["POST"])]
 
-    return Starlette(
-        routes=[
-            Route("/", page),
-            Route("/state", state),
-            Route("/events", events),
-            Route("/login", login, methods=["POST"]),
-            Route("/logout", logout, methods=["POST"]),
-            Route("/orders/{name}", order, methods=["POST"]),
-        ]
-    )
+
+async def _give_order(orders: Mapping[str, Order], sessions: Sessions, request: Request) -> Response:
+    """Give the order that a request names, where its session is open."""
+    given = orders.get(request.path_params["name"])
+    if given is None:
+        return _answer({"refused": "there is no such order"}, 404)
+    token = request.cookies.get(_COOKIE, "")
+    if not sessions.valid(token):
+        return _answer({"refused": "log in first"}, 403)
+    values = await _values(request)
+    if values is None:
+        return _answer({"refused": "a JSON object was expected"}, 400)
+    reason = given(values, sessions.name_of(token))
+    return _answer({"refused": reason}, 200 if reason is None else 409)
 
 
 def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:

@@ -14,7 +14,7 @@ from typing import Final, Protocol
 from railfix.ground.store import DatabaseError
 
 #: A commit that takes longer is an alarm [s].
-HANGS_S: Final = 2.0
+HANGS_S: Final = 1.0
 #: Time between attempts to write to a database that fails [s].
 RETRY_S: Final = 1.0
 

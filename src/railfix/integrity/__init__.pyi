@@ -4,7 +4,7 @@ from .fault_exclusion import RaimResult, compute_statistic, exclude_faults
 from .persistent_biases import BiasLimits, PersistentBiases, reject_persistent_biases
 from .point_validation import PointStatus, position_dilution, validate_point
 from .protection import Cause, LevelStatus, ProtectionLevel, RiskBudget, availability, protection_level
-from .protection.level import MapDeviation, RangeBounds
+from .protection.solution_separation import MapDeviation, RangeBounds
 from .raim import Exclusion, LinearModel, Outcome, RaimLimits, linear_model
 
 __all__ = [

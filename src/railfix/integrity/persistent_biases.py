@@ -10,12 +10,12 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, copy_with
 from railfix.core.channel_state import join_channels
 from railfix.integrity.raim import LinearModel, linear_model
-from railfix.integrity.raim.model import update_model
+from railfix.integrity.raim.position_model import update_model
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
+from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.receiver_noise import LastingErrorLimits, LastingErrorState
-from railfix.positioning.windows import Windows
 
 #: Below this fraction of its own error in its residual a range does not show its error.
 _LEAST_REDUNDANCY: Final = 0.1

@@ -98,15 +98,22 @@ def find_kind(path: FilePath) -> FileKind:
     return _ENDINGS.get(ending(path), "unknown")
 
 
+#: Words in the header of a table of positions that one of a track map has not.
+_OF_POSITIONS: Final = ("time", "unix", "tow", "quality", "sigma_north", "antenna")
+
+
 def wrong_kind(path: FilePath, expected: str) -> InputFileError:
     """Return the error of a file of another kind than is expected."""
     return InputFileError(path, f"is {KIND_WORDS[find_kind(path)]}; {expected} was expected")
 
 
 def has_times(path: FilePath) -> bool:
-    """Return whether the header of a table names columns of a log of positions that a track map has not."""
-    names = _header_line(read_head(path)).lower()
-    return any(word in names for word in ("time", "unix", "tow", "quality", "sigma_north", "antenna"))
+    """Return whether a table or GPX file has properties of a log of positions that a track map lacks: times,
+    qualities.
+    """
+    head = read_head(path)
+    names = _header_line(head).lower()
+    return b"time>" in head or any(word in names for word in _OF_POSITIONS)
 
 
 def _header_line(head: bytes) -> str:

@@ -259,10 +259,10 @@ def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
     fields = [line.replace(",", " ").replace(";", " ").split() for _, line in rows]
     sexagesimal = "(d'" in names[0]
     least = max(9 + 1 if sexagesimal else 5 + 1, len(fields[0]))
-    for (line, _), row in zip(rows, fields, strict=True):
+    for (number, _), row in zip(rows, fields, strict=True):
         if len(row) < least:
             message = f"{len(row)} fields; time, coordinates, quality and as many as in the first row were expected"
-            raise InputFileError(path, message, line=line)
+            raise InputFileError(path, message, line=number)
     columns = [pl.Series(column, dtype=pl.String) for column in zip(*(row[:least] for row in fields), strict=True)]
     calendar = "/" in fields[0][0]
     if calendar:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,7 +96,7 @@ def read_kml_lines(path: FilePath) -> list[XmlLine]:
     return lines
 
 
-def _kml_cells(part: Element) -> Iterator[list[str | None]]:
+def _kml_cells(part: Element) -> Iterator[Sequence[str | None]]:
     """Yield longitude, latitude and, where it is there, height of the points of a LineString or gx:Track."""
     for child in part:
         if tag(child) == "coordinates":
@@ -105,7 +105,7 @@ def _kml_cells(part: Element) -> Iterator[list[str | None]]:
             yield [*(child.text or "").split()]
 
 
-def _numbers(path: FilePath, where: str, cells: list[str | None]) -> list[float]:
+def _numbers(path: FilePath, where: str, cells: Sequence[str | None]) -> list[float]:
     """Return longitude, latitude and the cells after them as numbers."""
     if comma := next((cell for cell in cells if "," in str(cell)), None):
         raise InputFileError(path, f"{where}: {comma} has a comma in a number; a point was expected")

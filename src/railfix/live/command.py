@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal
@@ -19,7 +19,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import OutputError, SettingsError
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
-from railfix.live.console import PlaceWatch, SensorWatch, SessionLog, check_log_file, serve_metrics
+from railfix.live.console import Metrics, PlaceWatch, SensorWatch, SessionLog, check_log_file, serve_metrics
 from railfix.live.engine import LiveEngine, LiveOutput
 from railfix.live.forms import TABLES
 from railfix.live.session import Hooks, run_session
@@ -33,10 +33,10 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.pipeline.tables import round_floats
+from railfix.pipeline.result_tables import round_floats
 from railfix.run.driver import find_record_time
 from railfix.run.output import OutputFolder, Overwrite, check_not_input
-from railfix.run.processor import check_base_place, make_processor, parse_position
+from railfix.run.processor_setup import check_base_place, make_processor, parse_position
 from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges
 from railfix.run.sources import OpenedLine, open_line
 
@@ -146,45 +146,43 @@ async def run_live(inputs: LiveInputs) -> tuple[list[str], bool]:
         for note in engine.frame.notes:
             log.say(note)
         hooks, streams = _hooks(inputs, live, engine, log, held, full="wait" if replay else "drop")
-        metrics = hooks.metrics
         if inputs.metrics is not None:
-            held.callback((await serve_metrics(metrics, inputs.metrics)).close)
+            held.callback((await serve_metrics(hooks.metrics, inputs.metrics)).close)
         for name in set(inputs.sensors) - set(listened):
             samples = SensorSamples(**{str(name): getattr(tables, name)})
             table = Sensed(sensor=name, samples=samples, until=FOREVER)
             engine.add_samples(table)
             if hooks.sensed is not None:
                 hooks.sensed(table)
-        session = asyncio.create_task(
+        terminated = await _run_until_signal(
             run_session(
-                engine,
-                dict(inputs.sources.items()),
-                sinks,
-                speed=inputs.speed,
-                sensors=listened,
-                hooks=hooks,
-                date=inputs.logs.instant,
-                streams=streams,
-            )
-        )
+                engine, dict(inputs.sources.items()), sinks, speed=inputs.speed, sensors=listened, hooks=hooks,
+                date=inputs.logs.instant, streams=streams,
+            ),
+            hooks.metrics, log,
+        )  # fmt: skip
+    return hooks.metrics.summary(), terminated
 
-        def hung_up() -> None:
-            metrics.hangups += 1
-            log.say("SIGHUP: nothing is reloaded; settings, map and vehicle are those of the start; restart to change")
 
-        loop, terminated = asyncio.get_running_loop(), False
+async def _run_until_signal(session: Coroutine[Any, Any, object], metrics: Metrics, log: SessionLog) -> bool:
+    """Run a session until its end, SIGINT or SIGTERM; return whether SIGTERM ended it."""
+    task, loop, terminated = asyncio.ensure_future(session), asyncio.get_running_loop(), False
 
-        def terminate() -> None:
-            nonlocal terminated
-            terminated = True
-            session.cancel()
+    def hung_up() -> None:
+        metrics.hangups += 1
+        log.say("SIGHUP: nothing is reloaded; settings, map and vehicle are those of the start; restart to change")
 
-        loop.add_signal_handler(signal.SIGINT, session.cancel)
-        loop.add_signal_handler(signal.SIGTERM, terminate)
-        loop.add_signal_handler(signal.SIGHUP, hung_up)
-        with contextlib.suppress(asyncio.CancelledError):
-            await session
-    return metrics.summary(), terminated
+    def terminate() -> None:
+        nonlocal terminated
+        terminated = True
+        task.cancel()
+
+    loop.add_signal_handler(signal.SIGINT, task.cancel)
+    loop.add_signal_handler(signal.SIGTERM, terminate)
+    loop.add_signal_handler(signal.SIGHUP, hung_up)
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+    return terminated
 
 
 def _hooks(

@@ -25,9 +25,9 @@ from railfix.live.stream import FOREVER, Lag, Sensed
 from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.processor_state import State
 from railfix.pipeline.received import merge_navigation
 from railfix.pipeline.results import Result
-from railfix.pipeline.state import State
 from railfix.ranges.sbas import SbasMessages
 
 #: A time after all epochs [ns].

@@ -20,8 +20,8 @@ from railfix.core.timescale import GPS_EPOCH, gpst_minus_utc
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown, encode, etcs_report, to_json
 from railfix.live.engine import LiveOutput
 from railfix.live.settings import LiveSettings
+from railfix.pipeline.result_tables import passing_table, positions_table, train_table
 from railfix.pipeline.results import Result
-from railfix.pipeline.tables import passing_table, positions_table, train_table
 
 Form = Callable[[LiveOutput], bytes]
 #: Longest doubt of a position report, with room for the rounding of the distance [cm].

@@ -19,10 +19,10 @@ import numpy as np
 from railfix import kernels
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection.open_places import Forms
-from railfix.integrity.raim.model import ModelArrays
+from railfix.integrity.raim.position_model import ModelArrays
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.run.processor import make_processor
+from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -81,7 +81,7 @@ def compile_filter() -> None:
     )  # fmt: skip
     inputs = demo_inputs()
     assert inputs.vehicle is not None
-    line = Line.of(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
+    line = Line(antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front"))
     state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)

@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks, copy_with, join_rows
+from railfix.core.arrays import Datetimes, Floats, Masks, copy_with, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState, wheel_signs
 from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balises import BaliseLimits, find_passings
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
-from railfix.pipeline.filter_result import COORDINATES, AlongTrack, FilterFix, FilterState, SingleEpochs
+from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, SingleEpochs
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
-from railfix.pipeline.smoothing import Replay, SmoothedTrack
+from railfix.pipeline.smoothed_track import Replay, SmoothedTrack
+from railfix.pipeline.solution import with_coordinates
 from railfix.positioning.carrier import CycleSlipState, Slips, corrected_phase_m, find_slips
+from railfix.positioning.map_offset import beyond_threshold
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import Screened
-from railfix.track.track import interpolate_kilometrage
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackStatus, track
+from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracked, TrackStatus, track
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
@@ -63,14 +65,14 @@ def along_track(
     ranges: CorrectedRanges,
     slips: Slips | None,
     single: SingleEpochs,
-    trajectory: Trajectory,
+    line: Line,
     config: Config,
     state: FilterState,
     *,
     samples: SensorSamples | None = None,
     references: LineReferences | None = None,
-) -> tuple[AlongTrack, FilterState]:
-    """Return the filtered positions of one antenna after all screens and exclusions, and the state for the next chunk.
+) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
+    """Return filtered positions of one antenna after all screens and exclusions, what the filter was given, its state.
 
     The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
     Samples are those of the sensors on board since the previous chunk; `references` has the line's features, ground
@@ -78,10 +80,9 @@ def along_track(
     """
     epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
     epochs = copy_with(epochs, off_map=single.off_map, near_ecef_m=single.near_ecef_m)
-    line = Line.of(trajectory) if state.line is None else state.line
+    trajectory = line.trajectory
     tracked, sensed, replays, after = _run_filter(
-        epochs, trajectory, line, config, copy_with(state, slips=after_slips), samples, references,
-        (single.arc_m, single.sigma_m),
+        epochs, line, config, copy_with(state, slips=after_slips), samples, references, (single.arc_m, single.sigma_m)
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
     tracked = mark_doubtful(tracked, beside, TrackStatus.MAP_OFFSET)
@@ -99,24 +100,31 @@ def along_track(
             pulled, filtered = _against_wheel(replays, tracked.arc_m, sure, after.pulled, config)
             after, tracked = replace(after, pulled=filtered), _bound_by_wheel(tracked, pulled.bound_m)
         tracked = mark_doubtful(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
-    inside = on_line_m(tracked, trajectory)
-    chainage = trajectory.chainage_at(inside)
-
-    def later(name: str) -> Mapping[str, Floats]:
-        if name == "ecef_m":
-            return {name: trajectory.at_arc(inside)}
-        if name == "kilometrage_m":
-            return {name: interpolate_kilometrage(chainage, trajectory.chainage_m, trajectory.kilometrage_m)}
-        return dict(zip(COORDINATES, geodetic_from_ecef(result.ecef_m), strict=True))
-
     speed, sigma = tracked.speed_mps, tracked.speed_sigma_mps
     direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
-    result = AlongTrack.create(
-        later, tracked=tracked, chainage_m=chainage, direction=direction.astype(np.int8),
-        standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS, sensed=sensed,
-        spacing_error_m=np.full(len(tracked), np.nan), wheel=wheel, replay=replays,
+    result = AlongTrack(
+        tracked=tracked, trajectory=trajectory, arc_m=on_line_m(tracked, trajectory),
+        direction=direction.astype(np.int8), standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS, sensed=sensed,
+        spacing_error_m=np.full(len(tracked), np.nan), wheel=wheel,
     )  # fmt: skip
-    return result, copy_with(after, line=line)
+    return result, replays, after
+
+
+def single_epochs(chunk: Chunk, antenna: str, config: Config) -> SingleEpochs:
+    """Return what the filter of an antenna uses of the positions of single epochs."""
+    assert chunk.solution is not None, "single epochs are positioned before the filter"
+    k = chunk.names.index(antenna)
+    solution, interference = take_epochs(chunk.solution, chunk.antennas.parts[k]), chunk.interference[k]
+    has = with_coordinates(config.failed_checks)[solution.status]
+    return SingleEpochs(
+        noise_scale=solution.noise_scale,
+        arc_m=np.where(has, solution.arc_m, np.nan),
+        sigma_m=solution.epoch_sigma_m,
+        near_ecef_m=solution.point.ecef_m,
+        off_map=solution.off_map,
+        map_offset=beyond_threshold(solution.map_offset, config.map_offset),
+        suspicion=np.zeros(len(has), dtype=np.int8) if interference is None else interference.suspicion,
+    )
 
 
 def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
@@ -188,7 +196,6 @@ def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tra
 
 def _run_filter(
     epochs: GnssEpochs,
-    trajectory: Trajectory,
     line: Line,
     config: Config,
     state: FilterState,
@@ -220,7 +227,7 @@ def _run_filter(
             state = _restart_state(state, state.fixed)
         before = state.sensors
         sensors, sensed, kept = sensor_epochs(
-            samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
+            samples, part.time, line.trajectory, before, limits=config.sensors, sine_at=sine_at,
             sources=config.filter_sources, references=references,
         )  # fmt: skip
         samples = None
@@ -357,17 +364,3 @@ def gnss_epochs(
         cn0_dbhz=ranges.cn0_dbhz, off_map=np.zeros(len(obs.time), dtype=np.bool_),
     )  # fmt: skip
     return epochs, after
-
-
-def innovations(result: AlongTrack | None, columns: Indices, shape: tuple[int, ...]) -> dict[str, Floats]:
-    """Return innovations of the filter and weights of codes, by column of the table of observations; NaN without.
-
-    `columns`: channels of the filter among all, shape (K,); `shape`: epochs and channels of the table.
-    """
-    names = ("innovation_code_m", "innovation_phase_m", "innovation_doppler_mps", "weight_code")
-    full = {name: np.full(shape, np.nan) for name in names}
-    if result is not None:
-        for kind, name in enumerate(names[:3]):
-            full[name][:, columns] = result.tracked.innovation[:, kind]
-        full["weight_code"][:, columns] = result.tracked.weight[:, Kind.CODE]
-    return full

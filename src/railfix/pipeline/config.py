@@ -129,7 +129,7 @@ class Config(ScreenSettings):
     #: Coordinates of positions with a failed check (`reasons.CHECK_FAILED`): kept, with the status of the check, or
     #: dropped as P1 does.
     failed_checks: Literal["keep", "drop"] = "keep"
-    #: Availability/accuracy threshold: a position whose single-epoch sigma (`AntennaResult.own_sigma_m`) exceeds it is
+    #: Availability/accuracy threshold: a position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds it is
     #: `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared. P4 takes
     #: a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed checks.
     largest_sigma_m: float = Field(default=20.0, gt=0)

@@ -50,7 +50,7 @@ class LineFeatures:
         inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])
         return cls(
             series=series, features=tuple(map_features(series)), antenna_m=np.asarray(trajectory.arc_m),
-            body_m=line.arc_at_chainage(inside) + body - inside, line=Line.of(line),
+            body_m=line.arc_at_chainage(inside) + body - inside, line=Line(line),
         )  # fmt: skip
 
     def body_at(self, antenna_m: Floats) -> Floats:

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Masks
-from railfix.core.epoch_rows import OnDemand
 from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState
 from railfix.kernels.tracking import index as ix
 from railfix.pipeline.balises import Passing, PassingState
+from railfix.pipeline.coordinates import LineCoordinates
 from railfix.pipeline.outage_gate import ReturnState
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import SensorState
-from railfix.pipeline.smoothing import Replay
 from railfix.positioning.carrier import CycleSlipState
 from railfix.screens import FilteredMotion
-from railfix.tracking import Line, Tracked, TrackState
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Tracked, TrackState
 from railfix.tracking.levels import LevelState
 from railfix.tracking.result import is_bounded
 
@@ -58,7 +57,6 @@ class SingleEpochs:
 class FilterState(NotebookTable):
     """State of the filter along the track of one antenna after a chunk."""
 
-    line: Line | None = None  #: The trajectory as the filter sees it, made once.
     slips: CycleSlipState | None = None  #: State of the carrier phases.
     track: TrackState | None = None
     level: LevelState = field(default_factory=LevelState)  #: State of the filter that gives the levels.
@@ -90,33 +88,20 @@ class FilterState(NotebookTable):
         return f"{place:,.1f} ± {np.sqrt(variance):.1f}"
 
 
-#: Fields of results that are computed together.
-COORDINATES: Final = ("latitude_deg", "longitude_deg", "height_m")
-
-
 @dataclass(frozen=True, kw_only=True)
-class AlongTrack(NotebookTable, OnDemand):
+class AlongTrack(LineCoordinates, NotebookTable):
     """Positions of one antenna by the filter along the track, T epochs."""
 
-    #: Positions along the antenna's trajectory, and their measurements; channels as `AntennaResult.columns`.
-    tracked: Tracked
-    #: Shape (T,).
-    chainage_m: Floats
-    kilometrage_m: Floats
-    ecef_m: Floats  #: Shape (T, 3).
-    #: Shape (T,).
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
-    #: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small to decide; shape (T,).
-    direction: Codes
+    tracked: Tracked  #: Output of the filter; channels as those of `AntennaResult.corrected`.
+    trajectory: Trajectory  #: Of the antenna.
+    arc_m: Floats  #: Positions on the trajectory, those just beyond an end on it; NaN further out; shape (T,).
+    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed does not tell; shape (T,).
     standstill: Masks  #: Shape (T,).
     sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
     #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape
     #: (T,).
     spacing_error_m: Floats
     wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.
-    replay: tuple[Replay, ...] = ()  #: Input of the filter, to smooth it (`railfix.pipeline.smoothing`).
     passings: tuple[Passing, ...] = ()  #: Balises and virtual ones that were passed, and readings that are wrong.
 
     @property

@@ -29,10 +29,10 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion import MotionFit, fit_motion
+from railfix.integrity.interference.motion_signs import MotionFit, fit_motion
 from railfix.integrity.interference.range_fits import MotionInputs
+from railfix.pipeline.solution import Solution
 from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.range_arrays import InterSystemBiases
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.corrected import CorrectedRanges
 
@@ -98,25 +98,13 @@ class Interference:
         return suspicion(self.causes)
 
 
-class PositionEpochs(NamedTuple):
-    """Results of single epochs that the signs are searched for in, T epochs."""
-
-    #: 3-D positions without the map, of all ranges; and of those that agree, NaN where ranges contradict each other;
-    #: shape (T, 3).
-    point_ecef_m: Floats
-    consistent_ecef_m: Floats
-    noise_scale: Floats  #: Shape (T,).
-    ties: InterSystemBiases  #: Inter-system biases known before each epoch.
-    status: Codes  #: `Status`, before causes are known; shape (T,).
-
-
 def _motion_inputs(
-    corrected: CorrectedRanges, single: PositionEpochs, antennas: AntennaRows, rows: Indices, broken: Masks
+    corrected: CorrectedRanges, single: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
     """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the previous epoch."""
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
-    near = np.where(np.isnan(consistent), single.point_ecef_m[rows], consistent)
+    near = np.where(np.isnan(consistent), single.point.ecef_m[rows], consistent)
     first = 0
     lines: list[SearchIndex] = []
     for index, own in antennas.split(rows):
@@ -281,7 +269,7 @@ def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
 
 def judge_interference(
     corrected: CorrectedRanges,
-    single: PositionEpochs,
+    single: Solution,
     antennas: AntennaRows,
     states: list[InterferenceState],
     limits: InterferenceLimits,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Codes, Floats, Indices, Masks, copy_with
+from railfix.core.arrays import Codes, Floats, Masks, copy_with
 from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, Status
@@ -22,37 +22,17 @@ from railfix.integrity.protection import (
     protection_level,
 )
 from railfix.integrity.protection.araim import AraimGeometry, AraimResult, IntegritySupport, araim_levels
-from railfix.integrity.protection.level import MapDeviation, RangeBounds
 from railfix.integrity.protection.open_places import places_beyond_the_level
+from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, linear_model
 from railfix.pipeline.config import Config
+from railfix.pipeline.fault_stage import CheckedRanges
+from railfix.pipeline.solution import ProtectionResult, Solution
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.line_fix import LineFix
 from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.corrected import CorrectedRanges
-
-
-@dataclass(frozen=True, kw_only=True)
-class ProtectionResult:
-    """Protection levels of T epochs."""
-
-    #: NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
-    level: ProtectionLevel
-    status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
-    kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
-    basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
-
-
-class RaimPositions(NamedTuple):
-    """Positions after the exclusion of faults, T epochs."""
-
-    ranges: Ranges
-    fix: LineFix
-    model: LinearModel  #: Of the positions.
-    raim: RaimResult
-    scale: Floats  #: Noise scale of the receiver, shape (T,).
-
 
 #: Basis of a level: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
 #: satellites' own faults as well (ARAIM).
@@ -131,14 +111,10 @@ def level_scale(scale: Floats, config: Config) -> Floats:
 
 
 def level_stage(
-    corrected: CorrectedRanges,
-    checked: RaimPositions,
-    antennas: AntennaRows,
-    offset: MapOffset,
-    config: Config,
+    checked: CheckedRanges, antennas: AntennaRows, offset: MapOffset, config: Config
 ) -> tuple[ProtectionResult | None, Masks]:
     """Return the protection levels, None where they are off, and the epochs with open positions beyond them, (T,)."""
-    ranges, fix, model, raim, scale = checked
+    corrected, ranges, fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)
     section = np.maximum(fix.constrained.section, 0)
@@ -240,9 +216,7 @@ _SPACE: Final = 3
 
 def compute_araim(
     corrected: CorrectedRanges,
-    arc_m: Floats,
-    noise_scale: Floats,
-    section: Indices,
+    solution: Solution,
     antennas: AntennaRows,
     support: IntegritySupport | None,
     config: Config,
@@ -254,11 +228,11 @@ def compute_araim(
     """
     if support is None:
         return None
-    place = np.where(np.isfinite(arc_m)[:, None], antennas.at_arc(arc_m), np.nan)
+    place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
     stated = support.arrays(corrected.satellite[channels].tolist())
     air = config.nominal.replaced(satellite_sigma_m=0.0).sigma_m(corrected.elevation_deg[:, channels])
-    noise = level_scale(noise_scale, config)[:, None] * corrected.sigma_m[:, channels]
+    noise = level_scale(solution.noise_scale, config)[:, None] * corrected.sigma_m[:, channels]
     if config.error_model is not None:
         noise = np.fmax(noise, corrected.bound_sigma_m[:, channels])
     used = (corrected.reason[:, channels] == 0) & np.isfinite(place[:, :1]) & support.holds(corrected.time)[:, None]
@@ -277,7 +251,7 @@ def compute_araim(
     )  # fmt: skip
     budget = config.araim
     near = np.nan_to_num(place, nan=1e6)
-    axes = antennas.get_axes(np.maximum(section, 0))
+    axes = antennas.get_axes(np.maximum(solution.fix.constrained.section, 0))
     on_line = with_map(_rotate_geometry(ranges, axes), antennas.sigma_plan_m, antennas.sigma_height_m, budget.map_prior)
     horizontal = budget.phmi_horizontal / 2.0, budget.false_alarm_horizontal / 2.0
     return AraimResult(

@@ -8,7 +8,7 @@ and the wavelength if metres are given for cycles.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -50,17 +50,10 @@ class ObservableState:
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
 
-class CheckedObservables(NamedTuple):
-    """Ranges without Dopplers and phases of the wrong sign or unit."""
-
-    corrected: CorrectedRanges
-    notes: tuple[str, ...]  #: One sentence for each kind of a constellation.
-    state: ObservableState
-
-
-def check_observables(corrected: CorrectedRanges, state: ObservableState) -> CheckedObservables:
-    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, with one sentence for
-    each.
+def check_observables(
+    corrected: CorrectedRanges, state: ObservableState
+) -> tuple[CorrectedRanges, list[str], ObservableState]:
+    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, a sentence on each.
 
     A factor is valid until the next one of its constellation; before the first one, that of all constellations is used.
     """
@@ -95,7 +88,7 @@ def check_observables(corrected: CorrectedRanges, state: ObservableState) -> Che
     if bad:
         corrected = _without(corrected, letters, bad)
     last = copy_with(after, letter=np.array(list(factors), dtype="<U1"), factor=np.array(list(factors.values())).T)
-    return CheckedObservables(corrected, tuple(notes), last)
+    return corrected, notes, last
 
 
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:

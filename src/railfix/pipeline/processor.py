@@ -22,31 +22,24 @@ from railfix.core.errors import check_type
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.along_track import along_track, apply_spacing_verdict, with_passings
-from railfix.pipeline.antennas import (
-    AntennaOrder,
-    antenna_results,
-    apply_wheel_sign,
-    filter_inputs,
-    filter_verdicts,
-    position_verdicts,
-    with_coordinates,
-)
-from railfix.pipeline.base_station import BaseStation, Stations, check_base
-from railfix.pipeline.channels import ChannelBook, missing_notes
+from railfix.pipeline.along_track import along_track, apply_spacing_verdict, single_epochs, with_passings
+from railfix.pipeline.antenna_order import AntennaOrder
+from railfix.pipeline.base_station_stage import BaseStation, Stations, check_base
+from railfix.pipeline.channel_book import ChannelBook, missing_notes
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import SCREEN_NAMES, Config
 from railfix.pipeline.feature_fixes import LineFeatures
 from railfix.pipeline.filter_result import AlongTrack, FilterState
-from railfix.pipeline.interference_stage import Interference, PositionEpochs, judge_interference, with_statuses
+from railfix.pipeline.interference_stage import judge_interference, with_statuses
 from railfix.pipeline.level_stage import compute_araim
-from railfix.pipeline.position_stage import Solution, position_stage
+from railfix.pipeline.position_stage import position_stage
+from railfix.pipeline.processor_state import AntennaState, State
 from railfix.pipeline.range_stage import Models, collect_conditions, correct_ranges
 from railfix.pipeline.received import correction_source, known_from_start, receive
-from railfix.pipeline.results import AntennaResult, Result
-from railfix.pipeline.screen_stage import screen_antennas, screen_pairs
+from railfix.pipeline.results import Result, antenna_results
+from railfix.pipeline.screen_stage import screen_antennas, screen_filtered, screen_pairs, screen_positions
 from railfix.pipeline.sensor_epochs import LineReferences, waiting_samples
-from railfix.pipeline.state import AntennaState, State
+from railfix.pipeline.smoothed_track import Replay
 from railfix.positioning.antenna_rows import AntennaRows, stack_observations
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.error_model import condition_differences
@@ -58,13 +51,13 @@ from railfix.screens import (
     PairScreen,
     PositionScreen,
     Screen,
-    Screened,
     ScreenSetup,
     in_order,
 )
 from railfix.screens.base import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line
 
 
 class EpochProcessor:
@@ -173,6 +166,11 @@ class EpochProcessor:
         """Return everything but the threads, which another process creates itself."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
 
+    @cached_property
+    def lines(self) -> dict[str, Line]:
+        """The trajectories as the filter along the track takes them, by antenna."""
+        return {name: Line(trajectory) for name, trajectory in self.trajectories.items()}
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the data known from the start, and on screens that cannot be run."""
@@ -279,29 +277,23 @@ class EpochProcessor:
             base_state = self._base.add_observations(base, received, state.base, began)
             received = base_state.beside(received)
         names, (obs, parts) = tuple(observations), stack_observations(list(observations.values()))
-        antennas, rows = (
-            AntennaRows(tuple(self.indices[name] for name in names), parts),
-            dict(zip(names, parts, strict=True)),
-        )
+        antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
         channels, source = self._channels.of(obs, received.navigation), correction_source(received, self.config)
         corrected, near = correct_ranges(obs, channels, self.config, source, antennas, error_model=self._error_model)
-        own_states = [state.antennas.get(name) or AntennaState() for name in names]
-        screening, own_states = screen_antennas(
-            corrected, antennas, self._of_observations, self.setup, self.config, received.ionosphere_sigma_m, own_states
-        )
-        pair = self._pair(obs.time, near.arc_m, rows)
-        screening = screen_pairs(screening, rows, self._of_pairs, pair)
-        headers = {name: part.header for name, part in observations.items()}
         chunk = Chunk(
-            corrected=screening.corrected, rows=rows, screens=screening.screens, combined=screening.combined,
-            slips=screening.slips, pair=pair, sensors=sensors,
+            names=names, antennas=antennas, corrected=corrected, sensors=sensors,
+            pair=self._pair(obs.time, near.arc_m, dict(zip(names, parts, strict=True))),
             notes=(
                 *missing_notes(received, self.config, corrected.second), *received.notes, *self._lacking,
-                *screening.notes,
-                *self._curve_notes(headers),
+                *self._curve_notes({name: part.header for name, part in observations.items()}),
                 *(self._support.notes(obs.time) if self._support is not None else ()),
             ),
         )  # fmt: skip
+        own_states = [state.antennas.get(name) or AntennaState() for name in names]
+        chunk, own_states = screen_antennas(
+            chunk, self._of_observations, self.setup, self.config, received.ionosphere_sigma_m, own_states
+        )
+        chunk = screen_pairs(chunk, self._of_pairs)
         after = dict(state.antennas)
         for name, part, own in zip(names, observations.values(), own_states, strict=True):
             after[name] = copy_with(own, ended=part.time[-1] if len(part) else own.ended)
@@ -309,28 +301,25 @@ class EpochProcessor:
 
     def position(self, chunk: Chunk, state: State) -> tuple[Chunk, State]:
         """Return the chunk with the positions of single epochs: the second part of `process`, before the filter."""
-        names, parts = zip(*chunk.rows.items(), strict=True)
-        antennas = AntennaRows(tuple(self.indices[name] for name in names), parts)
-        own_states = [state.antennas.get(name) or AntennaState() for name in names]
+        antennas, own_states = chunk.antennas, [state.antennas.get(name) or AntennaState() for name in chunk.names]
         corrected, solution, own_states = position_stage(
             chunk.corrected, chunk.slips, antennas, self.config, own_states
         )
-        single = PositionEpochs(
-            solution.point.ecef_m, solution.consistent_ecef_m, solution.noise_scale, solution.ties, solution.status
-        )
         interference, signs = judge_interference(
-            corrected, single, antennas, [own.interference for own in own_states], self.config.interference
+            corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
         status = with_statuses(solution.status, [own.suspicion for own in interference if own is not None])
-        own_states = [copy_with(own, interference=sign) for own, sign in zip(own_states, signs, strict=True)]
-        araim = compute_araim(
-            corrected, solution.arc_m, solution.noise_scale, solution.fix.constrained.section, antennas,
-            self._support, self.config,
+        araim = compute_araim(corrected, solution, antennas, self._support, self.config)
+        solution = copy_with(solution, status=status, araim=araim)
+        status, judged = screen_positions(chunk, solution, self._of_positions, self.config)
+        chunk = copy_with(
+            chunk, corrected=corrected, solution=copy_with(solution, status=status), interference=interference,
+            judged=judged,
         )  # fmt: skip
-        solution, chunk = copy_with(solution, status=status, araim=araim), copy_with(chunk, corrected=corrected)
-        results = self._results(antennas, chunk, solution, interference)
-        after = {**state.antennas, **dict(zip(names, own_states, strict=True))}
-        return copy_with(chunk, results=results, off_map=solution.off_map), copy_with(state, antennas=after)
+        after = dict(state.antennas)
+        for name, own, sign in zip(chunk.names, own_states, signs, strict=True):
+            after[name] = copy_with(own, interference=sign)
+        return chunk, copy_with(state, antennas=after)
 
     def along_track(self, chunk: Chunk, state: State) -> tuple[Result, State]:
         """Return the results of one chunk with those of the filter, where it is on: the third part of `process`.
@@ -340,60 +329,43 @@ class EpochProcessor:
         state : State
             Of it only what the filter left after the previous chunk is used, and replaced.
         """
-        fusion, filter_states, sensors = {}, dict(state.fusion), chunk.sensors
+        fusion, replays, filter_states, sensors = {}, {}, dict(state.fusion), chunk.sensors
         if sensors:
             for name, own in state.fusion.items():
-                if name not in chunk.results:
+                if name not in chunk.names:
                     filter_states[name] = replace(own, sensors=waiting_samples(own.sensors, sensors))
         if self.config.filter == "track":
             found = self._filter_antennas(chunk, state)
-            motions = {name: tracked.motion for name, (tracked, _) in found.items()}
-            spacing = filter_verdicts(self._of_positions, chunk.pair, motions)
+            motions = {name: tracked.motion for name, (tracked, _, _) in found.items()}
+            spacing = screen_filtered(self._of_positions, chunk.pair, motions)
             held_s, limits = self.config.antenna_spacing.filter_held_s, self.config.sensors.balise
-            for name, (tracked, own) in found.items():
+            for name, (tracked, replays[name], own) in found.items():
                 tracked, own = apply_spacing_verdict(tracked, spacing.get(name), own, held_s)
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)
-        result = Result(antennas=apply_wheel_sign(chunk.results, fusion), notes=chunk.notes, fusion=fusion)
+        results = antenna_results(chunk, fusion, self.config)
+        result = Result(antennas=results, notes=chunk.notes, fusion=fusion, replays=replays)
         return result, copy_with(state, fusion=filter_states)
 
-    def _results(
-        self, antennas: AntennaRows, chunk: Chunk, solution: Solution, interference: Sequence[Interference | None]
-    ) -> dict[str, AntennaResult]:
-        """Return the results of single epochs by antenna, after the screens of the published positions."""
-        chainage = antennas.chainage_at(solution.arc_m)
-        published = {name: chainage[rows] for name, rows in chunk.rows.items()}
-        judged: dict[str, dict[str, Screened]] = {name: {} for name in chunk.rows}
-        status = solution.status.copy()
-        for name, verdicts in position_verdicts(self._of_positions, chunk.pair, published).items():
-            rows = chunk.rows[name]
-            for verdict in verdicts:
-                doubtful = verdict.screened.reject & with_coordinates(self.config.failed_checks)[status[rows]]
-                status[rows] = np.where(doubtful, verdict.status, status[rows])
-                judged[name][verdict.name] = verdict.screened
-        results = antenna_results(chunk, antennas, copy_with(solution, status=status), chainage, self.config)
-        return {
-            name: copy_with(
-                take_epochs(results, rows), interference=own,
-                screens={**{key: take_epochs(each, rows) for key, each in chunk.screens.items()}, **judged[name]},
-            )
-            for (name, rows), own in zip(chunk.rows.items(), interference, strict=True)
-        }  # fmt: skip
+    def _filter_antennas(
+        self, chunk: Chunk, state: State
+    ) -> dict[str, tuple[AlongTrack, tuple[Replay, ...], FilterState]]:
+        """Return the positions of the filter along the track by antenna, what it was given, and its states.
 
-    def _filter_antennas(self, chunk: Chunk, state: State) -> dict[str, tuple[AlongTrack, FilterState]]:
-        """Return the filter's positions by antenna, and its states; two antennas in two threads."""
+        Two antennas are filtered in two threads.
+        """
 
-        def one_antenna(name: str) -> tuple[AlongTrack, FilterState]:
+        def one_antenna(name: str) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
             rows, sensors = chunk.rows[name], chunk.sensors
             return along_track(
-                take_epochs(chunk.corrected, rows), None if chunk.slips is None else take_epochs(chunk.slips, rows),
-                filter_inputs(chunk.results[name], chunk.off_map[rows], self.config.map_offset),
-                self.trajectories[name], self.config, state.fusion.get(name) or FilterState(),
-                samples=sensors, references=self._line_references(name, sensors),
+                take_epochs(chunk.corrected, rows), take_epochs(chunk.slips, rows),
+                single_epochs(chunk, name, self.config), self.lines[name], self.config,
+                state.fusion.get(name) or FilterState(), samples=sensors,
+                references=self._line_references(name, sensors),
             )  # fmt: skip
 
-        over_antennas = self._threads.map if len(chunk.results) > 1 else map
-        return dict(zip(chunk.results, over_antennas(one_antenna, chunk.results), strict=True))
+        over_antennas = self._threads.map if len(chunk.names) > 1 else map
+        return dict(zip(chunk.names, over_antennas(one_antenna, chunk.names), strict=True))
 
     def _curve_notes(self, headers: Mapping[str, ObservationHeader]) -> Iterator[str]:
         """Yield notes on a C/N0 curve of another antenna or receiver."""

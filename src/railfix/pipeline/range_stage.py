@@ -14,10 +14,9 @@ from railfix.pipeline.config import Config
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.approximate import ANCHOR_SIGMA_M, ApproximatePosition, approximate_position
 from railfix.positioning.range_arrays import Ranges, weighted_ranges
-from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.channels import Channels
 from railfix.ranges.cn0_curve import Cn0Curve
-from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_satellites
+from railfix.ranges.corrected import CorrectedRanges, SatelliteRanges, corrected_ranges, find_satellites
 from railfix.ranges.error_model import Conditions, ErrorModel
 from railfix.ranges.sources import CorrectionSource
 from railfix.screens import Verdict, suspicion_sigma_m
@@ -47,16 +46,21 @@ def correct_ranges(
     An error model gives the least sigmas of the protection level; the weights are those of ``config.noise``.
     """
     satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)
-    raw = obs.code_m[:, channels.columns] + satellites.correction_m
-    raw = np.where(satellites.reason == 0, raw, np.nan)
-    sigma = np.broadcast_to(ANCHOR_SIGMA_M, raw.shape)
-    ranges = weighted_ranges(satellites.states.position_ecef_m, raw, sigma, channels.clock)
-    near = approximate_position(ranges, antennas, limits=config.single_point, section=config.section)
+    near = approximate_position(
+        raw_ranges(obs, channels, satellites), antennas, limits=config.single_point, section=config.section
+    )
     corrected = corrected_ranges(obs, channels, satellites, near.ecef_m, source, gross=near.gross, noise=config.noise)
     corrected = copy_with(corrected, unsure=near.unsure)
     if error_model is not None:
         corrected = _apply_error_model(error_model, corrected, antennas, near.arc_m, config)
     return corrected, near
+
+
+def raw_ranges(obs: Observations, channels: Channels, satellites: SatelliteRanges) -> Ranges:
+    """Return the codes with satellite clock and group delay applied, of equal weight."""
+    code = np.where(satellites.reason == 0, obs.code_m[:, channels.columns] + satellites.correction_m, np.nan)
+    sigma = np.full(code.shape, ANCHOR_SIGMA_M)
+    return weighted_ranges(satellites.states.position_ecef_m, code, sigma, channels.clock)
 
 
 def fit_ranges(corrected: CorrectedRanges) -> Ranges:
@@ -88,11 +92,8 @@ def _apply_error_model(
     model: ErrorModel, corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, config: Config
 ) -> CorrectedRanges:
     """Return the ranges with overbounding sigma and bias by an error model; those that it does not bound rejected."""
-
-    def front_deg(index: SearchIndex, rows: slice) -> Floats:
-        return index.trajectory.body_azimuth_deg(arc_m[rows])
-
-    turned = corrected.azimuth_deg - antennas.each(front_deg)[:, None]
+    front_deg = antennas.each(lambda index, rows: index.trajectory.body_azimuth_deg(arc_m[rows]))
+    turned = corrected.azimuth_deg - front_deg[:, None]
     bound, bias = model.at(corrected.elevation_deg, turned, corrected.cn0_dbhz)
     bound = np.hypot(bound, corrected.nominal_m) if model.covers == "local" or config.sbas else bound
     unbounded = (corrected.reason == 0) & ~np.isfinite(bound)

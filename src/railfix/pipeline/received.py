@@ -16,14 +16,8 @@ from railfix.gnss.plausible_records import plausible_navigation
 from railfix.pipeline.config import Config
 from railfix.ranges.base_station import BaseErrors
 from railfix.ranges.sbas import DfmcService, SbasCorrections, SbasMessages, SbasState
-from railfix.ranges.sources import (
-    BaseStationSource,
-    BroadcastSource,
-    CorrectionSource,
-    DfmcSource,
-    SbasSource,
-    choose_ionosphere,
-)
+from railfix.ranges.sbas.sbas_sources import DfmcSource, SbasSource
+from railfix.ranges.sources import BaseStationSource, BroadcastSource, CorrectionSource, choose_ionosphere
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
 
@@ -72,12 +66,17 @@ class Received:
     base: BaseErrors | None = None  #: Range errors that a base station has measured.
 
 
-def correction_source(received: Received, config: Config) -> CorrectionSource:
-    """Return the source of corrections from the received data."""
-    models = BroadcastSource(
+def broadcast_source(received: Received, config: Config) -> BroadcastSource:
+    """Return the source of corrections by the records and models alone."""
+    return BroadcastSource(
         navigation=received.navigation, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
         troposphere=config.troposphere, nominal=config.nominal,
     )  # fmt: skip
+
+
+def correction_source(received: Received, config: Config) -> CorrectionSource:
+    """Return the source of corrections of what has been received."""
+    models = broadcast_source(received, config)
     source: CorrectionSource = models
     if isinstance(received.sbas, DfmcService):
         source = DfmcSource(models=models, service=received.sbas)

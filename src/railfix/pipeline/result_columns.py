@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -21,13 +21,13 @@ from railfix.integrity.interference import Suspicion, cause_text
 from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
-from railfix.pipeline.along_track import innovations
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.two_frequencies import Combined
 from railfix.ranges.second_codes import SecondCodes
 from railfix.screens import SCREENS, ScreenColumn
+from railfix.tracking import Kind
 
 Source = TypeVar("Source")
 #: Unit by the last part of a name.
@@ -123,12 +123,15 @@ def _get_screened(result: AntennaResult, column: ScreenColumn) -> Floats | None:
     return getattr(result.screens[column.verdict], column.field) if column.verdict in result.screens else None
 
 
-def _position_column(column: ScreenColumn) -> Column[AntennaResult]:
-    return Column(column.name, column.meaning, lambda r: _get_screened(r, column))
+def _get_screened_channels(observed: Observed, column: ScreenColumn) -> Floats:
+    """Return the array of a column that a screen of observations fills, on all channels."""
+    return observed.on_all_channels(_get_screened(observed.result, column))
 
 
-def _observation_column(column: ScreenColumn) -> Column[Observed]:
-    return Column(column.name, column.meaning, lambda o: o.on_all_channels(_get_screened(o.result, column)))
+def _screen_columns(table: str, get: Callable[..., Floats | None]) -> Iterator[Column[Any]]:
+    """Yield the columns that screens add to a table."""
+    for column in (column for screen in SCREENS for column in screen.columns if column.table == table):
+        yield Column(column.name, column.meaning, partial(get, column=column))
 
 
 @dataclass(frozen=True)
@@ -140,15 +143,11 @@ class Observed:
 
     def on_all_channels(self, values: Floats | None) -> Floats:
         """Return values of the channels that were positioned with, on all channels: shape (T, M), NaN elsewhere."""
-        full = np.full(self.result.reason.shape, np.nan)
-        if values is not None:
-            full[:, self.result.columns] = values
-        return full
+        return self.result.on_all_channels(np.nan if values is None else values)
 
-    @cached_property
-    def innovations(self) -> Mapping[str, Floats]:
-        """Innovations of the filter and weights of codes, by column."""
-        return innovations(self.tracked, self.result.columns, self.result.reason.shape)
+    def innovation(self, kind: Kind) -> Floats:
+        """Return the filter's innovations of a kind of measurement of each channel, shape (T, M); NaN without it."""
+        return self.on_all_channels(None if self.tracked is None else self.tracked.tracked.innovation[:, kind])
 
 
 #: Columns that the tables of positions and of the filter share: epoch, line and position.
@@ -175,7 +174,11 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
         *ON_LINE,
         Column("along_sigma_m", "standard deviation along the line, other positions of an ambiguous epoch included"),
-        Column("own_sigma_m", "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit"),
+        Column(
+            "own_sigma_m",
+            "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit",
+            "epoch_sigma_m",
+        ),
         *IN_SPACE,
         Column("n_used", "satellites used", dtype=pl.Int16()),
         Column("n_rejected", "satellites with a pseudorange that were not used", dtype=pl.Int16()),
@@ -279,7 +282,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "araim_vertical_m", "the same, vertical", lambda r: None if r.araim is None else r.araim.space.level_m[:, 2]
         ),
-        *(_position_column(c) for screen in SCREENS for c in screen.columns if c.table == "positions"),
+        *_screen_columns("positions", _get_screened),
         Column(
             "conventional_status",
             "3-D single point: `valid`, `no_position`, `residuals` beyond noise (chi-square test), "
@@ -320,16 +323,16 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "cn0_fall_db", "median fall of C/N0 of the satellites below their recent peak", "interference.power.fall_db"
         ),
-        Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 0]),
-        Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 1]),
-        Column("conventional_z_m", "3-D single point, ECEF", lambda r: r.conventional_ecef_m[:, 2]),
+        Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 0]),
+        Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 1]),
+        Column("conventional_z_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 2]),
     )
 )
 
 
 def _second(observed: Observed, values: Callable[[Combined, SecondCodes], Floats]) -> Floats | None:
     """Return values of the combination of two codes on all channels; None with one frequency."""
-    combined, second = observed.result.combined, observed.result.second
+    combined, second = observed.result.combined, observed.result.corrected.second
     return None if combined is None or second is None else observed.on_all_channels(values(combined, second))
 
 
@@ -351,7 +354,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             "pseudorange, satellite clock, group delay and atmosphere applied",
             "result.corrected_code_m",
         ),
-        *(_observation_column(c) for screen in SCREENS for c in screen.columns if c.table == "observations"),
+        *_screen_columns("observations", _get_screened_channels),
         Column(
             "second_share",
             "two frequencies: weight of the second code; negative: toward the ionosphere-free combination; "
@@ -383,17 +386,17 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             "innovation_code_m",
             "filter along the track: code less its prediction from earlier epochs, where codes are used (once a "
             "second)",
-            lambda o: o.innovations["innovation_code_m"],
+            lambda o: o.innovation(Kind.CODE),
         ),
         *of_one_meaning(
             "innovation of the carrier phase's change, and of the Doppler",
-            innovation_phase_m=lambda o: o.innovations["innovation_phase_m"],
-            innovation_doppler_mps=lambda o: o.innovations["innovation_doppler_mps"],
+            innovation_phase_m=lambda o: o.innovation(Kind.PHASE),
+            innovation_doppler_mps=lambda o: o.innovation(Kind.DOPPLER),
         ),
         Column(
             "weight_code",
             "weight of the code in the filter; 1 is that of an error of one standard deviation",
-            lambda o: o.innovations["weight_code"],
+            lambda o: o.on_all_channels(None if o.tracked is None else o.tracked.tracked.weight[:, Kind.CODE]),
         ),
     )
 )

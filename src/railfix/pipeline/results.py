@@ -1,105 +1,153 @@
-"""Results of the pipeline with every intermediate value."""
+"""Results of the pipeline: the outputs of its stages by antenna, and what tables show of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Strings
-from railfix.core.epoch_rows import OnDemand
-from railfix.core.reasons import Status
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Strings, copy_with
+from railfix.core.epoch_rows import take_epochs
+from railfix.core.reasons import Reason, Status
 from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
-from railfix.gnss.orbits import SatelliteStates
-from railfix.integrity.fault_exclusion import RaimResult
-from railfix.integrity.protection.araim import AraimResult
+from railfix.integrity.interference import Sign, WheelSigns
+from railfix.pipeline.chunk import Chunk
+from railfix.pipeline.config import Config
+from railfix.pipeline.coordinates import LineCoordinates
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.pipeline.interference_stage import Interference
-from railfix.pipeline.level_stage import ProtectionResult
-from railfix.positioning.carrier import PhasePositions
-from railfix.positioning.map_offset import MapOffset
-from railfix.positioning.normal_equations import Constrained, SinglePoint
-from railfix.positioning.section_search import Section
+from railfix.pipeline.interference_stage import Interference, with_statuses
+from railfix.pipeline.level_stage import apply_verdicts
+from railfix.pipeline.smoothed_track import Replay
+from railfix.pipeline.solution import Solution, with_coordinates
 from railfix.positioning.two_frequencies import Combined
-from railfix.ranges.second_codes import SecondCodes
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import Screened
+from railfix.track.trajectory import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
-class AntennaResult(NotebookTable, OnDemand):
-    """Results of one antenna, T epochs by M channels.
+class AntennaResult(Solution, LineCoordinates, NotebookTable):
+    """Results of one antenna, T epochs: positions without those that the status drops, and what they rest on.
 
-    The channels are those of the given observations, of all antennas where few epochs of several are given together.
+    Arrays of the ranges have the K channels that settings allow (`corrected`); those of properties have all M channels
+    of the observations given, of all antennas where few epochs of several are given together.
     """
 
-    time: Datetimes  #: Shape (T,).
-    #: Shape (M,).
-    satellite: Strings
-    signal: Strings
-    status: Codes  #: `reasons.Status`; shape (T,).
-    #: Along the line (reference point named by the trajectory), its own marking, and along the antenna's trajectory.
-    #: NaN where the status has no position; shape (T,).
-    chainage_m: Floats
-    kilometrage_m: Floats
-    arc_m: Floats
-    #: Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
-    #: itself; satellites and atmosphere; the map error; and the distance to another possible position, by its
-    #: probability; shape (T,).
-    along_sigma_m: Floats
-    #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
-    #: receiver's noise and the noise of these residuals, widened by Student's t where few ranges are redundant. Also
-    #: given where the position is dropped; shape (T,).
-    own_sigma_m: Floats
-    #: Ratio of this receiver's standard deviation to that of the weights: root mean square of the ranges that RAIM
-    #: accepted in earlier epochs, with forgetting; shape (T,).
-    noise_scale: Floats
-    ecef_m: Floats  #: Antenna; shape (T, 3).
-    #: Shape (T,).
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
-    #: Satellites used; satellites with a code that were not used; shape (T,).
-    n_used: Integers
-    n_rejected: Integers
-    #: `railfix.integrity.PointStatus` of the conventional position, which is kept as it is; shape (T,).
-    conventional_status: Codes
-    conventional_ecef_m: Floats  #: 3-D single point from the same ranges; shape (T, 3).
-    #: Nearest point of the trajectory to it, and how far that is; shape (T,).
-    conventional_arc_m: Floats
-    conventional_chainage_m: Floats
-    conventional_offset_m: Floats
-    reason: Bits  #: `reasons.Reason` bits, 0 = used; shape (T, M).
-    #: NaN where unknown; shape (T, M).
-    elevation_deg: Floats
-    azimuth_deg: Floats
-    cn0_dbhz: Floats
-    sigma_m: Floats
-    bound_sigma_m: Floats  #: Least sigma of each range in the level, by the error model; 0 without one; shape (T, M).
-    #: NaN where unknown; residuals of the position on the line; shape (T, M).
-    corrected_code_m: Floats
-    residual_m: Floats
-    satellites: SatelliteStates  #: Frequencies of the channels in `columns`.
-    columns: Indices  #: Channels that settings allow, in the order of the intermediate results below; shape (K,).
-    second: SecondCodes | None  #: Second codes of satellites, where two frequencies are used; shape (T, K).
-    combined: Combined | None  #: How they were combined with the first.
+    trajectory: Trajectory  #: Of the antenna.
+    corrected: CorrectedRanges  #: Corrected ranges, with all reasons against them.
+    combined: Combined | None  #: How codes of two frequencies were combined.
     #: Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which judges positions,
     #: has shape (T,).
     screens: Mapping[str, Screened]
-    single_point: SinglePoint  #: The conventional position: every constellation with a separate clock.
-    section: Section
-    constrained: Constrained  #: Position on the line.
-    #: Positions from code and phase, where ``Config.carrier`` is "float"; the coordinates are theirs.
-    phase: PhasePositions | None
-    raim: RaimResult  #: Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
-    protection: ProtectionResult | None  #: Protection levels along the line; None where they are off.
-    map_offset: MapOffset  #: Mean offset of the 3-D positions of the last minutes from the line.
     interference: Interference | None  #: Jamming and spoofing suspected; None where that is off.
-    araim: AraimResult | None  #: ARAIM levels; None without an integrity support message.
-    clocks: tuple[str, ...]  #: Letter of each receiver clock of the results above; length G.
-    #: Inter-system bias known before each epoch (that clock less the reference clock), and its sigma; shape (T, G).
-    clock_offset_m: Floats
-    clock_offset_sigma_m: Floats
+
+    @property
+    def time(self) -> Datetimes:
+        """Time tags, shape (T,)."""
+        return self.corrected.time
+
+    @property
+    def satellite(self) -> Strings:
+        """Satellite of each channel, shape (M,)."""
+        return self.corrected.observations.satellite
+
+    @property
+    def signal(self) -> Strings:
+        """Signal of each channel, shape (M,)."""
+        return self.corrected.observations.signal
+
+    @property
+    def columns(self) -> Indices:
+        """Channels that settings allow, in the order of `corrected`, shape (K,)."""
+        return self.corrected.columns
+
+    @property
+    def cn0_dbhz(self) -> Floats:
+        """Carrier-to-noise density, shape (T, M)."""
+        return self.corrected.observations.cn0_dbhz
+
+    @cached_property
+    def reason(self) -> Bits:
+        """`reasons.Reason` bits, 0 = used, shape (T, M)."""
+        corrected, second = self.corrected, self.corrected.second
+        not_observed = ~np.isfinite(corrected.observations.code_m) * np.int64(Reason.NOT_OBSERVED)
+        reason = np.asarray(not_observed | corrected.channels.left_out)
+        reason[:, corrected.columns] = corrected.reason
+        if second is not None and self.combined is not None:
+            epoch, channel = np.nonzero(np.isfinite(self.combined.share))
+            reason[epoch, second.column[epoch, channel]] = corrected.reason[epoch, channel]
+        return reason
+
+    @property
+    def n_used(self) -> Integers:
+        """Satellites used, shape (T,)."""
+        return np.asarray((self.corrected.reason == 0).sum(axis=1))
+
+    @property
+    def n_rejected(self) -> Integers:
+        """Satellites with a code of which no signal was used, shape (T,)."""
+        of_satellite = self.corrected.channels.member.astype(np.float32)  # floats are multiplied in blocks
+        seen = ((self.reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
+        used = (self.reason == 0).astype(np.float32) @ of_satellite > 0
+        return np.asarray((seen & ~used).sum(axis=1), dtype=np.int64)
+
+    def on_all_channels(self, values: Floats | float) -> Floats:
+        """Return values of the channels that settings allow, shape (T, K), on all channels: (T, M), NaN elsewhere."""
+        full = np.full(self.corrected.observations.code_m.shape, np.nan)
+        full[:, self.corrected.columns] = values
+        return full
+
+    @property
+    def elevation_deg(self) -> Floats:
+        """Elevation of the satellites, NaN where unknown, shape (T, M)."""
+        return self.on_all_channels(self.corrected.elevation_deg)
+
+    @property
+    def azimuth_deg(self) -> Floats:
+        """Azimuth of the satellites, NaN where unknown, shape (T, M)."""
+        return self.on_all_channels(self.corrected.azimuth_deg)
+
+    @property
+    def sigma_m(self) -> Floats:
+        """Standard deviation of each range, shape (T, M)."""
+        return self.on_all_channels(self.corrected.sigma_m)
+
+    @property
+    def bound_sigma_m(self) -> Floats:
+        """Least sigma of each range in the level, by the error model; 0 without one; shape (T, M)."""
+        return self.on_all_channels(self.corrected.bound_sigma_m)
+
+    @property
+    def corrected_code_m(self) -> Floats:
+        """Corrected pseudoranges, NaN where unknown, shape (T, M)."""
+        return self.on_all_channels(self.corrected.corrected_code_m)
+
+    @property
+    def residual_m(self) -> Floats:
+        """Residuals of the position on the line, NaN for ranges that were not used, shape (T, M)."""
+        residual = self.fix.constrained.residual_m
+        return self.on_all_channels(np.where(self.corrected.reason == 0, residual, np.nan))
+
+    @cached_property
+    def _nearest(self) -> tuple[Floats, Floats]:
+        return self.trajectory.nearest(self.point.ecef_m)
+
+    @property
+    def conventional_arc_m(self) -> Floats:
+        """Arc length of the point of the trajectory nearest to the 3-D single point, shape (T,)."""
+        return self._nearest[0]
+
+    @property
+    def conventional_offset_m(self) -> Floats:
+        """Distance of the 3-D single point from that point, shape (T,)."""
+        return self._nearest[1]
+
+    @property
+    def conventional_chainage_m(self) -> Floats:
+        """Chainage of that point, shape (T,)."""
+        return self.trajectory.chainage_at(self.conventional_arc_m)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -117,6 +165,44 @@ class AntennaResult(NotebookTable, OnDemand):
         return {"median sigma [m]": median_text(self.along_sigma_m), "median level [m]": median_text(level)}
 
 
+def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Config) -> dict[str, AntennaResult]:
+    """Return the results of single epochs by antenna, without the coordinates that the last status drops.
+
+    The filter along the track, where it is on, gives the sign of interference by the wheel.
+    """
+    results = {}
+    for k, (name, rows) in enumerate(chunk.rows.items()):
+        assert chunk.solution is not None, "positions come before results"
+        solution, interference = take_epochs(chunk.solution, rows), chunk.interference[k]
+        wheel = fusion[name].wheel if name in fusion else None
+        if wheel is not None and interference is not None:
+            solution, interference = add_wheel_sign(solution, interference, wheel)
+        trajectory = chunk.antennas.indices[k].trajectory
+        has = with_coordinates(config.failed_checks)[solution.status]
+        arc, protection, raim = np.where(has, solution.arc_m, np.nan), solution.protection, solution.raim
+        if protection is not None:
+            protection = apply_verdicts(protection, solution.status, has, trajectory.chainage_at(arc), config)
+        solution = copy_with(
+            solution, arc_m=arc, along_sigma_m=np.where(has, solution.along_sigma_m, np.nan), protection=protection,
+            raim=copy_with(raim, protection_level_m=np.where(has, raim.protection_level_m, np.nan)),
+        )  # fmt: skip
+        screens = {key: take_epochs(screened, rows) for key, screened in chunk.screens.items()}
+        results[name] = AntennaResult(
+            **vars(solution), trajectory=trajectory, corrected=take_epochs(chunk.corrected, rows),
+            combined=take_epochs(chunk.combined, rows), screens={**screens, **chunk.judged[name]},
+            interference=interference,
+        )  # fmt: skip
+    return results
+
+
+def add_wheel_sign(solution: Solution, interference: Interference, wheel: WheelSigns) -> tuple[Solution, Interference]:
+    """Return positions and interference with the sign of the wheel where distances by satellites part from its own."""
+    causes = np.where(wheel.parted, interference.causes | int(Sign.WHEEL_PARTS), interference.causes)
+    interference = replace(interference, causes=causes)
+    status = with_statuses(solution.status, [interference.suspicion])
+    return copy_with(solution, status=np.where(wheel.parted, status, solution.status)), interference
+
+
 @dataclass(frozen=True, kw_only=True)
 class Result(NotebookTable):
     """Results of one chunk."""
@@ -125,6 +211,8 @@ class Result(NotebookTable):
     notes: tuple[str, ...]  #: Differences between the requested and the used data, one sentence each.
     #: Positions of the filter along the track, by antenna; empty where it is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
+    #: What the filter was given, by antenna, to smooth its positions (`railfix.pipeline.smoothed_track`).
+    replays: Mapping[str, tuple[Replay, ...]] = field(default_factory=dict)
 
     def __getitem__(self, antenna: str) -> AntennaResult:
         """Return the single-epoch results of an antenna; KeyError where no antenna has that name."""

@@ -1,56 +1,48 @@
-"""Screens of the observations, combination of frequencies and carrier smoothing, over the rows of all antennas."""
+"""Screens of observations and positions, combination of frequencies and carrier smoothing, over all antennas."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from railfix.core.arrays import copy_with
+import numpy as np
+
+from railfix.core.arrays import Codes, copy_with
 from railfix.core.epoch_rows import join_epochs, take_epochs
 from railfix.pipeline.carrier_stage import CarrierState, find_antenna_slips, smooth_ranges
+from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.frequency_stage import combine_frequencies
 from railfix.pipeline.observable_checks import check_observables
+from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import apply_verdict
-from railfix.pipeline.state import AntennaState
-from railfix.positioning.antenna_rows import AntennaRows
-from railfix.positioning.carrier import Slips
-from railfix.positioning.two_frequencies import Combined
-from railfix.ranges.corrected import CorrectedRanges
-from railfix.screens import PairedEpochs, Screened, ScreenSetup
-
-
-class Screening(NamedTuple):
-    """Ranges of all antennas after the screens of each antenna."""
-
-    corrected: CorrectedRanges
-    notes: tuple[str, ...]  #: On Dopplers and phases that are not used.
-    screens: Mapping[str, Screened]  #: Metric and verdict of each screen.
-    combined: Combined | None
-    slips: Slips | None
+from railfix.pipeline.solution import Solution, with_coordinates
+from railfix.screens import FilteredMotion, PairedEpochs, Screened, ScreenSetup
+from railfix.screens.base import on_pairs
 
 
 def screen_antennas(
-    corrected: CorrectedRanges,
-    antennas: AntennaRows,
+    chunk: Chunk,
     screens: Sequence[tuple[Any, Any]],
     setup: ScreenSetup,
     config: Config,
     ionosphere_sigma_m: float,
     states: Sequence[AntennaState],
-) -> tuple[Screening, list[AntennaState]]:
-    """Return the ranges after the screens of one antenna alone (`screens`, with their limits), and new states.
+) -> tuple[Chunk, list[AntennaState]]:
+    """Return the chunk after the screens that judge one antenna alone (`screens`, with their limits), and new states.
 
     Dopplers and phases of the wrong sign or unit are left out first. Codes of two frequencies are combined here, and
     smoothed by the carrier phase where the settings request it.
     """
+    corrected, antennas = chunk.corrected, chunk.antennas
     checked = [
         check_observables(take_epochs(corrected, rows), state.observables)
         for rows, state in zip(antennas.parts, states, strict=True)
     ]
-    if any(own.notes for own in checked):
-        corrected = join_epochs([own.corrected for own in checked])
-    states = [copy_with(state, observables=own.state) for state, own in zip(states, checked, strict=True)]
+    notes = tuple(note for _, own, _ in checked for note in own)
+    if notes:
+        corrected = join_epochs([own for own, _, _ in checked])
+    states = [copy_with(state, observables=own) for state, (_, _, own) in zip(states, checked, strict=True)]
     found: dict[str, Screened] = {}
     kept = [dict(state.screens) for state in states]
     for screen, limits in screens:
@@ -79,18 +71,53 @@ def screen_antennas(
     after = [
         copy_with(state, screens=kept[k], carrier=carriers[k], two_frequencies=two[k]) for k, state in enumerate(states)
     ]
-    return Screening(corrected, tuple(note for own in checked for note in own.notes), found, combined, slips), after
+    notes = (*chunk.notes, *notes)
+    return copy_with(chunk, corrected=corrected, screens=found, combined=combined, slips=slips, notes=notes), after
 
 
-def screen_pairs(
-    screening: Screening, rows: Mapping[str, slice], screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None
-) -> Screening:
-    """Return the ranges after the screens of common observations of two antennas (`screens`, with their limits)."""
-    corrected, found = screening.corrected, dict(screening.screens)
-    for screen, limits in screens if pair is not None else ():
+def screen_pairs(chunk: Chunk, screens: Sequence[tuple[Any, Any]]) -> Chunk:
+    """Return the chunk after the screens of common observations of two antennas (`screens`, with their limits)."""
+    corrected, found, rows = chunk.corrected, dict(chunk.screens), chunk.rows
+    for screen, limits in screens if chunk.pair is not None else ():
         front, rear = (take_epochs(corrected, rows[name]) for name in ("front", "rear"))
-        judged = screen.judge(front, rear, pair, limits)
+        judged = screen.judge(front, rear, chunk.pair, limits)
         for verdict in map(join_epochs, zip(*(judged[name] for name in rows), strict=True)):
             corrected = apply_verdict(corrected, verdict)
             found[verdict.name] = verdict.screened
-    return screening._replace(corrected=corrected, screens=found)
+    return copy_with(chunk, corrected=corrected, screens=found)
+
+
+def screen_positions(
+    chunk: Chunk, solution: Solution, screens: Sequence[tuple[Any, Any]], config: Config
+) -> tuple[Codes, dict[str, dict[str, Screened]]]:
+    """Return the statuses (T,) after the screens that compare positions of two antennas, and verdicts by antenna.
+
+    Both antennas get the status of a screen.
+    """
+    status, pair, judged = solution.status.copy(), chunk.pair, {name: dict[str, Screened]() for name in chunk.names}
+    if pair is None or not screens:
+        return status, judged
+    chainage, rows = chunk.antennas.chainage_at(solution.arc_m), chunk.rows
+    epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
+    for screen, limits in screens:
+        verdict = screen.judge(*(chainage[rows[name]][own] for name, own in epochs.items()), pair, limits)
+        for name, own in epochs.items():
+            found = on_pairs(verdict, chainage[rows[name]].shape, own, own)
+            doubtful = found.reject & with_coordinates(config.failed_checks)[status[rows[name]]]
+            status[rows[name]] = np.where(doubtful, int(screen.status), status[rows[name]])
+            judged[name][screen.name] = found
+    return status, judged
+
+
+def screen_filtered(
+    screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, filtered: Mapping[str, FilteredMotion]
+) -> dict[str, Screened]:
+    """Return the verdicts of the screens of positions on those of the filter, by antenna."""
+    judged: dict[str, Screened] = {}
+    for screen, limits in screens if pair is not None else ():
+        assert pair is not None
+        epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
+        verdict = screen.judge_filtered(*(filtered[name].take(own) for name, own in epochs.items()), pair, limits)
+        for name, own in epochs.items():
+            judged[name] = on_pairs(verdict, filtered[name].chainage_m.shape, own, own)
+    return judged

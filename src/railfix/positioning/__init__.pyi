@@ -4,6 +4,7 @@ from .antenna_rows import AntennaRows
 from .approximate import ApproximatePosition, approximate_position
 from .inter_system import PointPositions, TieLimits, tie_constellations
 from .line_fix import FixLimits, LineFix, fix_on_line
+from .noise_windows import Windows
 from .normal_equations import (
     Constrained,
     ConstrainedLimits,
@@ -26,7 +27,6 @@ from .receiver_noise import (
 )
 from .search_index import SearchIndex
 from .section_search import Section, SectionLimits, find_section
-from .windows import Windows
 
 __all__ = [
     "AntennaRows",

@@ -19,9 +19,9 @@ from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.noise_windows import correlated_sums
 from railfix.positioning.normal_equations import SinglePoint
 from railfix.positioning.range_arrays import RangeArrays, Ranges
-from railfix.positioning.windows import correlated_sums
 
 _SUMS: Final = 9  #: Sums of a window.
 

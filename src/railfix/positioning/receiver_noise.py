@@ -28,9 +28,9 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Str
 from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.noise_windows import Dated, Windows, correlated_sums
 from railfix.positioning.normal_equations import Constrained, SinglePoint
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
-from railfix.positioning.windows import Dated, Windows, correlated_sums
 from railfix.track.trajectory import Trajectory
 
 

@@ -22,7 +22,7 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
-from railfix.positioning.windows import correlated_sums
+from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.second_codes import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Mean size of a normal deviate, inverted.

@@ -21,7 +21,6 @@ from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.io.position_log import PositionLog
 from railfix.io.reference_log import Acceleration, Pulses
-from railfix.motion.tachometer import Wheel, estimate_wheel
 from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.fixes import Fixes, ReferenceSettings, judge_alone, judge_pair, judge_place, judge_travel
 from railfix.reference.smoother import (
@@ -38,6 +37,7 @@ from railfix.reference.smoother import (
     slip_m,
     smooth,
 )
+from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
 #: Speeds farther apart leave the distance between them unknown [s], with this variance [m2].

@@ -16,7 +16,7 @@ from railfix.core.errors import RailfixError
 from railfix.core.files import write_whole
 from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
-from railfix.evaluate.inputs import POSITIONS_TABLE, floats, list_position_tables, read_table
+from railfix.evaluate.evaluation_inputs import POSITIONS_TABLE, floats, list_position_tables, read_table
 from railfix.report.charts_page import Block, Notes, Sentence, charts_page
 from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan

@@ -13,7 +13,7 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
 from railfix.core.tables import Table, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.evaluate.inputs import floats
+from railfix.evaluate.evaluation_inputs import floats
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram, level_name, positions_diagram
 from railfix.evaluate.tables import level_tables, select_evaluation
 from railfix.pipeline.level_stage import prior_basis_text

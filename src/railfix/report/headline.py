@@ -12,8 +12,8 @@ import polars as pl
 from railfix.core.arrays import Floats
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
-from railfix.evaluate.figures import PASSED
-from railfix.evaluate.inputs import floats
+from railfix.evaluate.accuracy import PASSED
+from railfix.evaluate.evaluation_inputs import floats
 from railfix.report.runs import ReportedRun, get_figures
 from railfix.run.record import level_basis
 from railfix.run.verdict import judge_run

@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
-from railfix.evaluate.inputs import flat_settings
+from railfix.evaluate.evaluation_inputs import flat_settings
 from railfix.evaluate.tables import error_tables, group_tables, select_evaluation
 from railfix.report.charts_page import (
     Absent,

@@ -14,7 +14,14 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.tables import reading_table
 from railfix.evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.evaluate.evaluation import EvaluatedRun, short_names
-from railfix.evaluate.inputs import NO_MORE, POSITIONS_TABLE, RunFolder, list_position_tables, read_run, read_table
+from railfix.evaluate.evaluation_inputs import (
+    NO_MORE,
+    POSITIONS_TABLE,
+    RunFolder,
+    list_position_tables,
+    read_run,
+    read_table,
+)
 from railfix.evaluate.place import read_run_track
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve

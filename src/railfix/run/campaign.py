@@ -25,7 +25,7 @@ from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
 from railfix.run.inputs import LogReading, RunInputs, RunOptions
 from railfix.run.output import check_folder
-from railfix.run.processor import with_measured_priors
+from railfix.run.processor_setup import with_measured_priors
 from railfix.run.record import read_record
 
 #: A field in a pattern: ``{day}``.

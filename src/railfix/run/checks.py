@@ -15,7 +15,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.motion.samples import SensorSamples
 from railfix.ranges.base_station import LONGEST_AGE_S, LONGEST_KM
 from railfix.ranges.sbas import DfmcService, SbasCorrections
-from railfix.run.processor import BaseLog
+from railfix.run.processor_setup import BaseLog
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally, Tally
 from railfix.track.track import ANOTHER_PLACE_M

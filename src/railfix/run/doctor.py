@@ -117,8 +117,9 @@ def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
 def _find_kinds(path: Path) -> tuple[Kind, ...]:
     """Return the kinds that a file can be of, the likely one first."""
     kind = find_kind(path)
-    if kind == "table":
-        return ("positions",) if has_times(path) else ("track",)
+    if kind in ("table", "gpx"):
+        without: tuple[Kind, ...] = ("track",) if kind == "table" else ("positions", "track")
+        return ("positions",) if has_times(path) else without
     if kind == "mate":
         return ("observations",) if mate_table(path) == "S_GNSS_SAT" else ("track",)
     return _KINDS.get(kind, ("unknown",))
@@ -306,7 +307,6 @@ _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     "sp3": ("orbits",),
     "sbas": ("sbas",),
     "receiver": ("observations", "navigation", "positions"),
-    "gpx": ("positions", "track"),
     "toml": ("vehicle", "settings"),
     **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),

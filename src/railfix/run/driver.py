@@ -24,12 +24,12 @@ from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import get_risk_budget, level_facts, prior_basis_text
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.state import State
+from railfix.pipeline.processor_state import State
 from railfix.run.checks import check_base, check_each_file, check_same_day, check_same_place, check_whole_run
 from railfix.run.convert import add_mate_results
 from railfix.run.inputs import Antenna, RunInputs, RunOptions
 from railfix.run.output import OutputFolder
-from railfix.run.processor import BaseLog, base_log, make_processor
+from railfix.run.processor_setup import BaseLog, base_log, make_processor
 from railfix.run.record import RunProvenance, compute_figures, package_versions, run_record
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sensors import check_filter, load_balises, read_sensors, units_of_ranges

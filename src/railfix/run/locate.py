@@ -22,10 +22,10 @@ from railfix.io.file_kind import POSITIONS, find_kind, wrong_kind
 from railfix.io.logs import read_navigation
 from railfix.io.positions import read_positions
 from railfix.motion.features import BASE_M, STEP_M, Feature, LineSeries, Quantity, map_features
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import Located, NoPosition, locate, survey_run
 from railfix.pipeline.received import Received, known_from_start
+from railfix.pipeline.without_map import Located, NoPosition, locate, survey_run
 from railfix.run.checks import check_each_file
 from railfix.run.inputs import NAVIGATION, InputFiles, LogReading, input_option
 from railfix.run.sources import Log

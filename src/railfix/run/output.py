@@ -332,7 +332,7 @@ class OutputFolder:
         """Write a table again, Parquet and CSV, some rows at a time, changed."""
         import polars as pl
 
-        from railfix.pipeline.tables import round_floats
+        from railfix.pipeline.result_tables import round_floats
 
         file = f"{name}.parquet"
         self._csv.pop(f"{name}.csv").close()

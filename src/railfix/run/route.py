@@ -21,10 +21,10 @@ from railfix.core.timescale import nearest_rows
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.position_log import PositionLog
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import locate
 from railfix.pipeline.received import known_from_start
+from railfix.pipeline.without_map import locate
 from railfix.run.inputs import TrackReading
 from railfix.track import Track
 from railfix.track.frames import in_map_frame

@@ -73,7 +73,7 @@ def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMoti
     gained[1:-1] = 2.0 * (way[1:] / step[1:] - way[:-1] / step[:-1]) / span
     rate[1:-1] = np.arctan2(np.sin(turned), np.cos(turned)) / span
     known = count > 0
-    gradient = Line.of(trajectory).gradient_at(arc)
+    gradient = Line(trajectory).gradient_at(arc)
     return PositionMotion(time[0] + timedelta(t[known]), speed[known], gained[known], gradient[known], rate[known])
 
 
@@ -281,7 +281,7 @@ def range_notes(
     near &= (np.abs(ran) > _MOVED_M) & (unit >= 0) & np.isfinite(ranging.range_m)
     rows = np.flatnonzero(near)
     along, right, up = ranging_lever_m(trajectory, limits).tolist()
-    point, axes = Line.of(trajectory).at(arc[rows] + along)
+    point, axes = Line(trajectory).at(arc[rows] + along)
     sight = units.ecef_m[unit[rows]] - point - right * axes[:, 1] - up * axes[:, 2]
     distance = np.linalg.norm(sight, axis=1)
     ahead = (sight * axes[:, 0]).sum(axis=1) / np.maximum(distance, 1e-9)
@@ -311,7 +311,7 @@ def range_notes(
 
 
 def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
-    """Return times and speeds of filtered positions (`railfix.pipeline.tables`) for which Dopplers were used."""
+    """Return times and speeds of filtered positions (`railfix.pipeline.result_tables`) for which Dopplers were used."""
     known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
     return known.select("time_gpst", "speed_mps")
 

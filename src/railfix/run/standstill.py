@@ -14,12 +14,12 @@ from railfix.core.errors import MismatchError
 from railfix.core.geodesy import axes_at, range_with_rotation
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.locate import RangesWithoutMap, locate, ranges_without_map
 from railfix.pipeline.received import known_from_start
+from railfix.pipeline.without_map import RangesWithoutMap, locate, ranges_without_map
 from railfix.positioning.standstill_phase import MeanPhases
-from railfix.positioning.which_track import StandstillErrors, StandstillFix, standstill_fix
+from railfix.positioning.track_choice import StandstillErrors, StandstillFix, standstill_fix
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
 #: Satellites in fewer than this fraction of the epochs are left out, so that the mean is over the same ones.
@@ -93,9 +93,9 @@ def standstill_codes(
     if moved > _AT_REST_M:
         raise MismatchError(f"the antenna moves by {moved:.0f} m in the log; give --start and --end of a standstill")
     origin = np.median(places, axis=0) if origin_ecef_m is None else origin_ecef_m
-    time, residual, names = obs.time, _residual(seen, origin), seen.channels.satellite
+    time, residual, names = obs.time, _residual(seen, origin), seen.corrected.channels.satellite
     columns, phases = np.arange(len(names)), None
-    elevation = np.nanmedian(seen.elevation_deg, axis=0)
+    elevation = np.nanmedian(seen.corrected.elevation_deg, axis=0)
     nominal = np.hypot(config.nominal.sigma_m(elevation), received.ionosphere_sigma_m * thin_shell_obliquity(elevation))
     if base is not None:
         of_base, base_ecef_m = base
@@ -115,7 +115,7 @@ def standstill_codes(
         rows = system == letter
         received = np.isfinite(residual[:, rows]).sum(axis=1, keepdims=True)  # 0 in a tunnel
         residual[:, rows] -= np.nansum(residual[:, rows], axis=1, keepdims=True) / np.maximum(received, 1)
-    elevation, azimuth = seen.elevation_deg[:, columns[kept]], seen.azimuth_deg[:, columns[kept]]
+    elevation, azimuth = seen.corrected.elevation_deg[:, columns[kept]], seen.corrected.azimuth_deg[:, columns[kept]]
     turn = np.radians(azimuth)
     return StandstillCodes(
         time=time,
@@ -151,7 +151,7 @@ def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Ind
 
 def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[Indices, Indices]:
     """Return the channels of two receivers with the same satellites and signals."""
-    names = [list(zip(s.channels.satellite.tolist(), s.channels.signal.tolist(), strict=True)) for s in (seen, other)]
+    names = [s.corrected.channels.names.tolist() for s in (seen, other)]
     shared = [name for name in names[0] if name in names[1]]
     if not shared:
         raise MismatchError("log and base station have no signal of a satellite in common")
@@ -223,8 +223,8 @@ def _phases(train: _Side, base: _Side) -> StandstillPhases:
     """Return the single differences of the phases; GLONASS, whose wavelengths differ, is left out."""
     sides, lost = [], []
     for obs, seen, place, epochs, columns in (train, base):
-        channel = seen.channels.columns[columns]
-        wavelength = SPEED_OF_LIGHT / seen.channels.frequency_hz[columns]
+        channel = seen.corrected.channels.columns[columns]
+        wavelength = SPEED_OF_LIGHT / seen.corrected.channels.frequency_hz[columns]
         rows = np.ix_(epochs, columns)
         # orbit, clock and troposphere as of the codes; the ionosphere, of opposite sign, is the same at both ends
         corrections = seen.ranges.code_m[rows] - obs.code_m[np.ix_(epochs, channel)]
@@ -237,16 +237,16 @@ def _phases(train: _Side, base: _Side) -> StandstillPhases:
     _, seen, origin, epochs, columns = train
     line = seen.ranges.sat_ecef_m[np.ix_(epochs, columns)] - origin
     toward = line @ axes_at(origin).T
-    satellite = seen.channels.satellite[columns]
+    satellite = seen.corrected.channels.satellite[columns]
     kept = np.array([not str(name).startswith("R") for name in satellite], dtype=np.bool_)
-    signals = zip(satellite, seen.channels.signal[columns], strict=True)
+    signals = zip(satellite, seen.corrected.channels.signal[columns], strict=True)
     group = np.array([CLOCK_GROUP[str(name)[0]] + str(signal) for name, signal in signals])
     return StandstillPhases(
         difference_m=(sides[0] - sides[1])[:, kept],
         lost=(lost[0] | lost[1])[:, kept],
         toward=(toward / np.linalg.norm(toward, axis=-1, keepdims=True))[:, kept],
-        elevation_deg=seen.elevation_deg[np.ix_(epochs, columns)][:, kept],
-        wavelength_m=(SPEED_OF_LIGHT / seen.channels.frequency_hz[columns])[kept],
+        elevation_deg=seen.corrected.elevation_deg[np.ix_(epochs, columns)][:, kept],
+        wavelength_m=(SPEED_OF_LIGHT / seen.corrected.channels.frequency_hz[columns])[kept],
         group=group[kept],
         distance_m=float(np.linalg.norm(origin - base[2])),
     )

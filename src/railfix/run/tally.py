@@ -16,13 +16,11 @@ from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.integrity.interference import CAUSES, Suspicion
 from railfix.integrity.point_validation import PointStatus
 from railfix.integrity.protection import Cause, LevelStatus
-from railfix.pipeline.antennas import AntennaOrder
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.balises import balise_notes
 from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.results import AntennaResult, Result
-from railfix.pipeline.smoothing import Replay, smooth
-from railfix.pipeline.tables import (
+from railfix.pipeline.result_tables import (
     antenna_positions,
     antenna_train,
     observations_table,
@@ -33,6 +31,8 @@ from railfix.pipeline.tables import (
     train_table,
     with_smoothed,
 )
+from railfix.pipeline.results import AntennaResult, Result
+from railfix.pipeline.smoothed_track import Replay, smooth
 from railfix.run.output import OutputFolder
 from railfix.run.sensor_checks import SensorChecks
 from railfix.run.sources import OpenedLine
@@ -347,7 +347,7 @@ class ResultRows:
             tables["passings"] = passing_table(result)
         for name, kept in self.replays.items():
             if name in result.fusion:
-                kept.keep(result.fusion[name].replay)
+                kept.keep(result.replays[name])
         if self.line.route is not None:
             tables["positions"], tables["tracks"] = self.line.route.on_tracks(tables["positions"], self.line.track)
             if "train" in tables:
@@ -395,7 +395,7 @@ def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, fold
     smoothed = {}
     for name, kept in replays.items():
         trajectory = processor.trajectories[name]
-        result = smooth(kept.backward(), Line.of(trajectory), processor.config.tracking)
+        result = smooth(kept.backward(), Line(trajectory), processor.config.tracking)
         smoothed[name] = smoothed_table(result, trajectory)
     done = dict.fromkeys(smoothed, 0)
 

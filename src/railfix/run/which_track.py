@@ -25,9 +25,9 @@ from railfix.core.settings import Settings, option
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import read_navigation
 from railfix.pipeline.config import Config
-from railfix.positioning.which_track import NONE, StandstillErrors, TrackPosterior, YardTrack, track_posterior
+from railfix.positioning.track_choice import NONE, StandstillErrors, TrackPosterior, YardTrack, track_posterior
 from railfix.run.inputs import NAVIGATION, InputFiles, LogReading, TrackReading, input_option
-from railfix.run.processor import parse_position
+from railfix.run.processor_setup import parse_position
 from railfix.run.sources import Log
 from railfix.run.standstill import StandstillCodes, standstill_codes
 from railfix.track.frames import in_map_frame

@@ -272,13 +272,8 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     noise = receiver.white(len(time))
     sine = np.sin(np.radians(np.maximum(geometry.elevation_deg, 1.0)))
     cn0 = settings.cn0_horizon_dbhz + settings.cn0_rise_db * sine + CN0_SECOND_DB * receiver.second
-    cn0 = cn0 + receiver.cn0_offset_db
-    cn0 = cn0 + settings.cn0_sigma_dbhz * noise[:, :, 3] + receiver.carried.cn0_db(len(time))
-    added_code, added_phase, added_doppler = np.zeros((3, *code.shape))
-    for source in simulation.disturbances if receiver.antenna in ANTENNAS else ():
-        more = source(geometry)
-        added_code, added_phase = added_code + more.code_m, added_phase + more.phase_m
-        added_doppler, cn0 = added_doppler + more.doppler_hz, cn0 + more.cn0_db
+    cn0 = cn0 + receiver.cn0_offset_db + settings.cn0_sigma_dbhz * noise[:, :, 3] + receiver.carried.cn0_db(len(time))
+    added_code, added_phase, added_doppler, cn0 = _disturb(simulation, receiver, geometry, cn0)
     cn0 = np.round(cn0 / CN0_STEP_DBHZ) * CN0_STEP_DBHZ
     weak = 10.0 ** ((_SIGMA_AT_DBHZ - np.minimum(cn0, _BEST_DBHZ)) / 20.0)
     sigma = settings.code_sigma_m * weak / sine
@@ -308,6 +303,18 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
         clean_code_m=code,
         error_m=error + extra + receiver.group_delay_error_m,
     )
+
+
+def _disturb(
+    simulation: Simulation, receiver: Receiver, geometry: SightGeometry, cn0_dbhz: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return what the surroundings add to code [m], phase [m] and Doppler [Hz], and the C/N0 with it, each (T, M)."""
+    code, phase, doppler = np.zeros((3, *cn0_dbhz.shape))
+    for source in simulation.disturbances if receiver.antenna in ANTENNAS else ():
+        more = source(geometry)
+        code, phase = code + more.code_m, phase + more.phase_m
+        doppler, cn0_dbhz = doppler + more.doppler_hz, cn0_dbhz + more.cn0_db
+    return code, phase, doppler, cn0_dbhz
 
 
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:

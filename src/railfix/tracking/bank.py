@@ -80,9 +80,9 @@ def budget(limits: TrackingLimits) -> Budget:
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S
     local = 1.0 + remembered_s * limits.level_samples_per_hour / 3600.0
     of_constellation = (1.0 + remembered_s / CONSTELLATION_FAULT_S) * limits.level_constellation_prior
-    local_priors = (limits.level_sensor_prior, limits.level_motion_prior, limits.level_map_prior)
-    local_priors += (limits.level_balise_prior, limits.level_side_prior)
-    each = [local * limits.level_fault_prior, of_constellation, *(local * prior for prior in local_priors), 0.0]
+    others = [limits.level_sensor_prior, limits.level_motion_prior, limits.level_map_prior]
+    others += [limits.level_balise_prior, limits.level_side_prior]
+    each = [local * limits.level_fault_prior, of_constellation, *(local * prior for prior in others), 0.0]
     exposed = [min(prior, 1.0) for prior in each]
     kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
     risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)

@@ -75,7 +75,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     seen[0] = state.seen
     used = (slot >= 0).nonzero()[0]
     present = np.zeros((len(epochs), len(state.satellite)), dtype=np.bool_)
-    np.logical_or.at(present, (slice(None), slot[used]), any_kind[:, used])  # a satellite may have several channels
+    np.logical_or.at(present.T, slot[used], any_kind[:, used].T)  # a satellite may have several channels
     seen[1:] = np.where(present, epochs.time[:, None], seen[1:])
     seen = np.fmax.accumulate(seen, axis=0)
     kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * constants.CODE_CORRELATION_S

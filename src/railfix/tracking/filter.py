@@ -95,7 +95,7 @@ class Recursion:
                 step = self.make_step(state, span[0])
                 traced.restarted[:, ix.SATELLITES + self.chunk.fresh[span[0]].nonzero()[0]] = True
                 kept = traced.kept[: state.hypotheses]
-                step.trace = layout.Trace(*(values[kept] for values in traced))
+                step.trace = layout.Trace._make([values[kept] for values in traced])
                 step.mean, step.covariance, step.parent = state.mean, state.covariance, found.parent[kept]
                 step.splits = None if found.splits is None else [found.splits[k] for k in kept.tolist()]
                 trace.append(step)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
@@ -12,7 +11,7 @@ from railfix.core.arrays import Floats
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.ranges.atmosphere import geomagnetic_latitude
-from railfix.track.trajectory import Trajectory, joins_m
+from railfix.track.trajectory import Trajectory
 
 #: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude: 2/9 of that of
 #: the vertical delay that DO-229D J.2.3 assumes without SBAS, 9 m up to 20 deg, 4.5 m up to 55 deg, 6 m beyond [m].
@@ -21,36 +20,32 @@ TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 
-@dataclass(frozen=True, kw_only=True)
 class Line:
-    """Vertices of a trajectory with their axes."""
+    """A trajectory with smooth axes at its points; places beyond its ends are on it too."""
 
-    arc_m: Floats  #: Shape (V,).
-    ecef_m: Floats  #: Shape (V, 3).
-    axes: Floats  #: Rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3).
-    segment: Floats  #: Unit vector of each segment; shape (V - 1, 3).
-    gradient: Floats  #: Climb over horizontal length of each segment; shape (V - 1,).
-    sigma_plan_m: float
-    sigma_height_m: float
+    def __init__(self, trajectory: Trajectory) -> None:
+        self.trajectory = trajectory
+        self.arc_m: Floats = trajectory.arc_m  #: Shape (V,).
+        self.ecef_m: Floats = trajectory.ecef_m  #: Shape (V, 3).
+        self.segment: Floats = trajectory.tangent  #: Unit vector of each segment; shape (V - 1, 3).
+        self.joins_m = trajectory.joins_m
+        #: Standard deviations of the map [m].
+        self.sigma_plan_m, self.sigma_height_m = trajectory.sigma_plan_m, trajectory.sigma_height_m
 
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> Line:
-        """Return the axes at the vertices of a trajectory."""
-        segment = np.asarray(trajectory.tangent)
+    @cached_property
+    def axes(self) -> Floats:
+        """Axes at the points, rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3)."""
+        segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
-        up = np.concatenate([trajectory.up[:1], trajectory.up])
-        right = np.cross(tangent, up)
+        right = np.cross(tangent, np.concatenate([up[:1], up]))
         right /= np.linalg.norm(right, axis=1, keepdims=True)
-        return cls(
-            arc_m=np.asarray(trajectory.arc_m),
-            ecef_m=np.asarray(trajectory.ecef_m),
-            axes=np.stack([tangent, right, np.cross(right, tangent)], axis=1),
-            segment=segment,
-            gradient=np.asarray(trajectory.gradient_permille) / 1e3,
-            sigma_plan_m=trajectory.sigma_plan_m,
-            sigma_height_m=trajectory.sigma_height_m,
-        )
+        return np.stack([tangent, right, np.cross(right, tangent)], axis=1)
+
+    @cached_property
+    def gradient(self) -> Floats:
+        """Climb over horizontal length of each segment, shape (V - 1,)."""
+        return self.trajectory.gradient_permille / 1e3
 
     def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
         """Return points [m] and axes at arc lengths [m], shapes (H, 3), (H, 3, 3) and (H,).
@@ -65,11 +60,6 @@ class Line:
         axes = (1.0 - share) * self.axes[index] + share * self.axes[index + 1]
         axes = axes / np.sqrt((axes * axes).sum(axis=-1, keepdims=True))
         return self.ecef_m[index] + along[:, None] * self.segment[index], axes
-
-    @cached_property
-    def joins_m(self) -> tuple[float, float]:
-        """Arc lengths at which a closed line goes on before its start and after its end; NaN at an open end."""
-        return joins_m(self.arc_m, self.ecef_m)
 
     @cached_property
     def closed(self) -> bool:

@@ -1,7 +1,7 @@
 # The names of `railfix.integrity.protection`, imported at their first use (lazy-loader).
 
-from .level import Cause, LevelStatus, ProtectionLevel, availability, protection_level
 from .risk import MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
+from .solution_separation import Cause, LevelStatus, ProtectionLevel, availability, protection_level
 
 __all__ = [
     "MOST_EXCLUDED",

@@ -1,7 +1,7 @@
 # The names of `railfix.integrity.raim`, imported at their first use (lazy-loader).
 
 from .exclusion import Detection, Exclusion, Outcome, RaimLimits, detect, exclude, threshold, worst_channel
-from .model import LinearModel, linear_model
+from .position_model import LinearModel, linear_model
 from .reliability import Reliability, noncentrality, reliability
 
 __all__ = [

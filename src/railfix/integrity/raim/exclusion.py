@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.core.settings import Settings
-from railfix.integrity.raim.model import Compact, LinearModel, compact
+from railfix.integrity.raim.position_model import Compact, LinearModel, compact
 
 _TABLE_STEP: Final = 64  #: Degrees of freedom are tabulated in steps of this many.
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.raim.exclusion import RaimLimits
-from railfix.integrity.raim.model import LinearModel, compact
+from railfix.integrity.raim.position_model import LinearModel, compact
 
 _NO_EFFECT: Final = 1e-6  #: Effect on the position, in its own sigmas, below which a satellite has none.
 _BLOCK_SIZE: Final = 40_000  #: Number of elements of a pair array of a block of epochs.

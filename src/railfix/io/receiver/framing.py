@@ -15,13 +15,13 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, RowArrays, Strings, join_rows
+from railfix.core.checksums import crc24q
 from railfix.core.files import FilePath, open_stream
 
 #: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-_CRC24_POLYNOMIAL: Final = 0x1864CFB
 #: Whether a byte can be the first and the second of the address of an NMEA sentence; 0 is beyond the buffer's end.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
@@ -186,32 +186,6 @@ def _rtcm(data: Bytes) -> _FrameCandidates:
     valid[complete] = crc24q(data, frame[complete], stop) == sent
     kind = _at(data, start) << 4 | _at(data, start + 1) >> 4
     return _FrameCandidates("rtcm3", frame, kind, start, end, end + 3, valid)
-
-
-def _crc24_table() -> Integers:
-    table = np.arange(256, dtype=np.int64) << 16
-    for _ in range(8):
-        table = np.where(table & 0x800000, table << 1 ^ _CRC24_POLYNOMIAL, table << 1)
-    return table & 0xFFFFFF
-
-
-_CRC24: Final = _crc24_table()
-
-
-def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
-    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all stretches."""
-    crc = np.zeros(len(start), dtype=np.int64)
-    order = np.argsort(start - end, kind="stable")  # longest first: the ones still running are a prefix
-    first, length = start[order], (end - start)[order]
-    state = np.zeros(len(start), dtype=np.int64)
-    running = len(start)
-    for k in range(int(length[0]) if len(length) else 0):
-        while running and length[running - 1] <= k:
-            running -= 1
-        part = state[:running]
-        state[:running] = part << 8 & 0xFFFFFF ^ _CRC24[part >> 16 ^ data[first[:running] + k]]
-    crc[order] = state
-    return crc
 
 
 def _sbf(data: Bytes) -> _FrameCandidates:

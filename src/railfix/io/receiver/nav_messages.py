@@ -17,7 +17,8 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Integers, Masks
-from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, crc24q, fields, read_unsigned, unpack_words
+from railfix.core.checksums import crc24q
+from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, fields, read_unsigned, unpack_words
 
 _PI: Final = np.pi
 Coding = tuple[int, float, str]  #: Number of bits, factor, and how it is coded, of a field (as in `Field`).

@@ -62,7 +62,7 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
     segments = len(vertex) - 1
     if segments == 1 or arc <= vertex[0].middle_m:
         return float(vertex[0].gradient)
-    v = min(np.searchsorted(vertex["middle_m"][:segments], arc, side="right"), segments - 1)
+    v = min(int(np.searchsorted(vertex["middle_m"][:segments], arc, side="right")), segments - 1)
     before, after = vertex[v - 1], vertex[v]
     share = min((arc - before.middle_m) / (after.middle_m - before.middle_m), 1.0)
     return float((1.0 - share) * before.gradient + share * after.gradient)

@@ -114,7 +114,10 @@ def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]
             if coefficient[q, k] != 0.0:
                 add_row(g, coefficient[q, k], P, unknown[q, k])
         for i in range(q + 1):
-            covariance[i, q] = covariance[q, i] = _project(equations, i, g)
+            total = 0.0
+            for k in range(ix.TERMS):  # a constant number of terms compiles to faster code
+                total += coefficient[i, k] * g[unknown[i, k]]
+            covariance[i, q] = covariance[q, i] = total
     return covariance, without_clock
 
 
@@ -162,7 +165,14 @@ def compute_weight(rows: Rows, square: float, late: bool) -> float:
 @inner
 def median(values: Floats) -> float:
     """Return the median of values; NaN of none."""
-    return float(np.median(values)) if len(values) else math.nan
+    ordered, size = np.empty(len(values)), len(values)
+    for a in range(size):  # by insertion
+        b = a
+        while b > 0 and ordered[b - 1] > values[a]:
+            ordered[b] = ordered[b - 1]
+            b -= 1
+        ordered[b] = values[a]
+    return float(0.5 * (ordered[(size - 1) // 2] + ordered[size // 2])) if size else math.nan
 
 
 @inner

@@ -1,6 +1,16 @@
 # The names of `railfix.positioning.carrier`, imported at their first use (lazy-loader).
 
 from .ambiguities import ArcAmbiguities, Fixed, PhaseLimits, PhasePositions, count_repeats, fix_integers
+from .code_smoothing import (
+    CycleSlipLimits,
+    CycleSlipState,
+    SlipReason,
+    Slips,
+    SmoothingLimits,
+    SmoothingState,
+    find_slips,
+    smooth_codes,
+)
 from .continuity import (
     ArcState,
     ContinuityLimits,
@@ -13,16 +23,6 @@ from .continuity import (
 )
 from .filtered import PhaseState, phase_positions
 from .observation_model import IntegerChannels, Phases, corrected_phase_m
-from .smoothing import (
-    CycleSlipLimits,
-    CycleSlipState,
-    SlipReason,
-    Slips,
-    SmoothingLimits,
-    SmoothingState,
-    find_slips,
-    smooth_codes,
-)
 
 __all__ = [
     "ArcAmbiguities",

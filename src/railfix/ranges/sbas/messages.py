@@ -10,7 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, freeze_rows, join_rows
-from railfix.io.receiver.framing import crc24q
+from railfix.core.checksums import crc24q
 
 Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections.
 #: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.

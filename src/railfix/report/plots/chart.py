@@ -15,7 +15,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.timescale import seconds
-from railfix.evaluate.inputs import floats, words
+from railfix.evaluate.evaluation_inputs import floats, words
 
 #: Colours distinguishable with colour blindness (Okabe and Ito), with a contrast of 3 to 1 or more on white.
 BLUE: Final[str] = "#0072b2"

@@ -15,8 +15,8 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
-from railfix.evaluate.epochs import level_columns
-from railfix.evaluate.figures import PASSED
+from railfix.evaluate.accuracy import PASSED
+from railfix.evaluate.epoch_table import level_columns
 from railfix.integrity.stanford import Region, Stanford
 from railfix.report.plots.chart import (
     BLACK,

@@ -15,7 +15,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.integrity.protection.araim import read_integrity_support
 from railfix.motion.samples import GroundUnits, ListedBalises
-from railfix.pipeline.base_station import Stations
+from railfix.pipeline.base_station_stage import Stations
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.range_stage import Models

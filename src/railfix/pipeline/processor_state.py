@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.tables import NotebookTable
-from railfix.pipeline.base_station import BaseState
+from railfix.pipeline.base_station_stage import BaseState
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import FilterState
 from railfix.pipeline.interference_stage import InterferenceState

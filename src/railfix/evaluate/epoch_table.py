@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -12,7 +12,7 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, places_in_groups
 from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
-from railfix.evaluate.inputs import EvaluationOptions, RunFolder, Sections, floats
+from railfix.evaluate.evaluation_inputs import EvaluationOptions, RunFolder, Sections, floats
 from railfix.evaluate.integrity import PARTS, STATED
 from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, bracket, compute_errors
 from railfix.io.reference_log import AntennaReference
@@ -151,26 +151,16 @@ def antenna_epochs(
     """Return the epochs of one antenna of a run with their errors; MismatchError: no time in common, no errors."""
     mine = run.positions.filter(pl.col("antenna") == antenna)
     time, logged, step_s = with_missing(mine["time_gpst"].to_numpy())
-    rows = np.where(logged, np.cumsum(logged) - 1, len(mine))
+    own = _OwnColumns(mine, np.where(logged, np.cumsum(logged) - 1, len(mine)))
     at = bracket(time, reference.time, largest_gap_s=options.reference_gap_s)
     place, chainage = at.of(reference.ecef_m), at.of(reference.chainage_m)
     if not (at.inside & logged).any():
-        span, own = (f"{t[0]} to {t[-1]}" for t in (reference.time, time))
+        spans = [f"({t[0]} to {t[-1]})" for t in (time, reference.time)]
         raise MismatchError(
-            f"{run.path}: the {antenna} antenna's epochs ({own}) and its reference ({span}, GPS time) have no time in "
-            "common; give the reference of this run"
+            f"{run.path}: the {antenna} antenna's epochs {spans[0]} and its reference {spans[1]}, GPS time, have no "
+            "time in common; give the reference of this run"
         )
-
-    def column(name: str) -> Floats:
-        return np.append(floats(mine, name), np.nan)[rows]
-
-    answers = Answers(
-        chainage_m=column("chainage_m"),
-        conventional_chainage_m=column("conventional_chainage_m"),
-        ecef_m=np.stack([column(name) for name in ("x_m", "y_m", "z_m")], axis=1),
-        reference_chainage_m=chainage,
-        reference_ecef_m=place,
-    )
+    answers = own.answers(chainage, place)
     errors = compute_errors(run, antenna, answers, method=options.method, files=files)
     known = at.inside & (np.isfinite(chainage) if errors.method == "chainage" else np.isfinite(place[:, 0]))
     along = _steps(chainage if np.isfinite(chainage[known]).all() else place, known)
@@ -178,15 +168,13 @@ def antenna_epochs(
     moved = distance_travelled(time, along, known, stated_speed, options=options)
     speed = np.where(np.isfinite(stated_speed), np.abs(stated_speed), _own_speed(time, along, known))
     sigma = at.of(reference.sigma_m)
-    status = np.append(mine["status"].to_numpy().astype(str), NOT_LOGGED)[rows]
-    clock = seconds(time - time[0])
-    stated_environment = np.where(known, reference.environment[at.nearest], "")
-    environment = _environment(stated_environment, sections, errors.reference_chainage_m)
+    stated = np.where(known, reference.environment[at.nearest], "")
+    environment = _environment(stated, sections, errors.reference_chainage_m)
     columns: dict[str, Any] = {
         "time_gpst": time,
         "antenna": np.full(len(time), antenna),
-        "status": status,
-        "observed": logged & np.append(mine["observed"].to_numpy(), False)[rows],
+        "status": own.texts("status").fill_null(NOT_LOGGED),
+        "observed": logged & np.append(mine["observed"].to_numpy(), False)[own.rows],
         "in_reference": known,
         "reference_good": known & ~(sigma > options.reference_sigma_m),
         "chainage_m": errors.reference_chainage_m,
@@ -195,26 +183,20 @@ def antenna_epochs(
         "environment": environment,
         "reference_sigma_m": sigma,
         "reference_source": np.where(known, reference.source[at.nearest], ""),
-        "n_used": column("n_used"),
+        "n_used": own.floats("n_used"),
         "positioned": np.isfinite(answers.chainage_m),
         "conventional_positioned": np.isfinite(answers.conventional_chainage_m),
         "error_m": errors.error_m,
         "conventional_error_m": errors.conventional_error_m,
         "distance_m": errors.distance_m,
-        "along_sigma_m": column("along_sigma_m"),
-        "branch_probability": column("branch_probability"),
-        "sources": _texts(mine, "sources", rows) if "sources" in mine.columns else np.full(len(time), ""),
+        "along_sigma_m": own.floats("along_sigma_m"),
+        "branch_probability": own.floats("branch_probability"),
+        "sources": own.texts("sources") if "sources" in mine.columns else np.full(len(time), ""),
     }
-    for prefix, answered in (("", answers.chainage_m), ("conventional_", answers.conventional_chainage_m)):
-        # moved_m is interpolated by time over gaps of the reference, so that positions there count
-        columns[f"{prefix}interval_m"] = since_last(moved, np.isfinite(answered))
-        columns[f"{prefix}gap_s"] = since_last(np.where(np.isfinite(moved), clock, np.nan), np.isfinite(answered))
-    first = run.positions["time_gpst"].to_numpy().min()
-    columns["block"] = (seconds(time - first) // options.block_s).astype(np.int64)
-    columns |= {run.prefix_column(name): column(name) for name in level_columns(mine)}
-    for name in (f"protection_{name}" for name in (*PARTS, *STATED)):
-        if name in mine.columns and run.level_kind is not None:
-            columns[run.prefix_column(name)] = column(name) if name.endswith("_m") else _texts(mine, name, rows)
+    columns |= _since_last_position(time, moved, answers)
+    since_begin = seconds(time - run.positions["time_gpst"].to_numpy().min())
+    columns["block"] = (since_begin // options.block_s).astype(np.int64)
+    columns |= _levels(run, own)
     table = pl.DataFrame(columns, nan_to_null=True).with_columns(pl.col("n_used").cast(pl.Int64))
     return AntennaEpochs(
         table=table,
@@ -222,14 +204,55 @@ def antenna_epochs(
         speed_from="reference" if np.isfinite(stated_speed[known]).all() else "places",
         outside=int((logged & ~known).sum()),
         step_s=step_s,
-        from_sections=int((known & (stated_environment == "") & (environment != UNKNOWN)).sum()),
+        from_sections=int((known & (stated == "") & (environment != UNKNOWN)).sum()),
     )
 
 
-def _texts(table: pl.DataFrame, name: str, rows: Indices) -> pl.Series:
-    """Return a text column, null where the log has no epoch."""
-    texts = table[name].cast(pl.String)
-    return pl.concat([texts, pl.Series([None], dtype=pl.String)])[rows]
+class _OwnColumns(NamedTuple):
+    """Columns of the positions of one antenna, on the epochs of its log and the missing ones between them."""
+
+    table: pl.DataFrame
+    rows: Indices  #: Row of the table for each epoch; its length for a missing one.
+
+    def floats(self, name: str) -> Floats:
+        """Return a column of numbers, NaN for missing epochs."""
+        return np.append(floats(self.table, name), np.nan)[self.rows]
+
+    def texts(self, name: str) -> pl.Series:
+        """Return a column of texts, null for missing epochs."""
+        texts = self.table[name].cast(pl.String)
+        return pl.concat([texts, pl.Series([None], dtype=pl.String)])[self.rows]
+
+    def answers(self, reference_chainage_m: Floats, reference_ecef_m: Floats) -> Answers:
+        """Return the positions of the run with those of a reference, NaN for missing epochs."""
+        return Answers(
+            chainage_m=self.floats("chainage_m"),
+            conventional_chainage_m=self.floats("conventional_chainage_m"),
+            ecef_m=np.stack([self.floats(name) for name in ("x_m", "y_m", "z_m")], axis=1),
+            reference_chainage_m=reference_chainage_m,
+            reference_ecef_m=reference_ecef_m,
+        )
+
+
+def _since_last_position(time: Datetimes, moved_m: Floats, answers: Answers) -> dict[str, Floats]:
+    """Return distance and time since the last position, on the map and conventional.
+
+    The distance travelled is interpolated by time over gaps of the reference, so that positions there count.
+    """
+    columns, clock = {}, np.where(np.isfinite(moved_m), seconds(time - time[0]), np.nan)
+    for prefix, answered in (("", answers.chainage_m), ("conventional_", answers.conventional_chainage_m)):
+        columns[f"{prefix}interval_m"] = since_last(moved_m, np.isfinite(answered))
+        columns[f"{prefix}gap_s"] = since_last(clock, np.isfinite(answered))
+    return columns
+
+
+def _levels(run: RunFolder, own: _OwnColumns) -> dict[str, Any]:
+    """Return the protection levels of a run, their parts, causes and statuses."""
+    columns: dict[str, Any] = {run.prefix_column(name): own.floats(name) for name in level_columns(own.table)}
+    for name in (f"protection_{name}" for name in (*PARTS, *STATED)):
+        if name in own.table.columns and run.level_kind is not None:
+            columns[run.prefix_column(name)] = own.floats(name) if name.endswith("_m") else own.texts(name)
+    return columns
 
 
 def _steps(values: Floats, known: Masks) -> Floats:

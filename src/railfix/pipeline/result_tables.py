@@ -35,7 +35,7 @@ from railfix.pipeline.result_columns import (
 )
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
-from railfix.pipeline.smoothing import SmoothedTrack
+from railfix.pipeline.smoothed_track import SmoothedTrack
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind, TrackStatus
 
@@ -128,7 +128,7 @@ def to_xarray(
         data |= {f"filter_{name}": values for name, values in variables(TRAIN_COLUMNS, tracked, ("time",)).items()}
     data |= variables(CHANNEL_COLUMNS, Observed(result, tracked), ("time", "channel"))
     data["arc_m"] = (("time",), result.arc_m, {"units": "m", "long_name": "distance along the antenna's trajectory"})
-    for name, values in (("ecef_m", result.ecef_m), ("conventional_ecef_m", result.conventional_ecef_m)):
+    for name, values in (("ecef_m", result.ecef_m), ("conventional_ecef_m", result.point.ecef_m)):
         data[name] = (("time", "xyz"), values, {"units": "m"})
     coordinates = {
         "time": result.time,

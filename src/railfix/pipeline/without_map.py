@@ -12,21 +12,19 @@ import numpy as np
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
-from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
-from railfix.pipeline.received import Received
-from railfix.positioning.approximate import ANCHOR_SIGMA_M
+from railfix.pipeline.range_stage import raw_ranges
+from railfix.pipeline.received import Received, broadcast_source
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
 from railfix.positioning.normal_equations import SinglePoint, point_position
-from railfix.positioning.range_arrays import Ranges, usable_ranges, without
+from railfix.positioning.range_arrays import Ranges, weighted_ranges, without
 from railfix.positioning.receiver_noise import robust_fit
-from railfix.ranges.atmosphere import SeenFrom, model_delays
-from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
-from railfix.ranges.range_sigma import code_sigma_m
+from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_satellites
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
@@ -91,14 +89,14 @@ class Located:
 class RangesWithoutMap:
     """Corrected ranges of one antenna at an approximate position, T epochs by K channels."""
 
-    channels: Channels
-    ranges: Ranges  #: Weight 0 where a range cannot be used.
-    states: SatelliteStates
-    #: Shape (T, K).
-    elevation_deg: Floats
-    azimuth_deg: Floats
-    place_ecef_m: Floats  #: The approximate place; NaN where the codes give none; shape (T, 3).
+    corrected: CorrectedRanges
+    ranges: Ranges  #: Those to be fitted, with the sigmas of satellites and atmosphere; weight 0 for the others.
+    near_ecef_m: Floats  #: The approximate position; NaN where the codes give none; shape (T, 3).
     no_position: Codes  #: `NoPosition` by the number of codes, records and satellites; shape (T,).
+
+
+#: Reasons by which a code is none of a satellite's that is used.
+_OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OTHER_SIGNAL_TAKEN)
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
@@ -106,57 +104,30 @@ def ranges_without_map(obs: Observations, received: Received, config: Config, bo
     alone.
     """
     channels = book.of(obs, received.navigation)
-    satellite, columns = channels.satellite, channels.columns
-    code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
-    plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
-    observed = plausible & first_available(satellite, plausible)
-    states = satellite_states(
-        obs.time, satellite, channels.signal, code, received.navigation, max_age_s=config.max_ephemeris_age_s
-    )
-    usable = observed & ~(states.no_record | states.too_old | states.unhealthy)
-    clean = code + states.clock_m - states.group_delay_m
-    raw = usable_ranges(states, clean, np.array(1.0 / ANCHOR_SIGMA_M**2), np.where(usable, 0, 1), channels.groups)
-    lacking = np.where(_solvable(raw), int(NoPosition.NONE), int(NoPosition.NO_RECORD))
-    enough = _solvable(replace(raw, weight=observed.astype(np.float64)))
-    lacking = np.where(enough, lacking, int(NoPosition.TOO_FEW_SATELLITES))
-    lacking = np.where(plausible.any(axis=1), lacking, int(NoPosition.NO_CODE))
-    place, gross, apart = _approximate_place(raw, config)
-    usable &= ~gross
-    near = _at_surface(np.where(np.isnan(place), _below(raw), place))
-    seen = SeenFrom.of(near, states.position_ecef_m)
-    delays = model_delays(
-        obs.time,
-        seen,
-        channels.frequency_hz,
-        klobuchar=received.klobuchar,
-        ionosphere_sigma_m=received.ionosphere_sigma_m,
-        troposphere=config.troposphere,
-    )
-    clean = clean - delays.ionosphere_m - delays.troposphere_m
-    sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)
-    sigma = np.hypot(sigma, config.nominal.sigma_m(seen.elevation_deg))
-    sigma = np.hypot(sigma, config.nominal.unusual_sigma_m(states.accuracy_m))
-    weight = 1.0 / sigma**2
+    source = replace(broadcast_source(received, config), second="none")
+    satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)
+    raw = raw_ranges(obs, channels, satellites)
+    observed, implausible = (satellites.reason & _OF_CODES) == 0, int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE)
+    near, gross, apart = _approximate_position(raw, config)
+    seen_from = _at_surface(np.where(np.isnan(near), _below(raw), near))
+    corrected = corrected_ranges(obs, channels, satellites, seen_from, source, gross=gross, noise=config.noise)
+    sigma = np.hypot(corrected.sigma_m, corrected.nominal_elevation_sigma_m)
+    position, code = corrected.satellites.position_ecef_m, corrected.used_code_m
     # those below the mask help to find which ones are wrong
-    usable &= ~disagreeing(usable_ranges(states, clean, weight, np.where(usable, 0, 1), channels.groups), near)
-    usable &= seen.elevation_deg >= config.elevation.mask_deg
-    ranges = usable_ranges(states, clean, weight, np.where(usable, 0, 1), channels.groups)
-    elsewhere = np.isfinite(place[:, 0]) & ~_plausible_height(place)
+    wrong = disagreeing(weighted_ranges(position, code, sigma, channels.clock), seen_from)
+    code = np.where(wrong | ~(corrected.elevation_deg >= config.elevation.mask_deg), np.nan, code)
+    ranges = weighted_ranges(position, code, sigma, channels.clock)
+    no_position = np.zeros(len(obs), dtype=np.int8)
     for failed, cause in (
+        (((satellites.reason & implausible) != 0).all(axis=1), NoPosition.NO_CODE),
+        (~_solvable(replace(raw, weight=observed.astype(np.float64))), NoPosition.TOO_FEW_SATELLITES),
+        (~_solvable(raw), NoPosition.NO_RECORD),
         (apart, NoPosition.INCONSISTENT),
-        (elsewhere, NoPosition.IMPLAUSIBLE_HEIGHT),
+        (np.isfinite(near[:, 0]) & ~_plausible_height(near), NoPosition.IMPLAUSIBLE_HEIGHT),
         (~_solvable(ranges), NoPosition.TOO_FEW_SATELLITES),
     ):
-        lacking = np.where(failed & (lacking == int(NoPosition.NONE)), int(cause), lacking)
-    return RangesWithoutMap(
-        channels=channels,
-        ranges=ranges,
-        states=states,
-        elevation_deg=seen.elevation_deg,
-        azimuth_deg=seen.azimuth_deg,
-        place_ecef_m=place,
-        no_position=lacking.astype(np.int8),
-    )
+        no_position = np.where(failed & (no_position == 0), np.int8(cause), no_position)
+    return RangesWithoutMap(corrected=corrected, ranges=ranges, near_ecef_m=near, no_position=no_position)
 
 
 def _solvable(ranges: Ranges) -> Masks:
@@ -164,7 +135,7 @@ def _solvable(ranges: Ranges) -> Masks:
     return np.asarray(ranges.n_used - ranges.n_clocks >= 3)
 
 
-def _approximate_place(raw: Ranges, config: Config) -> tuple[Floats, Masks, Masks]:
+def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, Masks]:
     """Return positions from raw ranges, NaN without, shape (T, 3); grossly wrong ranges, (T, M); epochs whose other
     ranges contradict each other, (T,).
     """
@@ -208,7 +179,7 @@ def locate(obs: Observations, received: Received, config: Config, book: ChannelB
 def locate_ranges(time: Datetimes, seen: RangesWithoutMap, config: Config) -> Located:
     """Compute the conventional position of every epoch from corrected ranges; see `locate`."""
     ranges = seen.ranges
-    start = np.where(np.isnan(seen.place_ecef_m), _below(ranges), seen.place_ecef_m)
+    start = np.where(np.isnan(seen.near_ecef_m), _below(ranges), seen.near_ecef_m)
     fit = robust_fit(ranges, start, limits=config.robust_fit)
     rest = without(ranges, (ranges.weight > 0) & ~fit.kept)
     checked = rest.n_used - rest.n_clocks > 3  # one range too many at least, or nothing shows which ones are wrong
@@ -283,18 +254,18 @@ def _survey_part(
     otherwise the mean of the Dopplers at both ends.
     """
     seen = ranges_without_map(obs, received, config, book)
-    located = locate_ranges(obs.time, seen, config)
-    slips, after = find_slips(obs, slip_state, frequency_hz=seen.channels.every_frequency_hz, limits=config.slips)
-    columns = seen.channels.columns
+    located, channels = locate_ranges(obs.time, seen, config), seen.corrected.channels
+    slips, after = find_slips(obs, slip_state, frequency_hz=channels.every_frequency_hz, limits=config.slips)
+    columns = channels.columns
     usable = seen.ranges.weight > 0
     nothing = np.zeros(usable.shape)
-    phase = corrected_phase_m(slips.phase_m[:, columns], seen.states.clock_m, nothing, nothing)
-    rate = -SPEED_OF_LIGHT / seen.channels.frequency_hz * obs.doppler_hz[:, columns]
+    phase = corrected_phase_m(slips.phase_m[:, columns], seen.corrected.satellites.clock_m, nothing, nothing)
+    rate = -SPEED_OF_LIGHT / channels.frequency_hz * obs.doppler_hz[:, columns]
     broken = np.cumsum(slips.slip[:, columns] | obs.break_before[:, None], axis=0, dtype=np.intp)
     rows = rows_apart(obs.time, limits.interval_s)
     time, cn0_dbhz = obs.time[rows], obs.cn0_dbhz[:, columns]
     weak = 10.0 ** ((45.0 - np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))) / 10.0)
-    used, position, weak = usable[rows], seen.states.position_ecef_m[rows], weak[rows]
+    used, position, weak = usable[rows], seen.corrected.satellites.position_ecef_m[rows], weak[rows]
     step_s = seconds(np.diff(time))[:, None]
     both = used[1:] & used[:-1] & (step_s <= _LONGEST_STEP * limits.interval_s)
     phase, rate, broken = phase[rows], rate[rows], broken[rows]
@@ -309,7 +280,7 @@ def _survey_part(
         np.sqrt(noise.doppler_floor_mps**2 + noise.doppler_zenith_mps**2 * weak) * step_s, _CURVED_MPS2 * step_s**2
     )
     clock = np.zeros(used.shape[1], dtype=np.intp)
-    for number, group in enumerate(seen.channels.groups):
+    for number, group in enumerate(channels.groups):
         clock[group] = number
     row, channel = np.nonzero(used)
     step, of_step = np.nonzero(joined | doppler)

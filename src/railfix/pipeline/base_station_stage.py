@@ -14,7 +14,7 @@ from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises
 from railfix.pipeline.carrier_stage import CarrierState, find_antenna_slips, smooth_ranges
-from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.range_stage import correct_ranges
 from railfix.pipeline.received import Received, correction_source

@@ -17,7 +17,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.reasons import Status
-from railfix.evaluate.inputs import EvaluationOptions, floats
+from railfix.evaluate.evaluation_inputs import EvaluationOptions, floats
 
 #: Distance on the map from which on a position counts as wrong [m].
 WRONG_PLACE_M = 50.0

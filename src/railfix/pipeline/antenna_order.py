@@ -1,0 +1,103 @@
+"""Order of two antennas of one vehicle by their positions.
+
+Each antenna is positioned on its own trajectory, with its own offset from the vehicle. With the logs exchanged, or the
+vehicle turned round, both positions fit their ranges, but the front antenna comes out as far behind the rear one as
+it should be ahead.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Datetimes
+from railfix.screens.base import pair_epochs
+from railfix.track.trajectory import Trajectory
+
+#: Pairs of positions within so much of the line share their reflections, and count as one sample [m].
+_STRETCH_M: Final = 50.0
+#: Stretches before there is a verdict: a train at rest has too few.
+_LEAST_STRETCHES: Final = 4
+#: Sigmas by which the distance must be below zero.
+_CERTAIN: Final = 5.0
+#: Antennas nearer to each other than this have no order [m].
+_LEAST_DISTANCE_M: Final = 0.5
+
+
+class AntennaOrder:
+    """Mean distance of the front antenna ahead of the rear one of a vehicle on one track, as the positions have it.
+
+    `distance_m` is that by the vehicle file [m], in the direction that the vehicle faces; tags of a pair of epochs
+    differ by `tolerance_s` at most.
+    """
+
+    def __init__(self, front: Trajectory, rear: Trajectory, *, tolerance_s: float) -> None:
+        paths = front, rear
+        begin, end = (float(of([float(t.body_at(t.arc_m[k])) for t in paths])) for of, k in ((max, 0), (min, -1)))
+        arcs = [t.arc_of_body(np.linspace(begin, end, 21)[1:-1]) for t in paths]
+        along = front.at_arc(arcs[0]) - rear.at_arc(arcs[1])
+        ahead = front.at_arc(arcs[0] + 1.0) - front.at_arc(arcs[0])
+        rising = float(np.median(np.einsum("ni,ni->n", along, ahead)))
+        apart = float(np.median(front.chainage_at(arcs[0]) - rear.chainage_at(arcs[1])))
+        self._facing = front.front_sign
+        self.distance_m = self._facing * rising
+        self._reference_m = apart - rising  # chainages may be those of a point of the vehicle
+        self._tolerance_s = tolerance_s
+        #: By stretch of line: pairs, sum of their distances [m], sum of their variances [m^2].
+        self._stretches: dict[int, tuple[float, float, float]] = {}
+
+    def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
+        """Add the positions of more epochs; whether the train is on a stretch not seen before.
+
+        Of each antenna time tags, chainage [m] and its sigma [m], shape (F,) and (R,); NaN where there is no position.
+        """
+        at_front, at_rear = pair_epochs(front[0], rear[0], tolerance_s=self._tolerance_s)
+        (place, other), (sigma, other_sigma) = (
+            (np.asarray(front[k], dtype=np.float64)[at_front], np.asarray(rear[k], dtype=np.float64)[at_rear])
+            for k in (1, 2)
+        )
+        measured = self._facing * (place - other - self._reference_m)
+        variance = sigma**2 + other_sigma**2
+        known = np.isfinite(measured) & np.isfinite(variance)
+        # a gross error counts as no more than the distance of logs that are neither right nor exchanged
+        bound = 3.0 * abs(self.distance_m)
+        measured, variance = np.clip(measured[known], -bound, bound), variance[known]
+        stretch, which = np.unique(np.floor(place[known] / _STRETCH_M).astype(np.int64), return_inverse=True)
+        seen = len(self._stretches)
+        sums = (np.bincount(which, weights=part) for part in (np.ones(len(which)), measured, variance))
+        for key, *more in zip(stretch.tolist(), *(part.tolist() for part in sums), strict=True):
+            before = self._stretches.get(key, (0.0, 0.0, 0.0))
+            self._stretches[key] = (before[0] + more[0], before[1] + more[1], before[2] + more[2])
+        return len(self._stretches) > seen
+
+    def measure(self) -> tuple[float, float]:
+        """Return the mean distance of the front antenna ahead of the rear one, and its sigma [m]; NaN before a verdict.
+
+        A stretch has the mean of its distances with the variance of a single pair, as what disturbs the positions there
+        does not average out; where the stretches scatter more than that, the sigma grows.
+        """
+        if len(self._stretches) < _LEAST_STRETCHES:
+            return float("nan"), float("nan")
+        count, distance, variance = np.array(list(self._stretches.values())).T
+        mean, weight = distance / count, count / variance
+        overall = float(np.average(mean, weights=weight))
+        scatter = float(np.sum(weight * (mean - overall) ** 2)) / (len(mean) - 1)
+        return overall, float(np.sqrt(max(1.0, scatter) / weight.sum()))
+
+    @property
+    def note(self) -> str | None:
+        """Sentence on antennas in the wrong order; None where their order is right, or not certain."""
+        mean, sigma = self.measure()
+        right = abs(self.distance_m)
+        ahead = float(np.sign(self.distance_m)) * mean
+        exchanged = right >= _LEAST_DISTANCE_M and -2.0 * right < ahead < -_CERTAIN * sigma
+        if not exchanged:
+            return None
+        first, second = ("front", "rear") if self.distance_m > 0.0 else ("rear", "front")
+        return (
+            f"the positions of the {first} log are {-ahead:.1f} m (sigma {sigma:.1f} m) behind those of the {second} "
+            f"log, and the vehicle file has them {right:.1f} m ahead: the logs are exchanged (--front, --rear), or the "
+            "vehicle faces the other way (facing)"
+        )
