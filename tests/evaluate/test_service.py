@@ -11,7 +11,7 @@ import pytest
 from railfix.core.errors import MismatchError
 from railfix.evaluate import intervals
 from railfix.evaluate.evaluation_inputs import RunFolder
-from railfix.report.plots.campaign import plot_service
+from railfix.report.plots.campaign import plot_service, service_charts
 
 pytestmark = pytest.mark.requirement("G4")
 
@@ -77,6 +77,10 @@ def test_epochs_are_counted_by_stretch(runs: dict[str, RunFolder], tmp_path: Pat
     assert found["tracking_share"].to_list() == pytest.approx([1.0, 1.0, 0.51, 1.0])
     assert found["level_p95_m"].to_list() == [15.0, 15.0, np.inf, 50.0]
     assert found["within_limit_share"].to_list() == [1.0, 1.0, 0.0, 0.0]
+    charts = service_charts(found, 20.0)
+    assert [len(chart.layers) for chart in charts] == [2, 1, 3, 3]
+    assert not any(chart.empty for chart in charts)
+    assert {chart.common_axis for chart in charts} == {"chainage"}
     plot_service(found, tmp_path / "service.png", title="a", limit_m=20.0)
     assert (tmp_path / "service.png").read_bytes().startswith(b"\x89PNG")
 

@@ -103,7 +103,8 @@ def test_the_command_prints_and_writes_the_epoch(results: Path, tmp_path: Path) 
     ):
         assert words in done.output
     text = page.read_text()
-    assert text.count("<circle class=") - 3 == text.count('<tr><td class="text">') > 8
+    assert text.count("<circle class=") - 3 == text.count('<tr><th scope="row">') - 5 > 8  # last epoch: five before it
+    assert text.count('class="asked" aria-current="true"') == 1
     assert RUNNER.invoke(app, arguments).exit_code == 8, "the page was there already"
     (results / "observations.parquet").rename(tmp_path / "observations.parquet")
     done = RUNNER.invoke(app, arguments[:4])

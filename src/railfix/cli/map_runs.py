@@ -40,6 +40,9 @@ def service(
     *,
     out: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Table to write, a row by stretch.")] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
+    page: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Page to write, with charts that zoom.")
+    ] = None,
     stretch: Annotated[float, typer.Option(metavar="M", help="Length of a stretch.")] = 100.0,
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit of the level.")] = 20.0,
     overwrite: OverwriteOption = False,
@@ -50,7 +53,7 @@ def service(
     Reflections show in the distance of the 3-D position, which does not use the map, from the line. Several runs at
     different times of the day are more representative than one.
 
-    Example: `railfix map service monday-results tuesday-results --out service.csv --picture service.png`
+    Example: `railfix map service monday-results tuesday-results --out service.csv --page service.html`
 
     Exit codes are those of `railfix --help`; 5 where the runs are on different maps.
     """
@@ -59,7 +62,7 @@ def service(
 
     if not stretch > 0.0 or not limit > 0.0:
         raise SettingsError("--stretch and --limit must be positive")
-    check_outputs((out, "csv"), (picture, "picture"), overwrite=overwrite, inputs=[])
+    check_outputs((out, "csv"), (picture, "picture"), (page, "page"), overwrite=overwrite, inputs=[])
     found = compute_service(runs, stretch_m=stretch, limit_m=limit)
     if out is not None:
         write_whole(out, found.write_csv(float_precision=3))
@@ -80,11 +83,17 @@ def service(
     else:
         verdict.append("the runs have no filter and no levels; fractions are of single epochs")
     show_verdict(console, verdict)
-    show_table(
-        console,
-        listing("service", found, _COLUMNS, f"By stretch of {stretch:g} m; served: protection level within the limit"),
-    )
-    show_files(console, [path for path in (out, picture) if path is not None])
+    caption = f"By stretch of {stretch:g} m; served: protection level within the limit"
+    table = listing("service", found, _COLUMNS, caption)
+    show_table(console, table)
+    if page is not None:
+        from railfix.report.charts_page import Sentence, charts_page
+        from railfix.report.plots.campaign import service_charts
+
+        title = f"Satellite service: {', '.join(path.name for path in runs)}"
+        lead = [Sentence(f"{sentence}.") for sentence in verdict]
+        write_whole(page, charts_page(title, service_charts(found, limit), [table], lead=lead), what="page")
+    show_files(console, [path for path in (out, picture, page) if path is not None])
 
 
 class SurveyFiles(Settings):

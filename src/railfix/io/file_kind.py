@@ -108,7 +108,9 @@ def wrong_kind(path: FilePath, expected: str) -> InputFileError:
 
 
 def has_times(path: FilePath) -> bool:
-    """Return whether a table or GPX file has what a log of positions has and a track map has not: times, qualities."""
+    """Return whether a table or GPX file has properties of a log of positions that a track map lacks: times,
+    qualities.
+    """
     head = read_head(path)
     names = _header_line(head).lower()
     return b"time>" in head or any(word in names for word in _OF_POSITIONS)

@@ -33,6 +33,7 @@ from railfix.integrity.interference.motion_signs import MotionFit, fit_motion
 from railfix.integrity.interference.range_fits import MotionInputs
 from railfix.pipeline.solution import Solution
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Reasons that ranges get because they contradict others, as those of a spoofer do.
@@ -104,7 +105,8 @@ def _motion_inputs(
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
     near = np.where(np.isnan(consistent), single.point.ecef_m[rows], consistent)
-    first, lines = 0, []
+    first = 0
+    lines: list[SearchIndex] = []
     for index, own in antennas.split(rows):
         part = slice(first, first := first + len(own))
         antenna[part] = len(lines)
@@ -136,7 +138,7 @@ def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
         named[:, group] |= gross[:, group] & (gross[:, group].sum(axis=1, keepdims=True) <= _MOST_GROSS)
-    return named
+    return np.asarray(named)
 
 
 def _find_interference(

@@ -256,7 +256,7 @@ def render(template: str, title: str, **content: Any) -> str:
         created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
         version=__version__,
         policy=_POLICY,
-        style=_resource("page.css"),
+        style=page_style(),
         scripts=(_resource("errors.js"), chart_library(), _resource("page.js")),
         **content,
     )
@@ -265,6 +265,11 @@ def render(template: str, title: str, **content: Any) -> str:
 def chart_library() -> Markup:
     """Return the script of plotly.js, which draws the charts."""
     return Markup(get_plotlyjs())
+
+
+def page_style() -> Markup:
+    """Return the style sheet of all pages."""
+    return _resource("page.css")
 
 
 def _resource(name: str) -> Markup:

@@ -24,7 +24,7 @@ from railfix.core.geodesy import enu_axes
 from railfix.core.tables import reading_table
 from railfix.core.timescale import gps_time
 from railfix.evaluate.evaluation_inputs import RunFolder, read_run
-from railfix.report.charts_page import read_template
+from railfix.report.charts_page import page_style, read_template
 from railfix.track import Trajectory, read_track
 
 #: Meanings of the statuses of a single epoch.
@@ -67,6 +67,11 @@ _COLUMNS: Final = (
 )  # fmt: skip
 
 
+#: Number of epochs shown before and after the explained one, and their columns in ``positions`` and ``train``.
+_AROUND: Final = 5
+_NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "status")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
     """One epoch of one antenna."""
@@ -83,6 +88,7 @@ class Explanation:
     #: standard deviation then [m]; null where it would have none.
     satellites: pl.DataFrame
     sentences: tuple[str, ...]  #: Lines on position, sigma, level and status.
+    neighbours: pl.DataFrame  #: Rows of ``positions`` and ``train`` of the epochs around it: `_NEIGHBOURS`.
 
 
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
@@ -102,8 +108,13 @@ def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanat
     track: Mapping[str, Any] = {}
     if (run / "train.parquet").is_file():
         with reading_table(run / "train.parquet"):
-            of_filter = pl.scan_parquet(run / "train.parquet").filter(here).collect()
-        track = of_filter.row(0, named=True) if len(of_filter) else {}
+            of_filter = pl.scan_parquet(run / "train.parquet").filter(antenna=antenna).collect()
+        mine = of_filter.filter(time_gpst=single["time_gpst"])
+        track = mine.row(0, named=True) if len(mine) else {}
+    around = rows[max(row - _AROUND, 0) : row + _AROUND + 1].select("time_gpst", *_NEIGHBOURS, "n_used")
+    if track:
+        filtered = of_filter.select("time_gpst", pl.col(_NEIGHBOURS).name.prefix("filter_"))
+        around = around.join(filtered, on="time_gpst", how="left")
     satellites = seen.select(name for name in _COLUMNS if name in seen.columns)
     shift, sigma = np.full((2, len(satellites)), np.nan)
     if single["x_m"] is not None and len(satellites):
@@ -114,6 +125,7 @@ def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanat
     return Explanation(
         run=run, antenna=antenna, time=rows["time_gpst"].to_numpy().astype("datetime64[ns]")[row], asked=at,
         single=single, track=track, satellites=satellites, sentences=tuple(_sentences(single, track, satellites)),
+        neighbours=around,
     )  # fmt: skip
 
 
@@ -263,7 +275,7 @@ def write_explanation(explanation: Explanation, path: Path) -> Path:
         sky.append({"x": radius * np.sin(azimuth), "y": -radius * np.cos(azimuth), **row})
     page = read_template("explain.html.j2").render(
         title=f"{explanation.antenna} antenna, {time_text(explanation.time)} GPS time",
-        explanation=explanation, sky=sky, rows=explanation.satellites.to_dicts(),
+        explanation=explanation, sky=sky, rows=explanation.satellites.to_dicts(), style=page_style(),
     )  # fmt: skip
     write_whole(path, page, what="page")
     return path

@@ -108,8 +108,8 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacin
     Parameters
     ----------
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
-        On their trajectories at the same instant. Both may be wrong along the track by as much as the
-        line stays straight: only their difference counts.
+        On their trajectories at the same instant. A common error along a straight line has no effect: only their
+        difference counts.
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)

@@ -234,7 +234,7 @@ def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
 
 
 def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
-    """Reject points outside the area of use of a CRS's frame, of which a projection may be used beyond its own."""
+    """Reject points outside the area of use of a CRS's frame; a projection may be used outside its own area."""
     south, north, west, east = _bounds(crs)
     of_latitude = south <= latitude_deg.min() and latitude_deg.max() <= north
     if of_latitude and west <= longitude_deg.min() and longitude_deg.max() <= east:

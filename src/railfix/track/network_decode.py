@@ -166,8 +166,8 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
     apart = np.abs(place[:, None] - SHIFTS_M)
     nearest = apart == apart.min(axis=1, keepdims=True)
     drifted = _DRIFTS * (apart <= apart.min(axis=1, keepdims=True) + _SHIFT_STEP_M)
-    inside = np.abs(place) <= SHIFTS_M[-1] + _SHIFT_STEP_M
-    return np.asarray(np.where(nearest, 1.0, drifted) * inside[:, None])
+    known = apart.min(axis=1, keepdims=True) <= _SHIFT_STEP_M  # else it is the track itself, or too far from it
+    return np.asarray(np.where(nearest, 1.0, drifted) * known)
 
 
 @lru_cache(maxsize=256)

@@ -286,8 +286,8 @@ def _features(
     kind = find_kind(path)
     if kind in ("kml", "gpx"):
         found = read_kml_lines(path) if kind == "kml" else read_gpx_lines(path)
-        points = [line.points if np.isfinite(line.points[:, 2]).any() else line.points[:, :2] for line in found]
-        yield "EPSG:4326", [line.fields for line in found], [[own] for own in points], [()] * len(points)
+        own = [[line.points if np.isfinite(line.points[:, 2]).any() else line.points[:, :2]] for line in found]
+        yield "EPSG:4326", [line.fields for line in found], own, [()] * len(own)
         return
     if kind == "osm":
         ways = read_osm_xml(path)
@@ -295,7 +295,7 @@ def _features(
         return
     for named, rows, shapes in read_layers(path, geometry="LineString"):
         lines = [s.geoms if s.geom_type.startswith("Multi") else [s] for s in shapes]
-        points = [[np.array(part.coords, dtype=np.float64) for part in own] for own in lines]
+        points = [[np.array(part.coords, dtype=np.float64) for part in parts] for parts in lines]
         yield named, rows, points, [()] * len(points)
 
 

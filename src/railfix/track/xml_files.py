@@ -100,12 +100,17 @@ def read_railml_relations(path: FilePath) -> list[Relation]:
         first, second = item.find("{*}elementA"), item.find("{*}elementB")
         if first is None or second is None:
             raise InputFileError(path, f"netRelation {item.get('id')} names no two elements")
+        try:
+            ends = [int(float(str(item.get(key)))) for key in ("positionOnA", "positionOnB")]
+        except ValueError:
+            what = f"netRelation {item.get('id')} has no positionOnA and positionOnB, of 0 or 1"
+            raise InputFileError(path, what) from None
         relations.append(
             Relation(
                 first=str(first.get("ref")),
                 second=str(second.get("ref")),
-                first_end=int(float(item.get("positionOnA"))),
-                second_end=int(float(item.get("positionOnB"))),
+                first_end=ends[0],
+                second_end=ends[1],
                 navigable=str(item.get("navigability") or "both").lower() != "none",
             )
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
@@ -15,7 +15,9 @@ from railfix.report.plots.chart import (
     BLUE,
     CONSTRAINED,
     FILTERED,
+    GREEN,
     GREY,
+    RED,
     Chart,
     Curve,
     Layer,
@@ -24,12 +26,11 @@ from railfix.report.plots.chart import (
     floats,
     points,
 )
-from railfix.report.plots.draw import save_figure
+from railfix.report.plots.draw import draw_chart, save_figure
 from railfix.report.plots.line import ECEF, ERROR_CLASSES, LEVEL_CLASSES, LocalFrame, size_classes
 
 if TYPE_CHECKING:
     import polars as pl
-    from matplotlib.axes import Axes
 
 #: Quantities by their column: text of the legend, limits of the classes [m], and the colour of bars.
 _QUANTITIES = {
@@ -98,44 +99,54 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
     )
 
 
-_BLUE: Final = "#1f4e79"
-_ORANGE: Final = "#e08e0b"
-_GREEN: Final = "#2e7d32"
+def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
+    """Return satellites, reflections, fractions of epochs and levels of `compute_service` by chainage."""
+    level = [("median", "level_median_m", BLUE), ("95 %", "level_p95_m", RED)]
+    ends = np.array([service["from_m"].min(), service["to_m"].max()], dtype=float)
+    limit = Curve(label="alarm limit", colour=GREEN, x=ends, y=np.full(2, limit_m), dash="dashed")
+    fractions = [
+        ("ok, single epochs", "ok_share", BLUE),
+        ("filter with a level", "tracking_share", RED),
+        (f"level within {limit_m:g} m", "within_limit_share", GREEN),
+    ]
+    satellites = [("median", "satellites_median", BLUE), ("5 %", "satellites_p5", RED)]
+    panels = (
+        ("Satellites used", "satellites", satellites, {"y_range": None}),
+        ("Distance of the 3-D position from the line", "m", [("95 %", "reflection_p95_m", RED)], {}),
+        ("Fraction of epochs", "fraction of epochs", fractions, {"y_range": (-0.03, 1.03)}),
+        ("Protection level", "m", level, {"y_scale": "log"}),
+    )
+    return tuple(
+        Chart(
+            name=f"service-{number}",
+            title=title,
+            caption="",
+            x_label="chainage [m]",
+            y_label=unit,
+            layers=(*(_steps(service, *column) for column in columns), *((limit,) if columns is level else ())),
+            **scales,  # type: ignore[arg-type]
+        )
+        for number, (title, unit, columns, scales) in enumerate(panels)
+    )
 
 
 def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str, limit_m: float) -> None:
-    """Draw satellites, reflections, fractions and levels of `compute_service` by chainage."""
+    """Draw the charts of `service_charts` into one picture."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 10), layout="constrained")
-    panels = figure.subplots(4, 1, sharex=True)
-    figure.suptitle(f"Where satellites can serve: {title}")
-    _steps(panels[0], service, {"satellites_median": ("median", _BLUE), "satellites_p5": ("5 %", _ORANGE)})
-    panels[0].set(ylabel="satellites used", ylim=(0.0, None))
-    _steps(panels[1], service, {"reflection_p95_m": ("95 %", _ORANGE)})
-    panels[1].set(ylabel="3-D position from the line [m]", ylim=(0.0, None))
-    shares = {
-        "ok_share": ("ok, single epochs", _BLUE),
-        "tracking_share": ("filter with a level", _ORANGE),
-        "within_limit_share": (f"level within {limit_m:g} m", _GREEN),
-    }
-    _steps(panels[2], service, shares)
-    panels[2].set(ylabel="share of epochs", ylim=(-0.03, 1.03))
-    _steps(panels[3], service, {"level_median_m": ("median", _BLUE), "level_p95_m": ("95 %", _ORANGE)})
-    panels[3].axhline(limit_m, color=_GREEN, linestyle="--", label="alarm limit")
-    panels[3].set(ylabel="level [m]", xlabel="chainage [m]", yscale="log")
-    for panel in panels:
-        panel.grid(alpha=0.3)
-        panel.legend(loc="best", fontsize="small")
+    figure.suptitle(f"Satellite service: {title}")
+    charts = service_charts(service, limit_m)
+    for chart, panel in zip(charts, figure.subplots(len(charts), 1, sharex=True), strict=True):
+        draw_chart(chart, panel)
     save_figure(figure, path)
 
 
-def _steps(axes: Axes, service: pl.DataFrame, columns: dict[str, tuple[str, str]]) -> None:
-    """Draw columns as constant by stretch, with gaps where values are missing."""
+def _steps(service: pl.DataFrame, label: str, column: str, colour: str) -> Curve:
+    """Return a column as constant by stretch, with gaps where values are missing."""
     begin, end = service["from_m"].to_numpy(), service["to_m"].to_numpy()
-    for name, (label, colour) in columns.items():
-        value = service[name].cast(float).fill_null(float("nan")).to_numpy()
-        value = np.where(np.isfinite(value), value, np.nan)
-        x = np.stack([begin, end, end], axis=1).ravel()
-        y = np.stack([value, value, np.full(len(value), np.nan)], axis=1).ravel()
-        axes.plot(x, y, color=colour, label=label, linewidth=2.0)
+    value = service[column].cast(float).fill_null(float("nan")).to_numpy()
+    value = np.where(np.isfinite(value), value, np.nan)
+    x = np.stack([begin, end, end], axis=1).ravel()
+    y = np.stack([value, value, np.full(len(value), np.nan)], axis=1).ravel()
+    return Curve(label=label, colour=colour, x=x, y=y, width=2.0)
