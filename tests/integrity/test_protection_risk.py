@@ -90,7 +90,7 @@ def test_priors_and_what_they_leave():
     ],
 )
 def test_budgets_that_are_refused(wrong):
-    with pytest.raises(SettingsError, match=rf"{next(iter(wrong))}|shares"):
+    with pytest.raises(SettingsError, match=rf"{next(iter(wrong))}|fractions"):
         RiskBudget(**wrong)
 
 

@@ -24,6 +24,9 @@ def exhaustive_search(ranges: Ranges, trajectory: Trajectory) -> tuple[NDArray[n
     vertex = np.full(len(ranges), -1)
     for t in range(len(ranges)):
         used = np.flatnonzero(ranges.weight[t] > 0)
+        if not len(used):
+            q[t] = 0.0
+            continue
         weight = ranges.weight[t, used]
         clock = np.array([next(g for g, s in enumerate(ranges.groups) if s.start <= c < s.stop) for c in used])
         distance = np.stack([range_on_turning_earth(sat, points)[0] for sat in ranges.sat_ecef_m[t, used]], axis=1)

@@ -160,7 +160,7 @@ def test_the_head_tells_what_was_run(document: str, folder: Path) -> None:
         assert entry["sha256"] in document
     assert record["versions"]["numpy"] in document
     assert '<th scope="row">raim.false_alarm</th><td>0.01</td><td>0.01</td>' in document
-    settings = document.split("<summary>Settings asked for and used")[1].split("</details>")[0]
+    settings = document.split("<summary>Settings given and used")[1].split("</details>")[0]
     assert settings.count("<tr class=asked>") == 3
     facts = record["antennas"]["front"]
     for reason, count in facts["observations_rejected_by_first_reason"].items():

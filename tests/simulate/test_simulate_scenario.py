@@ -416,7 +416,7 @@ def test_tables_of_settings_tell_what_is_known() -> None:
 
 def test_the_files_of_the_document_are_scenarios(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
-    one, many = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    one, many, *_ = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
     scenario = load_scenario(write_text(tmp_path, one))
     assert scenario.duration_s > 60.0
     assert Simulation(scenario).line.length_m == pytest.approx(1000.0)

@@ -358,7 +358,9 @@ def test_no_input_raises(garbage: str, level: str) -> None:
             "rate_mps",
         )
         values = {name: getattr(epochs, name)[:, none] for name in (*per_channel, "cn0_dbhz")}
-        epochs = replace(epochs, satellite=epochs.satellite[none], clock=epochs.clock[none], **values)
+        epochs = replace(
+            epochs, satellite=epochs.satellite[none], signal=epochs.signal[none], clock=epochs.clock[none], **values
+        )
     elif garbage == "nothing measured":
         epochs = without_epochs(epochs, np.ones(40, dtype=bool))
     elif garbage == "wild codes":

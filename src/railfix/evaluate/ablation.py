@@ -150,9 +150,7 @@ def ablate_files(
     given = OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths)
     with given as folder, ThreadPoolExecutor(max_workers=1) as pool:
         entries = inputs.entries(pool, out)
-        antennas, truth = tuple(inputs.logs), {}
-        if inputs.truth is not None:
-            truth = read_reference(inputs.truth, antennas, **(reading or ColumnNames()).arguments)
+        antennas, truth = tuple(inputs.logs), _read_truth(inputs, reading or ColumnNames())
         navigation, line, logs = open_inputs(inputs, options, config)
         screens, left_out = judging_screens(config, line.trajectories)
         settings = _settings_of_choices(inputs, config, screens)
@@ -204,6 +202,11 @@ def ablate_files(
         folder.write_json("ablation.json", record | {"choices": rows})
         files = folder.commit({})
     return Ablation(effects=effects, notes=notes, files=files, wall_s=wall)
+
+
+def _read_truth(inputs: RunInputs, reading: ColumnNames) -> Mapping[str, AntennaReference]:
+    """Return the reference positions by antenna; empty without any."""
+    return {} if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs), **reading.arguments)
 
 
 def _settings_of_choices(inputs: RunInputs, config: Config, screens: tuple[str, ...]) -> dict[str, Config]:

@@ -41,8 +41,7 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
 
 @inner
 def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, float]:
-    """Return the position at which a form is lowest, the diagonal of the cofactors of its matrix, 1 over the
-    determinant.
+    """Return where a form is lowest, the diagonal of the cofactors of its matrix, and 1 over the determinant.
 
     Forms are `constant`, `slope` (3), and the matrix by its elements xx, xy, xz, yy, yz, zz. The last number is 0 where
     the matrix is singular.

@@ -47,7 +47,7 @@ class TachometerLimits(Settings):
 class PulseSpeeds:
     """Speeds at N requested instants."""
 
-    #: Instant at which each speed is valid, earlier than requested; naT where missing; shape (N,).
+    #: Instant at which each speed is valid, earlier than requested; NaT where there is none; shape (N,).
     time: Datetimes
     speed_mps: Floats  #: Signed by the direction; NaN where the pulses give no speed; shape (N,).
     sigma_mps: Floats  #: Standard deviation by jitter and clock; the wheel's scale error is separate; shape (N,).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from railfix.core.arrays import Floats
 from railfix.core.geodesy import geodetic_from_ecef
@@ -13,8 +14,15 @@ from railfix.track.trajectory import Trajectory
 class LineCoordinates:
     """Base of dataclasses with arc lengths of T epochs on a trajectory: `arc_m`, NaN where there is no position."""
 
-    trajectory: Trajectory
-    arc_m: Floats
+    if TYPE_CHECKING:  # fields of the dataclass
+
+        @property
+        def trajectory(self) -> Trajectory:
+            """Trajectory of the antenna."""
+
+        @property
+        def arc_m(self) -> Floats:
+            """Arc lengths of the positions, shape (T,) [m]."""
 
     @cached_property
     def chainage_m(self) -> Floats:

@@ -150,8 +150,8 @@ def _consistent(
 
 def _contradict(point: SinglePoint, ranges: Ranges, scale: Floats) -> Masks:
     """Return the epochs whose ranges contradict each other in space, shape (T,)."""
-    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
-    return np.asarray(point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2)
+    freedom = ranges.n_used - ranges.n_clocks - 3
+    return np.asarray((freedom >= 1) & (point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2))
 
 
 class PublishedPositions(NamedTuple):

@@ -329,7 +329,8 @@ class EpochProcessor:
         state : State
             Of it only what the filter left after the previous chunk is used, and replaced.
         """
-        fusion, replays, filter_states, sensors = {}, {}, dict(state.fusion), chunk.sensors
+        fusion, filter_states, sensors = {}, dict(state.fusion), chunk.sensors
+        replays: dict[str, tuple[Replay, ...]] = {}
         if sensors:
             for name, own in state.fusion.items():
                 if name not in chunk.names:
@@ -339,7 +340,8 @@ class EpochProcessor:
             motions = {name: tracked.motion for name, (tracked, _, _) in found.items()}
             spacing = screen_filtered(self._of_positions, chunk.pair, motions)
             held_s, limits = self.config.antenna_spacing.filter_held_s, self.config.sensors.balise
-            for name, (tracked, replays[name], own) in found.items():
+            for name, (tracked, given, own) in found.items():
+                replays[name] = given
                 tracked, own = apply_spacing_verdict(tracked, spacing.get(name), own, held_s)
                 path = self.trajectories[name]
                 fusion[name], filter_states[name] = with_passings(tracked, own, self.balises, path, sensors, limits)

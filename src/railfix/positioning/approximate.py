@@ -69,10 +69,10 @@ def approximate_position(
         near[rest] = np.where((best >= 0)[:, None], index.trajectory.ecef_m[best], middle[rest])
     for index, off in antennas.split(np.isnan(arc).nonzero()[0]):
         arc[off], _ = index.trajectory.nearest(near[off])
-    unsure = np.isfinite(wrong.unsure_arc_m)
-    arc = np.where(unsure, wrong.unsure_arc_m, arc)
-    near = np.where(unsure[:, None], antennas.at_arc(arc), near)
-    return ApproximatePosition(near, arc, wrong.gross, unsure)
+    of_line = np.isfinite(wrong.unsure_arc_m)
+    arc = np.where(of_line, wrong.unsure_arc_m, arc)
+    near = np.where(of_line[:, None], antennas.at_arc(arc), near)
+    return ApproximatePosition(near, arc, wrong.gross, wrong.unsure)
 
 
 @lru_cache

@@ -242,8 +242,9 @@ class GrossErrors(NamedTuple):
     """Gross errors of raw ranges, T epochs by M channels."""
 
     gross: Masks  #: Ranges that are grossly wrong, shape (T, M).
-    #: Arc of the best point of the line where the grossly wrong range cannot be identified; NaN elsewhere; shape (T,).
+    #: Arc of the best point of the line where the ranges do not tell a position or a grossly wrong one; else NaN; (T,).
     unsure_arc_m: Floats
+    unsure: Masks  #: Epochs with a grossly wrong range that cannot be identified, shape (T,).
 
 
 #: Ellipsoidal heights of trains with a margin [m]: a position outside is not used.
@@ -261,7 +262,8 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     agree on, where redundant ranges do and no other accusation costs about as little; where the ranges agree with no
     point of the line, in space.
     """
-    gross, unsure = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
+    gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
+    unsure = np.zeros(len(ranges), dtype=np.bool_)
     located = np.isfinite(point.ecef_m[:, 0])
     residual = np.where(ranges.weight > 0, point.residual_m, 0.0)
     suspect = ~located | ~(np.sqrt((residual**2).sum(axis=1)) < _QUIET_M)
@@ -279,13 +281,15 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
         sure = scan.agreed & scan.clear
         gross[rows[sure]] = scan.gross[sure]
         open_arc = ~sure & (scan.agreed | nowhere[rows])
-        unsure[rows[open_arc]] = scan.arc_m[open_arc]
+        arc[rows[open_arc]] = scan.arc_m[open_arc]
+        # where the ranges fit a point of the line, none of them is accused
+        unsure[rows[open_arc]] = scan.gross[open_arc].any(axis=1)
         left = np.flatnonzero(~scan.agreed)
         if len(left):
             found = gross_in_space(part.take(left), np.repeat(index.middle_ecef_m[None], len(left), axis=0))
             gross[rows[left]] = found
-            unsure[rows[left[found.any(axis=1)]]] = np.nan
-    return GrossErrors(gross, unsure)
+            arc[rows[left[found.any(axis=1)]]] = np.nan
+    return GrossErrors(gross, arc, unsure & np.isfinite(arc))
 
 
 def gross_alone(ranges: Ranges, clock_m: Floats, ties: InterSystemBiases) -> Masks:

@@ -174,19 +174,11 @@ GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b1
 #: QZSS: bits of the health word that concern a signal (IS-QZSS-PNT-006, 4.1.2.3(4)): L1, L1C/A, L2C, L5, L1C, L1C/B
 #: from the most significant one. 1 (no L1C/B) is broadcast by satellites with L1C/A since 2022.
 QZSS_HEALTH: Final[Mapping[str, int]] = {
-    "1C": 0b110_000,
-    "1E": 0b100_001,
-    "1S": 0b10,
-    "1L": 0b10,
-    "1X": 0b10,
-    "2S": 0b1000,
-    "2L": 0b1000,
-    "2X": 0b1000,
-    "5I": 0b100,
-    "5Q": 0b100,
-    "5X": 0b100,
-}  # A record that states a larger accuracy is rejected (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
-#: IS-GPS-200, 20.3.3.3.1.3) is of no use [m]; the performance standard of GPS calls such a signal marginal.
+    "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
+    "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
+}  # fmt: skip
+#: A record that states a larger accuracy is rejected (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
+#: IS-GPS-200, 20.3.3.3.1.3) [m]; the performance standard of GPS calls such a signal marginal.
 LARGEST_ACCURACY_M: Final = 48.0
 #: Columns of `KeplerRecords.inter_signal_s` by signal of GPS and QZSS; their mean where data and pilot are one code.
 _ISC: Final[Mapping[str, list[int]]] = {

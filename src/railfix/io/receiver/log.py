@@ -210,9 +210,7 @@ class LogPiece:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamState:
-    """State after the bytes so far; `kind` is the kind of message used for observations, `observed` whether one was
-    received, `clock` the last time of any message, `station` that of RTCM 1005 and 1006.
-    """
+    """State after the bytes so far: kind of observations used, last time of any message, station of RTCM."""
 
     rest: bytes = b""
     subframes: Unfinished = field(default_factory=Unfinished)
@@ -325,7 +323,7 @@ class _Dated(NamedTuple):
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
     def first_after(self, places: Integers) -> Datetimes:
-        """Return the time of the first one after each offset of the stream; naT where missing."""
+        """Return the time of the first one after each offset of the stream; NaT where there is none."""
         times = np.append(self.times, np.datetime64("NaT", "ns"))
         return np.asarray(times[np.searchsorted(self.places, places)])
 

@@ -181,49 +181,14 @@ BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin
 #: Bits of subframes 2 and 3 of B-CNAV1 in each of the pages that a frame is passed on as, after PRN, number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
-BCNAV1: Final = _with_head(
-    BCNAV1_HEAD,
-    {
-        0: layout(
-            _BCNAV1_CODINGS,
-            week=24,
-            iodc=45,
-            iode=55,
-            toe_sow_s=63,
-            kind=74,
-            delta_a=76,
-            a_dot=102,
-            delta_n=127,
-            delta_n_dot=144,
-            m0=167,
-            eccentricity=200,
-            omega=233,
-            omega0=266,
-        ),
-        1: layout(
-            _BCNAV1_CODINGS,
-            i0=24,
-            omega_dot=57,
-            i_dot=76,
-            cis=91,
-            cic=107,
-            crs=123,
-            crc=147,
-            cus=171,
-            cuc=192,
-            toc_s=213,
-            af0_s=224,
-            af1=249,
-            af2=271,
-            group_delay_2_s=282,
-            inter_signal_0=294,
-            group_delay_1_s=306,
-        ),
-        2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
-        # Reference semi-major axes of B-CNAV1 and B-CNAV2 [m]: medium orbits (kind 3), and orbits with the Earth's
-        # period of rotation.
-    },
-)
+BCNAV1: Final = _with_head(BCNAV1_HEAD, {
+    0: layout(_BCNAV1_CODINGS, week=24, iodc=45, iode=55, toe_sow_s=63, kind=74, delta_a=76, a_dot=102, delta_n=127,
+              delta_n_dot=144, m0=167, eccentricity=200, omega=233, omega0=266),
+    1: layout(_BCNAV1_CODINGS, i0=24, omega_dot=57, i_dot=76, cis=91, cic=107, crs=123, crc=147, cus=171, cuc=192,
+              toc_s=213, af0_s=224, af1=249, af2=271, group_delay_2_s=282, inter_signal_0=294, group_delay_1_s=306),
+    2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
+})  # fmt: skip
+#: Reference semi-major axes of B-CNAV1 and B-CNAV2 [m]: medium orbits (kind 3), and orbits with the Earth's period.
 BCNAV_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
 CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Bits of CNAV, F/NAV and B-CNAV2 before their CRC.
 BEIDOU_CODINGS: Final[dict[str, Coding]] = {
@@ -240,58 +205,20 @@ BEIDOU_CODINGS: Final[dict[str, Coding]] = {
 }
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final = layout(BEIDOU_CODINGS, tow_s=((18, 8), (30, 12)), subframe=15)
-D1: Final = _with_head(
-    BDS_HEAD,
-    {
-        1: layout(
-            BEIDOU_CODINGS,
-            health=42,
-            aodc=43,
-            accuracy=48,
-            week=60,
-            toc_s=((73, 9), (90, 8)),
-            group_delay_1_s=98,
-            group_delay_2_s=((108, 4), (120, 6)),
-            ion0=126,
-            ion1=134,
-            ion2=150,
-            ion3=158,
-            ion4=((166, 6), (180, 2)),
-            ion5=182,
-            ion6=190,
-            ion7=((198, 4), (210, 4)),
-            af2=214,
-            af0_s=((225, 7), (240, 17)),
-            af1=((257, 5), (270, 17)),
-            aode=287,
-        ),
-        2: layout(
-            BEIDOU_CODINGS,
-            delta_n=((42, 10), (60, 6)),
-            cuc=((66, 16), (90, 2)),
-            m0=((92, 20), (120, 12)),
-            eccentricity=((132, 10), (150, 22)),
-            cus=180,
-            crc=((198, 4), (210, 14)),
-            crs=((224, 8), (240, 10)),
-            sqrt_a=((250, 12), (270, 20)),
-            toe_high=290,
-        ),
-        3: layout(
-            BEIDOU_CODINGS,
-            toe_low=((42, 10), (60, 5)),
-            i0=((65, 17), (90, 15)),
-            cic=((105, 7), (120, 11)),
-            omega_dot=((131, 11), (150, 13)),
-            cis=((163, 9), (180, 9)),
-            i_dot=((189, 13), (210, 1)),
-            omega0=((211, 21), (240, 11)),
-            omega=((251, 11), (270, 21)),
-        ),
-        # Start of each page of D2, subframe 1, in the 3000 bits of its ten concatenated pages: page k (1 to 10) at 300
-        # (k - 1); fields that extend over two pages are given in pieces.
-    },
-)
+D1: Final = _with_head(BDS_HEAD, {
+    1: layout(BEIDOU_CODINGS, health=42, aodc=43, accuracy=48, week=60, toc_s=((73, 9), (90, 8)), group_delay_1_s=98,
+              group_delay_2_s=((108, 4), (120, 6)), ion0=126, ion1=134, ion2=150, ion3=158, ion4=((166, 6), (180, 2)),
+              ion5=182, ion6=190, ion7=((198, 4), (210, 4)), af2=214, af0_s=((225, 7), (240, 17)),
+              af1=((257, 5), (270, 17)), aode=287),
+    2: layout(BEIDOU_CODINGS, delta_n=((42, 10), (60, 6)), cuc=((66, 16), (90, 2)), m0=((92, 20), (120, 12)),
+              eccentricity=((132, 10), (150, 22)), cus=180, crc=((198, 4), (210, 14)), crs=((224, 8), (240, 10)),
+              sqrt_a=((250, 12), (270, 20)), toe_high=290),
+    3: layout(BEIDOU_CODINGS, toe_low=((42, 10), (60, 5)), i0=((65, 17), (90, 15)), cic=((105, 7), (120, 11)),
+              omega_dot=((131, 11), (150, 13)), cis=((163, 9), (180, 9)), i_dot=((189, 13), (210, 1)),
+              omega0=((211, 21), (240, 11)), omega=((251, 11), (270, 21))),
+})  # fmt: skip
+#: Where each page of D2, subframe 1, begins in the 3000 bits of its ten pages one after the other: page k (1 to 10) at
+#: 300 (k - 1); fields that go over a page are given in pieces.
 _PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
 D2: Final = layout(
     BEIDOU_CODINGS,

@@ -69,38 +69,11 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
 _EVEN_BITS, _BDS_BITS = 114, 300  #: Bits of an even page of Galileo I/NAV without its tail, and of a page of BeiDou.
 #: Constellation and RINEX signal by signal number.
 SIGNALS: Final = {
-    0: "G1C",
-    1: "G1W",
-    2: "G2W",
-    3: "G2L",
-    4: "G5Q",
-    5: "G1L",
-    6: "J1C",
-    7: "J2L",
-    8: "R1C",
-    9: "R1P",
-    10: "R2P",
-    11: "R2C",
-    12: "R3Q",
-    13: "C1P",
-    14: "C5P",
-    15: "I5A",
-    17: "E1C",
-    19: "E6C",
-    20: "E5Q",
-    21: "E7Q",
-    22: "E8Q",
-    24: "S1C",
-    25: "S5I",
-    26: "J5Q",
-    28: "C2I",
-    29: "C7I",
-    30: "C6I",
-    32: "J1L",
-    33: "J1Z",
-    34: "C7D",
-    39: "J5P",
-}  # First and last SVID of each constellation, and the difference to the RINEX number.
+    0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
+    11: "R2C", 12: "R3Q", 13: "C1P", 14: "C5P", 15: "I5A", 17: "E1C", 19: "E6C", 20: "E5Q", 21: "E7Q", 22: "E8Q",
+    24: "S1C", 25: "S5I", 26: "J5Q", 28: "C2I", 29: "C7I", 30: "C6I", 32: "J1L", 33: "J1Z", 34: "C7D", 39: "J5P",
+}  # fmt: skip
+#: First and last SVID of each constellation, and the difference to the RINEX number.
 _NUMBERS: Final = (
     (1, 37, "G", 0), (38, 61, "R", -37), (63, 68, "R", -38), (71, 106, "E", -70), (120, 140, "S", -100),
     (141, 180, "C", -140), (181, 187, "J", -180), (191, 197, "I", -190), (198, 215, "S", -157), (223, 245, "C", -182),
