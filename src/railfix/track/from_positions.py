@@ -25,7 +25,10 @@ ANTENNA_PATH = "the track was made from positions of an antenna: it is that ante
 _TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
 #: Positions that deviate laterally from their neighbours by more than a distance [m], this many medians of such
 #: distances and a curve of this radius [m] are outliers; the search is repeated without them, in some rounds, where
-#: there are enough positions.
+#: there are enough positions. Where the neighbours are farther away in time [s], the path beside them is straight, too:
+#: the cosine of its turns is this at least.
+_NEAR_S: Final = 2.5
+_STRAIGHT: Final = 0.87
 _BESIDE_M: Final = 5.0
 _LEAST_RADIUS_M: Final = 150.0
 _BESIDE_MEDIANS: Final = 6.0
@@ -157,6 +160,9 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
     """Flag positions off the line between their neighbours by more than `_BESIDE_M`, `_BESIDE_MEDIANS` medians of all
     such distances, and what a curve of `_LEAST_RADIUS_M` needs, the farthest first.
+
+    Between neighbours that are far away a train may turn or change its speed: a position there is an outlier only where
+    the path before and after it goes on in the direction of the line between its neighbours.
     """
     wrong = np.zeros(len(time), dtype=np.bool_)
     if len(time) < _ENOUGH or np.isnat(time).any():
@@ -170,7 +176,12 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
         before, after = t[1:-1] - t[:-2], t[2:] - t[1:-1]
         share = (before / np.maximum(before + after, 1e-9))[:, None]
         off = np.linalg.norm(points[1:-1] - points[:-2] * (1.0 - share) - points[2:] * share, axis=1)
-        of_curve = ((points[2:] - points[:-2]) ** 2).sum(axis=1) / (8.0 * _LEAST_RADIUS_M)
+        chord = points[2:] - points[:-2]
+        length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+        of_curve = length**2 / (8.0 * _LEAST_RADIUS_M)
+        far = np.maximum(before, after) > _NEAR_S
+        across = np.linalg.norm(np.cross(points[1:-1] - points[:-2], chord), axis=1) / length
+        off = np.where(far, np.where(_goes_on(points, chord / length[:, None]), across, 0.0), off)
         limit = np.maximum(of_curve, max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(off))))
         around = np.pad(off, 1)
         farthest = (off > limit) & (off >= around[:-2]) & (off > around[2:])
@@ -178,6 +189,22 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
             break
         wrong[rows[1:-1][farthest]] = True
     return wrong
+
+
+def _goes_on(points: Floats, direction: Floats) -> Masks:
+    """Return whether the path before and after each inner point goes on in the direction between its neighbours.
+
+    The next position or the next but one shows it, since the next one may be an outlier as well.
+    """
+    cosine = np.full((2, 2, len(direction)), -1.0)
+    for span in (1, 2):
+        step = points[span:] - points[:-span]
+        step = step / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
+        inner = slice(span, len(direction))
+        cosine[0, span - 1, inner] = (step[: len(direction) - span] * direction[inner]).sum(axis=1)
+        inner = slice(0, len(direction) - span)
+        cosine[1, span - 1, inner] = (step[2 : 2 + len(direction) - span] * direction[inner]).sum(axis=1)
+    return np.asarray(cosine.max(axis=1).min(axis=0) >= _STRAIGHT)
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
