@@ -37,4 +37,4 @@ def test_positions_beside_those_around_them_make_no_points(interval_s: int) -> N
         least_m = 0.1
     assert beside_m[kept].max(initial=0.0) < least_m
     assert len(thinned.kept) > 0.97 * (count - len(wrong))
-    assert thinned.dropped["off the line of their neighbours"] >= 0.7 * len(np.unique(wrong))
+    assert thinned.dropped["off the line of their neighbours"] >= 0.6 * len(np.unique(wrong))

@@ -110,7 +110,7 @@ def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
         (f"level within {limit_m:g} m", "within_limit_share", GREEN),
     ]
     satellites = [("median", "satellites_median", BLUE), ("5 %", "satellites_p5", RED)]
-    panels = (
+    panels: tuple[tuple[str, str, list[Any], dict[str, Any]], ...] = (
         ("Satellites used", "satellites", satellites, {"y_range": None}),
         ("Distance of the 3-D position from the line", "m", [("95 %", "reflection_p95_m", RED)], {}),
         ("Fraction of epochs", "fraction of epochs", fractions, {"y_range": (-0.03, 1.03)}),
@@ -124,7 +124,7 @@ def service_charts(service: pl.DataFrame, limit_m: float) -> tuple[Chart, ...]:
             x_label="chainage [m]",
             y_label=unit,
             layers=(*(_steps(service, *column) for column in columns), *((limit,) if columns is level else ())),
-            **scales,  # type: ignore[arg-type]
+            **scales,
         )
         for number, (title, unit, columns, scales) in enumerate(panels)
     )
