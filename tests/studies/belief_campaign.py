@@ -373,7 +373,7 @@ def sights(case: Case) -> tuple[np.ndarray, np.ndarray]:
     known = np.isfinite(case.reference_arc_m)
     arc = np.where(known, case.reference_arc_m, 0.0)
     tangent = Line(case.trajectory).at(arc)[1][:, 0]
-    sat = found.satellites.position_ecef_m
+    sat = found.corrected.satellites.position_ecef_m
     sight = sat - np.where(known[:, None], case.reference_ecef_m, 0.0)[:, None, :]
     sight /= np.linalg.norm(sight, axis=2, keepdims=True)
     along = np.zeros(case.observations.code_m.shape)

@@ -258,7 +258,7 @@ def start_rows() -> Iterator[str]:
     columns = clean.columns
     used = (clean.reason[has][:, columns] == 0) & np.isfinite(clean.sigma_m[has][:, columns])
     ranges = Ranges(
-        sat_ecef_m=np.where(used[..., None], clean.satellites.position_ecef_m[has], 2.6e7),
+        sat_ecef_m=np.where(used[..., None], clean.corrected.satellites.position_ecef_m[has], 2.6e7),
         code_m=np.where(used, clean.corrected_code_m[has][:, columns], 0.0),
         weight=np.where(used, 1.0 / np.where(used, clean.sigma_m[has][:, columns], 1.0) ** 2, 0.0),
         groups=(slice(0, len(columns)),),
@@ -266,7 +266,7 @@ def start_rows() -> Iterator[str]:
     # One clock: the offsets between constellations are taken out as the run knows them.
     systems = np.array([name[0] for name in clean.satellite[columns].tolist()])
     offset = np.zeros(used.shape)
-    for g, letter in enumerate(clean.clocks):
+    for g, letter in enumerate(clean.corrected.channels.clocks):
         mine = np.isin(systems, ["G", "J"] if letter == "G" else [letter])
         offset[:, mine] = clean.ties.offset_m[has][:, g, None]
     ranges = replace(ranges, code_m=np.where(used, ranges.code_m - offset, 0.0))
