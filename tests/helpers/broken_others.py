@@ -124,12 +124,6 @@ def track_with_a_short_row(bench: Bench) -> Options:
     return write_track(bench, head, rows)
 
 
-@broken(INPUT, "line.csv", "line")
-def track_with_a_duplicate_point(bench: Bench) -> Options:
-    head, rows = track_lines(bench)
-    return write_track(bench, head, rows[:20] + rows[19:])
-
-
 @broken(INPUT, "line.csv", "lattitude_deg")
 def track_with_a_misspelt_column(bench: Bench) -> Options:
     return {"track": bench.edit(bench.track, "latitude_deg", "lattitude_deg")}

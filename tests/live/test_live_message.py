@@ -13,7 +13,7 @@ import pytest
 from live_outputs import output_of
 from pipeline_cases import clean_trajectories, demo_observations
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.reasons import Status
+from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.rinex import read_navigation
 from railfix.io.train_message import MessageStatus, Source, SuspectedInterference, Unknown
@@ -29,6 +29,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import Result
+from railfix.ranges.corrected import CorrectedRanges
 from railfix.simulate.demonstration import demo_files
 from railfix.tracking import Kind, TrackStatus
 
@@ -112,7 +113,8 @@ def test_the_bound_holds_for_the_single_epoch_and_for_the_filter(filtered: Resul
     single = filtered.antennas["front"].chainage_m
     bounds = []
     for away_m in (0.0, 4.0, -4.0):
-        moved = with_track(filtered, "front", chainage_m=single + away_m)
+        arc_m = filtered.fusion["front"].trajectory.arc_at_chainage(single + away_m)
+        moved = with_track(filtered, "front", arc_m=arc_m)
         message = output_of(moved, LiveSettings()).message
         assert message.over_cm is not None
         assert message.protection_level_cm is not None
@@ -124,7 +126,9 @@ def test_the_bound_holds_for_the_single_epoch_and_for_the_filter(filtered: Resul
 def test_forms_name_hemispheres_utc_and_the_place_of_the_first_antenna(filtered: Result) -> None:
     """GPS time is 18 s ahead of UTC from 2017 on."""
     for latitude, longitude, letters in ((35.5, 139.5, ("N", "E")), (-35.5, -139.5, ("S", "W"))):
-        one = with_track(filtered, "front", latitude_deg=np.full(3, latitude), longitude_deg=np.full(3, longitude))
+        one = with_track(filtered, "front")
+        # computed from the position on the line at the first access; no line is on the southern half as well
+        vars(one.fusion["front"])["geodetic"] = np.full(3, latitude), np.full(3, longitude), np.zeros(3)
         message = output_of(one, LiveSettings()).message
         at = (np.datetime64("2024-03-05T00:00:10", "ns") - GPS_EPOCH) // np.timedelta64(1, "ns")
         output = replace(output_of(one), message=message.replaced(time_ns=int(at)))
@@ -201,6 +205,13 @@ def test_a_sample_goes_to_the_first_epoch_after_it_and_to_none_that_a_restart_ha
         assert given == expected[first:]
 
 
+def using(corrected: CorrectedRanges, count: int) -> CorrectedRanges:
+    """The ranges of the first channels alone, as used."""
+    reason = np.full_like(corrected.reason, Reason.ELEVATION_MASK)
+    reason[:, :count] = 0
+    return replace(corrected, reason=reason)
+
+
 @pytest.mark.requirement("A8")
 def test_interference_is_the_worst_of_both_antennas_and_satellites_are_the_most(filtered: Result) -> None:
     for front, rear in ((0, 2), (2, 0), (1, 2)):
@@ -208,7 +219,7 @@ def test_interference_is_the_worst_of_both_antennas_and_satellites_are_the_most(
             name: replace(
                 filtered.antennas[name],
                 interference=SimpleNamespace(suspicion=np.array([0, 0, found])),
-                n_used=np.array([0, 0, 5 + found]),
+                corrected=using(filtered.antennas[name].corrected, 5 + found),
             )
             for name, found in (("front", front), ("rear", rear))
         }

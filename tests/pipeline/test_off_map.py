@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from functools import cache
 from itertools import pairwise
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -176,7 +177,11 @@ def test_antennas_that_disagree_are_doubted_for_a_time_however_the_log_is_cut(cu
         spacing = None
         if disagree[rows].any():
             spacing = Screened(metric=np.where(disagree, 9.0, 0.5)[rows], reject=disagree[rows])
-        result = AlongTrack.create(lambda _: {}, tracked=tracked, spacing_error_m=np.full(last - first, np.nan))
+        nothing, nobody = np.full(last - first, np.nan), cast(Any, None)
+        result = AlongTrack(
+            tracked=tracked, trajectory=nobody, arc_m=nothing, direction=np.zeros(last - first, dtype=np.int8),
+            standstill=np.zeros(last - first, dtype=np.bool_), sensed=nobody, spacing_error_m=nothing,
+        )  # fmt: skip
         found, state = apply_spacing_verdict(result, spacing, state, 3.0)
         parts.append(found.tracked)
     status, level = (np.concatenate([getattr(part, name) for part in parts]) for name in ("status", "level_m"))

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
-from enum import Enum
 from importlib import import_module
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
 
 ORACLES = Path(__file__).parents[1] / "oracles"
 
@@ -24,10 +21,7 @@ def find_faults(text: str) -> list[str]:
             module = import_module(node.module or "")
             for alias in node.names:
                 named = getattr(module, alias.name)
-                of_data = isinstance(named, type) and (
-                    dataclasses.is_dataclass(named) or issubclass(named, (Enum, BaseModel))
-                )
-                if not of_data or alias.name.startswith("_"):
+                if not isinstance(named, type) or alias.name.startswith("_"):
                     faults.append(f"{node.module}.{alias.name}")
     return faults
 

@@ -142,7 +142,7 @@ def test_the_command_and_what_reads_its_runs(folder: Path, tmp_path: Path) -> No
     [
         (("logs/{train}/{day}/front*.obs", "logs/{train}/{day}/none.obs"), InputFileError, "no file matches front"),
         (("logs/{train}/{day}/front*.obs", "logs/A/2024-03-05/front.obs"), SettingsError, "has no field"),
-        (("nav/{day}.nav", "nav/{week}.nav"), SettingsError, "nav has the field week, which front has not"),
+        (("nav/{day}.nav", "nav/{week}.nav"), SettingsError, "nav has the field week, which front lacks"),
         (("vehicle", "vehikel"), SettingsError, "vehikel"),
     ],
 )

@@ -87,7 +87,7 @@ def test_rows_name_their_track_and_the_probabilities_of_those_near(near: tuple[R
     assert not loop["on_route"].any()
     assert loop["offset_m"].median() == pytest.approx(4.5, abs=0.3)
     # the position without the map, which is metres from the route
-    assert abs(loop["unconstrained_offset_m"].median()) == pytest.approx(4.5, abs=2.0)
+    assert abs(loop["unconstrained_offset_m"].median()) == pytest.approx(4.5, abs=3.0)
     assert placed["unconstrained_offset_m"].abs().median() > 0.1  # type: ignore[operator]
     assert placed["unconstrained_offset_m"].abs().quantile(0.9) < 5.0
     assert placed["unmapped_probability"].is_between(0.0, 0.1).all()

@@ -34,10 +34,11 @@ from test_carrier_stage import demo
 
 #: Columns by the place of their values in `AntennaResult`: an attribute path, a column of an array after a colon.
 POSITION_PATHS = {
-    **{name: name for name in ("chainage_m", "kilometrage_m", "along_sigma_m", "own_sigma_m", "latitude_deg")},
+    **{name: name for name in ("chainage_m", "kilometrage_m", "along_sigma_m", "latitude_deg")},
+    "own_sigma_m": "epoch_sigma_m",
     **{name: name for name in ("longitude_deg", "height_m", "n_used", "n_rejected", "noise_scale")},
     **{f"{axis}_m": f"ecef_m:{i}" for i, axis in enumerate("xyz")},
-    **{f"conventional_{axis}_m": f"conventional_ecef_m:{i}" for i, axis in enumerate("xyz")},
+    **{f"conventional_{axis}_m": f"point.ecef_m:{i}" for i, axis in enumerate("xyz")},
     "conventional_chainage_m": "conventional_chainage_m",
     "conventional_offset_m": "conventional_offset_m",
     "raim_statistic": "raim.statistic",
@@ -93,7 +94,7 @@ def marked(value: Any, random: np.random.Generator) -> Any:
     if isinstance(value, np.ndarray) and value.dtype.kind == "i" and value.dtype.itemsize > 1:
         return random.integers(1, 1000, value.shape).astype(value.dtype)
     if is_dataclass(value) and not isinstance(value, type):
-        keep = {"columns", "reason", "satellites", "time", "used", "replay"}
+        keep = {"columns", "reason", "satellites", "time", "used", "replay", "trajectory", "channels"}
         new = {f.name: marked(getattr(value, f.name), random) for f in fields(value) if f.name not in keep}
         return replace(value, **{name: item for name, item in new.items() if item is not getattr(value, name)})
     return value
@@ -184,7 +185,8 @@ def test_columns_of_what_few_runs_have_are_the_quantities_that_they_name(result:
     names = ("share", "ionosphere_m", "difference_m")
     combined = SimpleNamespace(**{name: numbers(len(front.columns)) for name in names})
     second = SimpleNamespace(cn0_dbhz=numbers(len(front.columns)))
-    rare: Any = {"araim": araim, "phase": phase, "interference": signs, "combined": combined, "second": second}
+    rare: Any = {"araim": araim, "phase": phase, "interference": signs, "combined": combined}
+    rare["corrected"] = copy_with(front.corrected, second=second)
     rare_track: Any = {"wheel": SimpleNamespace(difference_m=numbers())}
     made = replace(
         result, antennas={"front": copy_with(front, **rare)}, fusion={"front": copy_with(track, **rare_track)}
