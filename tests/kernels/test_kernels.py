@@ -128,6 +128,7 @@ def test_each_kernel_gives_what_it_gives_as_plain_python(
 
 
 def test_every_kernel_of_single_epochs_is_compared() -> None:
+    kernels.load()
     compiled = {function.py_func for function in compiling.COMPILED}
     assert compiled == {getattr(getattr(kernels, m), name).py_func for m, name in NAMES} | {
         advance.py_func, write_velocities.py_func,

@@ -207,52 +207,38 @@ def write_first_weights(
 
 
 @inner
-def correct_by_rows(
-    rows: Rows, equations: Equations, variance: Floats, weight: Floats, mean: Floats, P: Floats
-) -> tuple[float, float]:
-    """Correct a Gaussian, in place, by all measurements of finite variance at their weights, one after the other.
-
-    `mean`, shape (N,), is the change from where the innovations hold. Returns ``log det(I + R^-1 H P H')``, and
-    ``y' (H P H' + R)^-1 y`` less the squared residuals of the six rows of the motion: less those of codes and sensors,
-    over their variances, it is `Fit.distance`.
-    """
-    codes, value, log_determinant, square = rows.code.stop, equations.value, 0.0, 0.0
-    g, gain, T, z = np.empty(len(mean)), np.empty(len(mean)), np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
+def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
+    """Correct the quantities, ``N(0, covariance)``, at the weights of `found`; write the rest of it."""
+    size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
+    mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
+    T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
     compress(rows, equations, variance, weight, T, z)
-    for q in range(len(equations.unknown)):
-        g[:] = 0.0
+    log_determinant = square = 0.0
+    for q in range(size):
         if codes <= q < codes + ix.MOTION:
             r = q - codes
             if T[r, r] == 0.0:
                 continue
-            y, noise, S = z[r], 1.0, 1.0
+            g[:], y, S, noise = 0.0, z[r], 1.0, 1.0
             for c in range(r, ix.MOTION):
-                y -= _add_quantity(equations, codes + c, T[r, c], P, mean, g)
+                add_row(g, T[r, c], C, codes + c)
+                y -= T[r, c] * mean[codes + c]
             for c in range(r, ix.MOTION):
-                S += T[r, c] * _project(equations, codes + c, g)
+                S += T[r, c] * g[codes + c]
         else:
             j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
             if variance[j] == math.inf:
                 continue
-            noise, y = variance[j] / weight[j], value[j] - _add_quantity(equations, q, 1.0, P, mean, g)
-            S = noise + _project(equations, q, g)
-        correct(mean, P, g, y, S, gain)
+            g[:], noise = C[q], variance[j] / weight[j]
+            y, S = value[j] - mean[q], g[q] + noise
+        correct(mean, C, g, y, S, gain)
         log_determinant += math.log(S / noise)
         square += y * y / S
     for r in range(ix.MOTION):
         rest = z[r]
         for c in range(r, ix.MOTION):
-            rest -= T[r, c] * _project(equations, codes + c, mean)
+            rest -= T[r, c] * mean[codes + c]
         square -= rest * rest
-    return log_determinant, square
-
-
-@inner
-def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Correct the quantities, ``N(0, covariance)``, at the weights of `found`; write the rest of it."""
-    mean, C, itself = np.zeros(len(covariance)), covariance.copy(), np.arange(len(covariance)).reshape(-1, 1)
-    own = Equations(itself, np.ones(itself.shape), equations.design, equations.value)
-    log_determinant, square = correct_by_rows(rows, own, variance, found.weight, mean, C)
     square -= _write_residuals(rows, equations, mean, C, variance, found)
     found.log_determinant[0], found.distance[0] = log_determinant, square
 
@@ -300,18 +286,38 @@ def reweight(rows: Rows, equations: Equations, covariance: Floats, variance: Flo
 
 @inner
 def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Floats, x: Floats, P: Floats) -> None:
-    """Correct the state by all measurements of finite variance at their weights."""
-    change = np.zeros(len(x))
-    correct_by_rows(rows, equations, variance, weight, change, P)
-    for i in range(len(x)):
-        x[i] += change[i]
+    """Correct the state by all measurements of finite variance at their weights, one after the other."""
+    codes, value = rows.code.stop, equations.value
+    change, g, gain = np.zeros(len(x)), np.empty(len(x)), np.empty(len(x))
+    T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
+    compress(rows, equations, variance, weight, T, z)
+    for q in range(len(equations.unknown)):
+        g[:] = 0.0
+        if codes <= q < codes + ix.MOTION:
+            r = q - codes
+            if T[r, r] == 0.0:
+                continue
+            y, S = z[r], 1.0
+            for c in range(r, ix.MOTION):
+                y -= _add_quantity(equations, codes + c, T[r, c], P, change, g)
+            for c in range(r, ix.MOTION):
+                S += T[r, c] * _project(equations, codes + c, g)
+        else:
+            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
+            if variance[j] == math.inf:
+                continue
+            y = value[j] - _add_quantity(equations, q, 1.0, P, change, g)
+            S = variance[j] / weight[j] + _project(equations, q, g)
+        correct(change, P, g, y, S, gain)
+    for a in range(len(x)):
+        x[a] += change[a]
 
 
 @inner
 def _project(equations: Equations, q: int, vector: Floats) -> float:
     """Return ``h' vector`` of a quantity h."""
     total = 0.0
-    for k in range(equations.unknown.shape[1]):
+    for k in range(ix.TERMS):
         total += equations.coefficient[q, k] * vector[equations.unknown[q, k]]
     return total
 
@@ -320,7 +326,7 @@ def _project(equations: Equations, q: int, vector: Floats) -> float:
 def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: Floats, g: Floats) -> float:
     """Add a multiple of ``P h`` of a quantity h to g; return the same multiple of ``h' mean``."""
     total = 0.0
-    for k in range(equations.unknown.shape[1]):
+    for k in range(ix.TERMS):
         f = factor * equations.coefficient[q, k]
         if f != 0.0:
             total += f * mean[equations.unknown[q, k]]
