@@ -129,7 +129,9 @@ class Tests:
         for context in self._data.contexts_by_lineno(str(self.source / "railfix" / module)).get(line, ()):
             test, _, when = context.rpartition("|")
             found.add(test.partition("[")[0] if when == "run" else test.partition("::")[0])
-        return sorted(test for test in found if test and not ("::" in test and test.partition("::")[0] in found))
+        some = [test for test in found if test and not ("::" in test and test.partition("::")[0] in found)]
+        own = Path(module).stem
+        return sorted(some, key=lambda test: (own not in test.partition("::")[0], "::" not in test, test))
 
     def pass_within(self, limit_s: float, words: Sequence[str], environment: dict[str, str] | None = None) -> bool:
         """Return whether tests pass against the copy of the source within a time."""
