@@ -26,7 +26,7 @@ from railfix.cli.console import (
     show_verdict,
 )
 from railfix.cli.options import Choices, JsonOption, OutOption, Without, from_models, resolve_settings
-from railfix.core.errors import MismatchError, NoPositionError, SettingsError
+from railfix.core.errors import MismatchError, NoPositionError, SettingsError, needs_extra
 from railfix.core.tables import number, percent, plain_table
 from railfix.evaluate import Score
 from railfix.evaluate.ablation import Ablation, Effect, ablate_files
@@ -150,10 +150,8 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
         return
-    try:
+    with needs_extra("--scheduler"):
         from distributed import Client, KilledWorker
-    except ModuleNotFoundError:
-        raise SettingsError("--scheduler needs distributed; install railfix[cluster]") from None
     try:
         client = Client(scheduler, timeout="10s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:

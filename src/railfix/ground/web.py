@@ -18,14 +18,16 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-import uvicorn
-from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
-from starlette.routing import Route
-from uvicorn.protocols.http.h11_impl import H11Protocol
-
+from railfix.core.errors import needs_extra
 from railfix.ground.quic import address_errors
+
+with needs_extra():
+    import uvicorn
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
+    from starlette.routing import Route
+    from uvicorn.protocols.http.h11_impl import H11Protocol
 
 #: Time between two events of the page [s].
 EVENT_S: Final = 0.5

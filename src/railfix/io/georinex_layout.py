@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.errors import check_type
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
@@ -75,6 +76,7 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
     """
     import xarray as xr
 
+    check_type(observations, Observations, "observations")
     satellites, row = np.unique(observations.satellite, return_inverse=True)
     shape = (len(observations), len(satellites))
     variables: dict[str, Any] = {}
@@ -130,6 +132,9 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
         The dataset has no observation types over ``time`` and ``sv``, an unknown time system, or times
         that do not rise.
     """
+    import xarray as xr
+
+    check_type(data, xr.Dataset, "data")
     types = [str(name) for name in data.data_vars if _TYPE.fullmatch(str(name))]
     if not types:
         raise ValueError("the dataset has no observation types such as C1C; georinex.load of an observation file has")
@@ -224,6 +229,7 @@ def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
     """
     import xarray as xr
 
+    check_type(navigation, Navigation, "navigation")
     kepler, glonass = navigation.kepler, navigation.glonass
     check_messages(kepler, "3.04")
     copies: Counter[tuple[str, np.datetime64]] = Counter()
@@ -278,6 +284,9 @@ def navigation_from_xarray(data: xr.Dataset) -> Navigation:
     ValueError
         The dataset has no navigation records, or a number of a record is not possible.
     """
+    import xarray as xr
+
+    check_type(data, xr.Dataset, "data")
     if "SVclockBias" not in data:
         raise ValueError("the dataset has no SVclockBias; georinex.load of a RINEX 3 navigation file has")
     values = {

@@ -18,6 +18,7 @@ import scipy
 from railfix.core.arrays import Floats, Indices, Integers, RowArrays, join_rows, places_in_groups, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.tables import NotebookTable
 from railfix.track.route import Segment, one_frame, sigma_of_files
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 from railfix.track.trajectory import NearestOnPolyline, project_on_segments
@@ -62,8 +63,8 @@ class Candidates(RowArrays):
     offset_m: Floats
 
 
-@dataclass(frozen=True, kw_only=True)
-class Network:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Network(NotebookTable):
     """Tracks, each from one end or switch to the next, their connections, and notes on the source of these."""
 
     tracks: tuple[Segment, ...]
