@@ -386,7 +386,7 @@ class LiveEngine:
             news = news.with_later(self._from_satellites.popleft())
         epochs = {name: head.epoch for name, head in heads.items()}
         self._done_ns = max(head.tag_ns for head in heads.values())
-        result, self._state = self.processor.process(
+        screened = self.processor.screen(
             epochs,
             self._state,
             navigation=news.navigation,
@@ -394,6 +394,7 @@ class LiveEngine:
             base=news.base,
             sensors=self._samples_until(self._done_ns) if self._heard_to else None,
         )
+        result, self._state = self.processor.along_track(*self.processor.position(*screened))
         self._tell_changes((self._state.received or self.processor.received).notes)
         self._check_order(result)
         return self._locate(result)

@@ -256,6 +256,8 @@ class EpochProcessor:
         SettingsError
             As the class; an antenna has no trajectory; no navigation records were given.
         """
+        if navigation is None and state is None and not self._navigation_given:
+            raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")
         chunk, state = self.screen(
             observations, state, navigation=navigation, messages=messages, sensors=sensors, base=base
         )
@@ -286,8 +288,6 @@ class EpochProcessor:
         state = State() if state is None else state
         check_type(state, State, "state")
         _check_received(navigation, messages)
-        if not self._navigation_given and navigation is None and state.received is None:
-            raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")
         for value, expected, what in ((sensors, SensorSamples, "sensors"), (base, Observations, "base")):
             if value is not None:
                 check_type(value, expected, what)
