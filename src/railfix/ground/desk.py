@@ -161,7 +161,9 @@ class OrderDesk:
         return None
 
     def is_silent(self, train: int) -> bool:
-        """Return whether a train has not been heard for so long that it stands, whatever it was granted."""
+        """Return whether a train has been silent for longer than it may run, so that it is at rest whatever it was
+        granted.
+        """
         supervision = self.centre.supervision
         record = supervision.records.get(train)
         heard_s = supervision.begun_s if record is None else max(record.heard_s, supervision.begun_s)

@@ -197,7 +197,7 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 async def _values(request: Request) -> dict[str, Any] | None:
     """Return the JSON object of a request; None where it has none.
 
-    Another site cannot send this content type unless the browser asks first, which is refused.
+    Another site cannot send this content type without a preflight request, which is refused.
     """
     if request.headers.get("content-type") != "application/json":
         return None

@@ -111,8 +111,7 @@ class LiveEngine:
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log on what happened: what is used in place of what was requested, and when that ends,
-        restarts, what became of a saved state.
+        Sentences for the log: replacements of requested data and their end, restarts, outcome of a saved state.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:

@@ -76,10 +76,10 @@ class EpochProcessor:
         SBAS messages known from the start. SBAS corrections are used once messages are given, here or with a chunk.
     models : Models, optional
     track : Track, optional
-        The line itself, for places by its changes of gradient and curvature in the filter along the track.
+        The line itself, for positions from its changes of gradient and curvature in the filter along the track.
     stations : Stations, optional
     screens : sequence of Screen, optional
-        Screens of one's own, used with their limits beside those of `config`; their verdicts are in
+        User-defined screens, used with their limits in addition to those of `config`; their verdicts are in
         `AntennaResult.screens`, without columns of the tables (those of installed packages have them).
 
     Attributes

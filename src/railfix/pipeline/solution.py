@@ -54,8 +54,8 @@ class Solution(NotebookTable):
     #: Position along the antenna's trajectory: from the codes, or from code and phase; shape (T,).
     arc_m: Floats
     #: Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
-    #: itself; satellites and atmosphere; the map error; and the distance to an open other place, by its probability;
-    #: shape (T,).
+    #: itself; satellites and atmosphere; the map error; and the distance to an unresolved alternative position,
+    #: weighted by its probability; shape (T,).
     along_sigma_m: Floats
     #: Positions from code and phase, where ``Config.carrier`` is "float" or "fixed"; they are what `arc_m` is.
     phase: PhasePositions | None

@@ -212,8 +212,7 @@ def _position(
 ) -> Tally:
     """Position chunk by chunk: counts and rows.
 
-    Five chunks are processed at a time: one is read, one is screened, one has its single epochs positioned, one is
-    filtered, and the rows of one are written by `beside`.
+    Five chunks are in work at a time: reading, screens, single epochs, filter, and writing by `beside`.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     state = State()

@@ -190,7 +190,7 @@ def _times(table: pl.DataFrame) -> Datetimes:
 
 
 def _names_of_columns(kind: str) -> list[str]:
-    """Return the names of the columns of a table, those that may be absent among them."""
+    """Return the names of the columns of a table, including optional ones."""
     return [column.strip("[]") for column in COLUMNS[kind]]
 
 

@@ -1,4 +1,4 @@
-"""Lines of map files of geographic information systems, read through GDAL by `pyogrio`, OpenStreetMap among them.
+"""Lines of map files of geographic information systems, including OpenStreetMap, read through GDAL by `pyogrio`.
 
 OpenStreetMap's ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters
 write the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class

@@ -50,7 +50,7 @@ class Cause(IntEnum):
     NO_POSITION = 5
     #: Three of these at a time, or more.
     THREE_FAULTS = 6
-    #: Infinite: local faults cannot be bounded at this place of the line.
+    #: Infinite: local faults cannot be bounded on this part of the line.
     UNBOUNDED = 7
     #: As `UNCHECKED`, mostly faults of a constellation, alone or with satellites.
     UNCHECKED_CONSTELLATION = 8
