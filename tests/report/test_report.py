@@ -297,20 +297,22 @@ def test_every_card_has_the_figure_of_the_evaluation_and_of_the_verdict(folder: 
     config = parse_config({"filter": "off", "screens": ["elevation"]})
     run_files(demo_inputs(), config, out=tmp_path / "unscreened", options=RunOptions(end=first + timedelta(seconds=20)))
     run_files(demo_inputs(), out=tmp_path / "run", options=RunOptions(end=first + timedelta(seconds=20)))
-    for mine, leading in ((folder, "run"), (tmp_path / "run", "run (train)")):
+    for mine in (folder, tmp_path / "run"):
         runs, evaluation = read_runs([mine], [demo_truth()], conventional=[tmp_path / "unscreened"])
         assert evaluation is not None
         page = report_page(runs, evaluation)
         assert "unscreened ranges, as in P1" in page
         cards = cards_of(page)
         assert len(cards) == 5
-        own = {"run": "run", "antenna": "front"}
-        passed = "constrained" if leading == "run (train)" else "constrained_ok"
+        name, train = (runs[0].name_in(evaluation, table) for table in ("positions", "train"))
+        assert bool(train) == (mine != folder)
+        own = {"run": name, "antenna": "front"}
+        leading = {**own, "run": train, "position": "constrained"} if train else {**own, "position": "constrained_ok"}
         for name, key in (("median error", "p50_m"), ("95 % of errors within", "p95_m"), ("largest error", "max_m")):
-            value = evaluation.figure(key, **{**own, "run": leading}, position=passed)
+            value = evaluation.figure(key, **leading)
             single = evaluation.figure(key, **own, position="constrained_ok")
             other = evaluation.figure(key, **own, position="conventional")
-            expected = f"{value:.2f} m", f"{single:.2f} m" if leading != "run" else "", f"conventional {other:.2f} m"
+            expected = f"{value:.2f} m", f"{single:.2f} m" if train else "", f"conventional {other:.2f} m"
             assert cards.pop(name) == expected
         verdict = judge_run(runs[0].record).antennas[0]
         figures = {name: (value, single) for name, value, single in verdict.figures()}
