@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -34,25 +34,28 @@ from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import read_vehicle
 
 SCENARIO: Final = paths.DATA / "cases" / "maps" / "sc.toml"
-#: The tracks driven of each network, and where the map has them [m]; elsewhere it lacks the track.
-END_M: Final = 1e9
+END_M: Final = 1e9  #: Beyond the end of the line [m].
+#: Tracks that were driven, and from where to where the map has them [m]; elsewhere it lacks the track.
+Driven = Mapping[str, tuple[float, float]]
 _SIGMA: Final = {"sigma_plan_m": "0.1", "sigma_height_m": "0.1"}
 
 
-def networks(line: Trajectory) -> dict[str, tuple[Around, dict[str, tuple[float, float]]]]:
+def networks(line: Trajectory) -> dict[str, tuple[Around, Driven]]:
     """Return the networks around a line by name, each with the tracks that were driven."""
     places = np.append(np.arange(0.0, float(line.arc_m[-1]), 5.0), line.arc_m[-1])
     points, right = line.at_arc(places), line.across[line.segment_at(places)[0]]
     up = axes_at(points)[:, 2]
 
-    def part(aside: float, first: float = 0.0, last: float = END_M, *, ramp_m: float = 0.0, up_m: float = 0.0) -> object:
+    def part(
+        aside: float, first: float = 0.0, last: float = END_M, *, ramp_m: float = 0.0, up_m: float = 0.0
+    ) -> np.ndarray:
         inside = (places >= first) & (places <= last)
         share = np.clip((places - first) / ramp_m, 0.0, 1.0) if ramp_m else np.ones(len(places))
         shift = aside * (3.0 * share**2 - 2.0 * share**3)
         return (points + shift[:, None] * right + up_m * up)[inside]
 
-    def around(driven: dict[str, tuple[float, float]], **tracks: object) -> tuple[Around, dict[str, tuple[float, float]]]:
-        return Around(tracks=tracks, driven=frozenset(driven)), driven  # type: ignore[arg-type]
+    def around(driven: Driven, **tracks: np.ndarray) -> tuple[Around, Driven]:
+        return Around(tracks=tracks, driven=frozenset(driven)), driven
 
     whole, main = {"M": (0.0, END_M)}, {"M1": (0.0, 400.0), "M2": (400.0, 900.0), "M3": (900.0, END_M)}
     found = {
@@ -72,7 +75,7 @@ def networks(line: Trajectory) -> dict[str, tuple[Around, dict[str, tuple[float,
     return found
 
 
-def true_names(driven: dict[str, tuple[float, float]], chainage_m: np.ndarray) -> np.ndarray:
+def true_names(driven: Driven, chainage_m: np.ndarray) -> np.ndarray:
     """Return the name of the track driven at chainages, "none" where the map lacks it."""
     names = np.full(len(chainage_m), "none", dtype=object)
     for name, (first, last) in driven.items():
@@ -87,7 +90,7 @@ def invoke(*words: object) -> str:
     return "" if result.exit_code == 0 else result.stderr.strip()
 
 
-def matched_row(folder: Path, around: Around, driven: dict[str, tuple[float, float]]) -> str:
+def matched_row(folder: Path, around: Around, driven: Driven) -> str:
     """Match conventional positions, once a second, to a network."""
     config, navigation = Config(), read_navigation([folder / "nav.rnx.gz"])
     log = read_observations(folder / "front.crx.gz")
@@ -106,7 +109,8 @@ def matched_row(folder: Path, around: Around, driven: dict[str, tuple[float, flo
     largest = float(np.max(np.where(wrong, found.probability, 0.0)))
     shares = [f"{(names == true)[k].mean():.3f}" if k.any() else "    -" for k in (there, ~there)]
     certain = int((wrong & (found.probability > 0.999)).sum())
-    return f"named {shares[0]} of {there.sum():3d}, none {shares[1]} of {(~there).sum():3d}; wrong above 0.999 {certain}, largest {largest:.4f}"
+    named = f"named {shares[0]} of {there.sum():3d}, none {shares[1]} of {(~there).sum():3d}"
+    return f"{named}; wrong above 0.999: {certain}, largest {largest:.4f}"
 
 
 def chainages(folder: Path, time: np.ndarray) -> np.ndarray:
@@ -116,7 +120,7 @@ def chainages(folder: Path, time: np.ndarray) -> np.ndarray:
     return np.interp(time.astype("datetime64[ns]").astype(np.int64), at, truth["chainage_m"].to_numpy())
 
 
-def run_rows(folder: Path, around: Around, driven: dict[str, tuple[float, float]]) -> Iterator[str]:
+def run_rows(folder: Path, around: Around, driven: Driven) -> Iterator[str]:
     """Run a network with the filter, and count passed rows and those on a wrong track."""
     track, out = write_network(around, folder / "net.gpkg"), folder / "out"
     refused = invoke(
@@ -134,7 +138,8 @@ def run_rows(folder: Path, around: Around, driven: dict[str, tuple[float, float]
         names = np.array([str(name).split("/")[0] for name in rows["track"]], dtype=object)
         good, certain = (rows["status"] == passed).to_numpy(), (rows["track_probability"] > 0.999).to_numpy()
         wrong = good & (names != true)
-        yield f"{table}: {len(rows)} rows, {good.sum()} {passed}, {wrong.sum()} of them wrong, {(wrong & certain).sum()} above 0.999"
+        counts = f"{wrong.sum()} of them wrong, {(wrong & certain).sum()} above 0.999"
+        yield f"{table}: {len(rows)} rows, {good.sum()} {passed}, {counts}"
 
 
 def main() -> None:

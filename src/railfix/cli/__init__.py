@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar
 import typer
 
 from railfix import __version__
-from railfix.cli.command import LazyCommands, command_group, run_program
+from railfix.cli.command import LazyCommands, command_group
 from railfix.core.files import source_commit
 
 # Threads of linear algebra spin while they wait for the next product. It must be set before numpy is imported.
@@ -116,8 +116,3 @@ def railfix(
     An error is one sentence on the standard error output; it leaves no results behind. Files that exist are
     replaced only with `--overwrite`, and an input is never replaced.
     """
-
-
-def main() -> None:
-    """Entry point of the program ``railfix``."""
-    run_program(app)
