@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, join_rows, take_rows
-from railfix.core.errors import MismatchError
+from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import nearest_rows
 from railfix.gnss.navigation import Navigation
@@ -314,7 +314,7 @@ class LogPositions:
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions of quality 5, single; MismatchError where the log has none."""
+        """Positions of quality 5, single; NoPositionError where the log has none."""
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
         located = []
         for part in self.parts():
@@ -323,7 +323,7 @@ class LogPositions:
             located.append(locate(part[::step], received, self.config, book))
         known = [take_rows(part, np.isfinite(part.ecef_m[:, 0])) for part in located]
         if not (count := sum(len(part.time) for part in known)):
-            raise MismatchError(f"{self.path}: the log has no position, so that its line cannot be found")
+            raise NoPositionError(f"{self.path}: the log has no position, so that its line cannot be found")
         placed = join_rows(known)
         return PositionLog(
             path=self.path, time=placed.time, ecef_m=placed.ecef_m, quality=np.full(count, 5), sigma_m=placed.sigma_m,

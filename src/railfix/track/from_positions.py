@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, NoPositionError
 from railfix.core.geodesy import axes_at
 from railfix.core.settings import Settings
 from railfix.core.tables import plural
@@ -332,7 +332,7 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
             message = (
                 f"no position has quality {accepted}; the log has {qualities_in_words(log)} (--quality takes others)"
             )
-            raise InputFileError(log.path, message)
+            raise NoPositionError(f"{log.path}: {message}")
     if max_sigma_m is not None:
         if not np.isfinite(log.sigma_m).any():
             raise InputFileError(log.path, "a largest sigma was given, but the log has no standard deviations")
@@ -375,7 +375,8 @@ def from_position_log(
 ) -> tuple[Track, Thinned]:
     """Create a track from the accurate positions of a log, and report the selection of rows.
 
-    InputFileError: fewer than two points are left, the times run backwards, or the log has no column for a filter.
+    NoPositionError: fewer than two points are left. InputFileError: the times run backwards, the log has no column for
+    a filter, or a gap is too long.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)
@@ -401,4 +402,6 @@ def from_position_log(
         )
         return track, thinned
     except ValueError as error:
+        if len(thinned.kept) < 2:
+            raise NoPositionError(f"{log.path}: {error}") from None
         raise InputFileError(log.path, str(error)) from None
