@@ -13,6 +13,7 @@ import pytest
 from railfix.ground.authority import Authority, BrakeOrder
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.layout import Layout, LoopStation, overlap
+from railfix.ground.on_board import OnBoard
 from railfix.ground.state import HEAD, TrainInterval, from_documents, to_documents
 from railfix.ground.stops import OCCUPIED, UNKNOWN, pieces_of
 from railfix.ground.store import DatabaseError, Store
@@ -99,6 +100,10 @@ class Desk:
         if "order it again" not in first:
             return first
         return self.orders[order](values, "ben")
+
+    def order_to(self, number: int) -> int:
+        """The number of the newest order to brake sent to a train."""
+        return max(order.number for order in self.sent if isinstance(order, BrakeOrder) and order.train == number)
 
     @property
     def state(self) -> Any:
@@ -355,7 +360,7 @@ def test_an_order_frees_a_line_that_a_wrong_report_has_stopped(desk: Desk, wrong
     assert desk.state.trains[2].stop is not None
     for _ in range(5):
         for number, front in ((1, 400.0), (2, 2900.0)):
-            desk.report(number, front)
+            desk.report(number, front, brake_order=desk.order_to(number))
         desk.steps(1.0)
     values = {"train": 2, "rear_m": 2690, "front_m": 2906, "direction": 1, "track": 1, "reason": "seen in Mid, whole"}
     assert "reason: one to" in (desk.orders["correct-train"]({**values, "reason": " "}, "anna") or "")
@@ -374,6 +379,77 @@ def test_an_order_frees_a_line_that_a_wrong_report_has_stopped(desk: Desk, wrong
         desk.steps(1.0)
     assert [known.stop for known in desk.state.trains.values()] == [None, None]
     assert any(line.split(": ", 1)[1].startswith("order of ben: correct-train") for line in desk.centre.lines)
+
+
+def test_an_interval_is_not_shortened_while_an_authority_is_on_the_way(desk: Desk) -> None:
+    """The train obeyed an order to brake, was released, and is stopped again while its next authority is late.
+
+    So its newest report names an order to brake which that authority ends. Only an order to brake that is as new as the
+    authority frees the track beyond the corrected interval, or 60 s: no unit takes one that has lapsed.
+    """
+    unit = OnBoard(direction=1, end_m=400.0)
+    desk.centre.supervision.routes = "automatic"
+
+    def answer(*, late: list[Authority] | None = None) -> None:
+        desk.report(2, 2900.0)
+        unit.note_report(desk.sequence + 1, desk.now)
+        unit.note_position(405.0, 0.0)
+        desk.report(1, 400.0, **unit.acknowledgement())
+        desk.steps(1.0)
+        for name in {point for point, _ in desk.commands}:
+            desk.centre.supervision.set_detected(name, desk.state.points[name].wanted)
+        for message in (sent := desk.sent[:]):
+            if message.train == 1 and late is None:
+                unit.receive(message)
+        desk.sent.clear()
+        if late is not None:
+            late += [message for message in sent if message.train == 1]
+
+    for _ in range(3):
+        answer()
+    assert unit.end_m > 2000.0
+    desk.orders["stop"]({"train": 1}, "anna")
+    answer()
+    answer()
+    assert unit.end_m < 410.0
+    assert desk.orders["release-train"]({"train": 1}, "anna") is None
+    late: list[Authority] = []
+    answer(late=late)
+    assert not late[-1].stopped
+    assert late[-1].end_cm > 200_000
+    desk.orders["stop"]({"train": 1}, "anna")
+    values = {"train": 1, "rear_m": 190, "front_m": 410, "direction": 1, "track": 1, "reason": "seen in West, whole"}
+    assert "has not reported that it obeys" in (desk.twice("correct-train", values) or "")
+    for message in late:
+        unit.receive(message)
+    assert unit.end_m > 2000.0
+    answer()
+    answer()
+    assert unit.order is not None
+    assert desk.twice("correct-train", values) is None
+    for message in late:
+        unit.receive(message)
+    assert unit.end_m < 410.0
+
+
+def test_an_interval_is_corrected_once_every_authority_has_lapsed(desk: Desk) -> None:
+    """A unit that names no order to brake, and from whose newest report on 60 s have passed, or since a stop."""
+    unit = OnBoard(direction=1, end_m=400.0)
+    desk.report(1, 400.0)
+    unit.note_report(desk.sequence, desk.now)
+    desk.steps(1.0)
+    authority = next(message for message in desk.sent if message.train == 1 and not message.stopped)
+    desk.orders["stop"]({"train": 1}, "anna")
+    values = {"train": 1, "rear_m": 190, "front_m": 410, "direction": 1, "track": 1, "reason": "seen in West, whole"}
+    for _ in range(58):
+        desk.report(1, 400.0)
+        desk.steps(1.0)
+    assert "has not reported that it obeys" in (desk.twice("correct-train", values) or "")
+    desk.report(1, 400.0)
+    desk.steps(3.0)
+    assert desk.twice("correct-train", values) is None
+    unit.note_report(desk.sequence, desk.now)
+    assert not unit.receive(authority)  # it answers a report of more than 15 s ago
 
 
 def test_a_train_is_entered_anywhere_and_removed(desk: Desk) -> None:

@@ -22,8 +22,6 @@ from railfix.ground.web import Order
 
 #: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
-#: A train that was silent for this time runs by no authority any more (`OnBoardLimits.fresh_s`) and stands [s].
-SILENT_S: Final = 60.0
 #: Longest reason that is taken [characters].
 LONGEST_REASON: Final = 200
 Values = dict[str, Any]
@@ -160,13 +158,6 @@ class OrderDesk:
                 return "train {} reports {:.0f} to {:.0f} m, outside of that interval".format(number, *known.reported_m)
         return None
 
-    def is_silent(self, train: int) -> bool:
-        """Return whether a train has not been heard for so long that it stands, whatever it was granted."""
-        supervision = self.centre.supervision
-        record = supervision.records.get(train)
-        heard_s = supervision.begun_s if record is None else max(record.heard_s, supervision.begun_s)
-        return self.centre.clock() - heard_s > SILENT_S
-
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
         """Return the state after a change of trains, and the reason of a refusal."""
         state, layout = self.centre.supervision.state, self.centre.supervision.layout
@@ -181,7 +172,8 @@ class OrderDesk:
                     return state, value
             place: Any = {"rear_m": ends[0], "front_m": ends[1], "track": track, "direction": direction}
             if of == "correct":
-                return correct_interval(state, train, layout, **place, silent=self.is_silent(train))
+                lapsed = self.centre.supervision.has_lapsed(train, self.centre.clock())
+                return correct_interval(state, train, layout, **place, lapsed=lapsed)
             length = metres_of(values, "length_m")
             if isinstance(length, str):
                 return state, length

@@ -61,8 +61,9 @@ class TrainInterval:
     reported_m: tuple[float, float] | None = None
     contradiction: str | None = None
     held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
-    #: Its reports have named an authority, and no order to brake since: it may run on by what it was granted.
-    unbraked: bool = False
+    #: Number of the newest authority by which it may run, sent or named by a report; None before the first, and once a
+    #: report names an order to brake of that number or a later one: none that is still on the way ends that order.
+    runs_by: int | None = None
     stop: str | None = None  #: Why the train is stopped, until it is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
     asked_number: int = 0  #: Number of the first authority that requests it.
@@ -187,12 +188,12 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
     InputFileError: when an older version wrote them.
     """
     head = json.loads(texts[HEAD] or "")
-    if "bars" not in head:
-        raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
     trains, points = {}, {}
     for name, text in texts.items():
         if name.startswith(_TRAIN):
             values = json.loads(text or "")
+            if values.keys() != {field.name for field in fields(TrainInterval)}:
+                raise InputFileError("the centre's database", "is of another version of railfix; name another database")
             tracks = {int(station): track for station, track in values.pop("tracks").items()}
             reported = values.pop("reported_m")
             trains[int(name.removeprefix(_TRAIN))] = TrainInterval(
