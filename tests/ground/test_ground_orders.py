@@ -449,7 +449,7 @@ def test_an_interval_is_corrected_once_every_authority_has_lapsed(desk: Desk) ->
     desk.steps(3.0)
     assert desk.twice("correct-train", values) is None
     unit.note_report(desk.sequence, desk.now)
-    assert not unit.receive(authority)  # it answers a report of more than 15 s ago
+    assert not unit.receive(authority)  # it answers a report of more than 45 s ago
 
 
 def test_a_train_is_entered_anywhere_and_removed(desk: Desk) -> None:

@@ -188,12 +188,14 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
     InputFileError: when an older version wrote them.
     """
     head = json.loads(texts[HEAD] or "")
+    names = {field.name for field in fields(TrainInterval)}
+    of_trains = [json.loads(text or "").keys() for name, text in texts.items() if name.startswith(_TRAIN)]
+    if "bars" not in head or any(found != names for found in of_trains):
+        raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
     trains, points = {}, {}
     for name, text in texts.items():
         if name.startswith(_TRAIN):
             values = json.loads(text or "")
-            if values.keys() != {field.name for field in fields(TrainInterval)}:
-                raise InputFileError("the centre's database", "is of another version of railfix; name another database")
             tracks = {int(station): track for station, track in values.pop("tracks").items()}
             reported = values.pop("reported_m")
             trains[int(name.removeprefix(_TRAIN))] = TrainInterval(

@@ -43,7 +43,7 @@ ROUTE_AHEAD_M = 700.0
 AUTHORITY_S = 1.0
 #: Numbers of authorities that are skipped at a start: more than an older copy of the database can be behind.
 SKIPPED: Final = 1 << 32
-#: An authority has lapsed on board this long after the report that it answers, at most `OnBoardLimits.fresh_s` [s].
+#: An authority has lapsed on board this long after the report that it answers: longer than `LONGEST_FRESH_S` [s].
 LAPSED_S: Final = 60.0
 #: Largest drift between clocks of a train and of the centre.
 CLOCK_DRIFT: Final = 1e-4
