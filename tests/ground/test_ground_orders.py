@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -499,6 +500,46 @@ def test_no_authority_into_a_section_of_vehicles_that_report_nothing(desk: Desk)
     assert desk.state.bars == {("West to Mid", OCCUPIED), ("West to Mid", UNKNOWN)}
     assert desk.orders["detect-section"]({"section": "West to Mid", "occupied": False}) is None
     assert desk.state.bars == set()
+
+
+def test_a_detection_that_falls_silent_leaves_its_section_unknown(desk: Desk) -> None:
+    """One that repeats its answer keeps the section free; 10 s after the last answer nothing is granted into it."""
+    desk.centre.supervision.answered_s["Mid to East"] = -math.inf
+    desk.centre.supervision.set_section_detected("Mid to East", None)
+    free = {"section": "Mid to East", "occupied": False}
+    assert desk.orders["route"]({"train": 2}) == "Mid to East is unknown to its detection"
+    for _ in range(4):
+        assert desk.orders["detect-section"](free, "axle counter") is None
+        desk.steps(8.0)
+    assert desk.state.bars == set()
+    assert sum("axle counter" in line for line in desk.centre.lines) == 1
+    desk.steps(3.0)
+    assert desk.state.bars == {("Mid to East", UNKNOWN)}
+    assert desk.orders["route"]({"train": 2}) == "Mid to East is unknown to its detection"
+    assert desk.orders["detect-section"](free, "axle counter") is None
+    assert desk.orders["route"]({"train": 2}) is None
+
+
+def test_no_authority_leaves_the_area(desk: Desk) -> None:
+    """A train passes to another area by orders, where it stands: no route and no authority leads out of the last
+    station, a place beyond it stops the train, and the track it is removed from stays occupied until it is seen free.
+    """
+    front_m = 5500.0
+    values = {
+        "train": 9, "length_m": 100, "rear_m": 5390, "front_m": front_m, "direction": 1, "track": 1, "reason": "enters",
+    }  # fmt: skip
+    assert desk.twice("enter-train", values) is None
+    desk.report(9, front_m, length_cm=10_000)
+    assert desk.orders["release-train"]({"train": 9}, "anna") is None
+    desk.report(9, front_m, length_cm=10_000)
+    desk.steps(2.0)
+    assert desk.orders["route"]({"train": 9}) == "there is no station ahead"
+    assert desk.state.trains[9].end_m <= LINE.stations[-1].end_m
+    assert desk.twice("enter-train", {**values, "train": 10, "rear_m": 5590, "front_m": 5700}) is not None
+    desk.report(9, 5640.0, length_cm=10_000)
+    assert desk.state.trains[9].stop == "the position is not on the line: 5640 m"
+    assert desk.twice("remove-train", {"train": 9, "reason": "in the other area"}) is None
+    assert {name for name, kind in desk.state.bars if kind == OCCUPIED} >= {"East track 1"}
 
 
 def test_trains_are_divided_and_joined(desk: Desk) -> None:

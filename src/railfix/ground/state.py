@@ -29,6 +29,8 @@ class InterlockingLimits(Settings):
     #: The field answers a request for the detection of points within this time; otherwise the trains on them are
     #: stopped.
     answer_s: float = Field(default=10.0, gt=0)
+    #: The detection of a section answers at least this often; otherwise the section is unknown.
+    detection_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration, between two reports with speeds.
     acceleration_mps2: float = Field(default=2.0, gt=0)

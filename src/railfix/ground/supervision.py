@@ -74,8 +74,10 @@ class Supervision:
     begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
     #: Trains that must report before anything is granted (`begin_again`).
     awaited: set[int] = field(default_factory=set)
-    #: Sections that are detected as occupied; None: not answered yet.
+    #: Sections that are detected as occupied; None: not answered yet, or too long ago.
     detected: dict[str, bool | None] = field(default_factory=dict)
+    #: When the detection of a section has answered last [s], of those that have to repeat it.
+    answered_s: dict[str, float] = field(default_factory=dict)
 
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
     _asked_s: dict[PointName, float] = field(default_factory=dict)
@@ -168,9 +170,11 @@ class Supervision:
         self._asked_s = dict.fromkeys(points, now_s)
         return tuple(points)
 
-    def set_section_detected(self, section: str, occupied: bool | None) -> None:
+    def set_section_detected(self, section: str, occupied: bool | None, now_s: float = -math.inf) -> None:
         """Process the detection of a section; None where it is unknown."""
         self.detected[section] = occupied
+        if section in self.answered_s:
+            self.answered_s[section] = now_s
         cleared = SWEPT if occupied is False else {UNKNOWN}
         bars = {bar for bar in self.state.bars if bar[0] != section or bar[1] not in cleared}
         unknown = {(section, UNKNOWN)} if occupied is None else set()
@@ -222,6 +226,9 @@ class Supervision:
 
         An order is repeated every `AUTHORITY_S` until a report of the train names it.
         """
+        for section, at_s in self.answered_s.items():
+            if now_s - at_s > self.limits.detection_s and self.detected[section] is not None:
+                self.set_section_detected(section, None)
         self.state = overlaps_stopped(parted_cleared(self.state), self.layout)
         self.state = occupied_detected(self.state, self.layout, [n for n, found in self.detected.items() if found])
         for point, asked_s in list(self._asked_s.items()):
