@@ -93,8 +93,8 @@ def monitor(
     out = choices.out
     if out.exists():
         inputs = [*(Path(log) for log in logs), *choices.nav]
-        files = ((out / "monitor.csv", "any"), (out / "triangle.png", "any"))
-        check_outputs(*files, overwrite=choices.overwrite == "replace", inputs=inputs)
+        overwrite = choices.overwrite == "replace"
+        check_outputs((out / "monitor.csv", "any"), (out / "triangle.png", "any"), overwrite=overwrite, inputs=inputs)
     if len(choices.point) not in (0, 3):
         raise SettingsError(f"--point was given {len(choices.point)} times; give it once for each receiver")
     if choices.live and choices.fixes:

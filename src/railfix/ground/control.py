@@ -392,4 +392,7 @@ class ControlCentre:
 
 def list_orders(centre: ControlCentre) -> dict[str, Order]:
     """Return the orders of the page by name."""
-    return OrderDesk(centre=centre).orders()
+    desk = OrderDesk(
+        supervision=centre.supervision, clock=centre.clock, log=centre.log, release=centre.release, stop=centre.stop
+    )
+    return desk.orders()

@@ -10,18 +10,15 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from railfix.ground.centre import TrainState
 from railfix.ground.changes import correct_interval, divide_train, enter_train, join_trains, remove_train
 from railfix.ground.layout import MOST_PARTS
 from railfix.ground.state import Interlocking, Restriction
 from railfix.ground.stops import CLOSED, OCCUPIED, close_section, open_section, release_train
+from railfix.ground.supervision import Supervision
 from railfix.ground.web import Order
-
-if TYPE_CHECKING:
-    from railfix.ground.control import ControlCentre
-    from railfix.ground.supervision import Supervision
 
 #: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
@@ -47,16 +44,15 @@ def metres_of(values: Values, *names: str) -> list[float] | str:
 
 @dataclass(kw_only=True)
 class OrderDesk:
-    """Orders of one centre."""
+    """Orders of one centre (`railfix.ground.control.ControlCentre`)."""
 
-    centre: ControlCentre
+    supervision: Supervision
+    clock: Callable[[], float]  #: Centre's clock [s].
+    log: Callable[..., None]  #: Writes a line of the log.
+    release: Callable[[], str | None]  #: Releases a stop of all trains.
+    stop: Callable[[int | None], str | None]  #: Stops a train, or every train with None.
     #: Orders that have been given once, by name and values: time and author.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
-
-    @property
-    def supervision(self) -> Supervision:
-        """Supervised trains."""
-        return self.centre.supervision
 
     def given(self, name: str, order: Callable[[Values, str], str | None], values: Values, by: str = "") -> str | None:
         """Carry an order out, with a line in the log; return the reason of a refusal."""
@@ -65,12 +61,12 @@ class OrderDesk:
         outcome = "done" if reason is None else f"refused: {reason}"
         train = values.get("train")
         who = by or "the page"
-        self.centre.log(f"order of {who}: {name} {shown}: {outcome}", train=train if type(train) is int else None)
+        self.log(f"order of {who}: {name} {shown}: {outcome}", train=train if type(train) is int else None)
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
         """Return None where an order is the second one, in time; otherwise the next step."""
-        key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.centre.clock(), AGAIN_S
+        key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:
             least_s = 0.0 if asked[1] != by else least_s
@@ -85,7 +81,7 @@ class OrderDesk:
     def asked_s(self, name: str, values: Values) -> float:
         """Return when an order was given the first time, now where it was not [s]."""
         key = f"{name} {json.dumps(values, sort_keys=True)}"
-        return self._asked.get(key, (self.centre.clock(), ""))[0]
+        return self._asked.get(key, (self.clock(), ""))[0]
 
     def release_train(self, values: Values, by: str) -> str | None:
         """Release the stop of a train; as nothing confirms the position of a silent train, its release is ordered
@@ -147,7 +143,7 @@ class OrderDesk:
                     return state, value
             place: Any = {"rear_m": ends[0], "front_m": ends[1], "track": track, "direction": direction}
             if of == "correct":
-                lapsed = self.supervision.has_lapsed(train, self.centre.clock())
+                lapsed = self.supervision.has_lapsed(train, self.clock())
                 return correct_interval(state, train, layout, **place, lapsed=lapsed)
             length = metres_of(values, "length_m")
             if isinstance(length, str):
@@ -200,8 +196,8 @@ class OrderDesk:
             return "occupied: true, false or null was expected"
         if self.supervision.detected.get(name, "not yet") != occupied:
             word = {True: "occupied", False: "free", None: "unknown"}[occupied]
-            self.centre.log(f"detection of {by or 'the page'}: {name} is {word}")
-        self.supervision.set_section_detected(name, occupied, self.centre.clock())
+            self.log(f"detection of {by or 'the page'}: {name} is {word}")
+        self.supervision.set_section_detected(name, occupied, self.clock())
         return None
 
     def restrict(self, values: Values, by: str) -> str | None:
@@ -233,7 +229,7 @@ class OrderDesk:
 
     def orders(self) -> dict[str, Order]:
         """Return the orders by name; each is called with its values and its author."""
-        centre, supervision = self.centre, self.supervision
+        supervision = self.supervision
 
         def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:
             def given(values: Values, _: str) -> str | None:
@@ -252,11 +248,11 @@ class OrderDesk:
             "free-section": partial(self.section, of="free"),
             "restrict": self.restrict,
             "confirm-start": self.confirm_start,
-            "release": lambda _values, _by: centre.release(),
+            "release": lambda _values, _by: self.release(),
             "route": of_train(supervision.set_route),
             "route-back": of_train(supervision.ask_route_back),
-            "stop": of_train(centre.stop),
-            "stop-all": lambda _values, _by: centre.stop(None),
+            "stop": of_train(self.stop),
+            "stop-all": lambda _values, _by: self.stop(None),
             "release-train": self.release_train,
             "correct-train": changing("correct", "the train is inside that interval, and stands"),
             "enter-train": changing("enter", "the train is inside that interval, and stands"),
