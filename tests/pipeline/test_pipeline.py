@@ -32,10 +32,10 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.errors import SettingsError
 from railfix.core.reasons import POSITIONED, Reason, Status
 from railfix.core.timescale import timedelta
-from railfix.gnss.navigation import no_navigation
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.received import no_navigation
 from railfix.run.processor_setup import make_processor
 
 #: Epochs a chunk, and epochs of the log.
