@@ -1,7 +1,7 @@
 """Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
 
 ``python tests/studies/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
-``docs/level-results.md``: faults, maps, sigmas, priors, sides.
+``docs/level-results.md``: faults, maps, sigmas, priors, sides, ahead.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from railfix.core.timescale import seconds
 from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.integrity.protection import LevelStatus
+from railfix.integrity.protection import LevelStatus, RiskBudget
 from railfix.io import read_navigation, read_observations
+from railfix.kernels.tracking.constants import AHEAD
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
@@ -257,12 +258,35 @@ def side_rows() -> Iterator[str]:
             )
 
 
+def late_ahead_rows() -> Iterator[str]:
+    """Levels with the satellites beside the track as sides, or also those ahead and behind; codes ahead late or not."""
+    yield "log    late_sides   codes ahead   levels %   median [m]   largest error [m]   over"
+    for name, case in cases().items():
+        plain = case.solved()
+        section = np.maximum(plain.fix.constrained.section, 0)
+        off_heading = np.radians(plain.azimuth_deg - case.trajectory.heading_deg[section][:, None])
+        ahead = np.cos(off_heading) * np.cos(np.radians(plain.elevation_deg)) > AHEAD
+        for sides in ("beside", "all"):
+            for late_m in (0.0, 15.0, 30.0):
+                result = case.solved(
+                    SETTINGS.model_copy(update={"risk": RiskBudget(late_sides=sides)}), bias_m=late_m * ahead
+                )
+                level, calm = bounds(result)
+                error, known = case.errors(result)[1], np.isfinite(level)
+                yield (
+                    f"{name:6s} {sides:>10s} {f'{late_m:g} m late':>13s} {100.0 * known.mean():10.1f}"
+                    f" {np.median(level[known]):12.2f} {np.nanmax(error[known]):19.1f}"
+                    f" {int((calm & (error > level)).sum()):6d}"
+                )
+
+
 PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "faults": fault_rows,
     "maps": map_rows,
     "sigmas": sigma_rows,
     "priors": prior_rows,
     "sides": side_rows,
+    "ahead": late_ahead_rows,
 }
 
 

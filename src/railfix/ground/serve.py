@@ -7,6 +7,7 @@ import contextlib
 import gc
 import ipaddress
 import json
+import math
 import signal
 import time
 from collections.abc import Callable, Coroutine, Mapping
@@ -96,11 +97,11 @@ class CentreFile(Settings):
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Stations of the line, in order of chainage.
-    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection: unknown until it answers, by the order
-    #: ``detect-section``.
+    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection, which answers by the order
+    #: ``detect-section`` at least every `InterlockingLimits.detection_s`: unknown without.
     detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
-    #: Where they are at the first start; afterwards the database knows.
+    #: Initial stations of the trains; later starts read them from the database.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"  #: File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
     log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.
@@ -307,6 +308,7 @@ def _centre(
         ask=points.ask,
     )
     for section in settings.detected_sections:
+        supervision.answered_s[section] = -math.inf
         supervision.set_section_detected(section, None)
     return control, links
 

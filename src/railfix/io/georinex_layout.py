@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.errors import check_type
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.observations_lines import KINDS, find_signal
@@ -34,6 +35,7 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
     """
     import xarray as xr
 
+    check_type(observations, Observations, "observations")
     satellites, row = np.unique(observations.satellite, return_inverse=True)
     shape = (len(observations), len(satellites))
     variables: dict[str, Any] = {}
@@ -89,6 +91,9 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
         The dataset has no observation types over ``time`` and ``sv``, an unknown time system, or times
         that do not rise.
     """
+    import xarray as xr
+
+    check_type(data, xr.Dataset, "data")
     types = [str(name) for name in data.data_vars if _TYPE.fullmatch(str(name))]
     if not types:
         raise ValueError("the dataset has no observation types such as C1C; georinex.load of an observation file has")

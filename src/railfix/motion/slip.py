@@ -1,7 +1,7 @@
 r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
 
-``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; otherwise it
-becomes one that no line has. Two rules:
+``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch while the wheel rolls; with slip it
+takes values that no line has. Two rules:
 
 * ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
   slip, not its speed. It is silent at constant slip speed, so that most of a long slide stays in the distance.

@@ -36,11 +36,11 @@ _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
 _LEAVE_BESIDE_COST: Final = 10.0
 _ENTER_BESIDE_COST: Final = 7.0
-#: And the same of a position that lies farther than this beyond an end of a track at which the map ends [m].
+#: Distance beyond a track end at which the map ends, above which the same applies to a position [m].
 _OPEN_COST: Final = 2.0
 _BEYOND_M: Final = 10.0
 _ROUNDED_M: Final = 1e-6
-#: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
+#: Length by which a connection may exceed the straight distance of two positions [m], and fraction of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Difference of path length and distance at which a joint is half as probable as where they agree [m].
@@ -119,8 +119,11 @@ class Transitions:
         share[:m, -1] = np.where(self._opens[k], np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
         share[-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
+        # a train that has passed an open end, or comes to one, is on a track that the map lacks; as it begins on one
+        # with `UNMAPPED_PRIOR`, leaving has that factor, too, and a run and its return are equally probable
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
-        share[m:-1, :m] = np.exp(-_ENTER_BESIDE_COST)
+        share[:m, m:-1][self._opens[k]] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
+        share[m:-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():

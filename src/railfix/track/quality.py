@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Floats, Masks
+from railfix.core.errors import check_type
 from railfix.core.settings import Settings
-from railfix.core.tables import plural
+from railfix.core.tables import NotebookTable, plural
 from railfix.track.track import HEIGHTS_M, Geometry, Track, compute_geometry, kilometrage_breaks, mean_gradients
 
 Severity = Literal["error", "warning"]
@@ -65,8 +66,8 @@ class Finding:
     sentence: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackQuality:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class TrackQuality(NotebookTable):
     """Quality report of a track map."""
 
     track: Track
@@ -87,6 +88,7 @@ class TrackQuality:
 
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
     """Check the quality of a map that was read with ``duplicates="keep"``: duplicates are findings and no error."""
+    check_type(track, Track, "track")
     limits = limits or MapLimits()
     geometry = compute_geometry(track)
     findings = [
