@@ -252,6 +252,16 @@ def test_a_reason_alone_is_counted_apart_from_one_among_others() -> None:
     assert told["observations_rejected_by_one_reason_alone"] == {"elevation_mask": 1, "cn0_floor": 2}
 
 
+@pytest.mark.requirement("B7")
+def test_a_rate_is_of_the_epochs_with_observations_and_ok_of_that_status_alone() -> None:
+    tally = AntennaTally()
+    statuses = [Status.OK, Status.MAP_OFFSET, Status.MAP_OFFSET, Status.TOO_FEW_SATELLITES, Status.NO_OBSERVATION]
+    tally.add(result_of([[0]] * 5, ["G01"], statuses))
+    told = tally.as_dict()
+    assert (told["epochs"], told["epochs_with_observations"]) == (5, 4)
+    assert told["ok_rate"] == 0.25
+
+
 @pytest.mark.requirement("B6")
 def test_span_and_offset_of_the_map_are_of_all_chunks() -> None:
     """Of the map the window that contradicts it most, and the least and the largest that any finds."""
