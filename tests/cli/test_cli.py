@@ -168,6 +168,19 @@ finally:
     assert done.stderr.strip() == "[]"
 
 
+@pytest.mark.requirement("G5")
+@pytest.mark.parametrize(("words", "code"), [("map check", 3), ("map network", 3), ("doctor", 5)])
+def test_a_geopackage_without_the_extra_for_maps_names_it(
+    words: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyogrio", None)
+    (tmp_path / "line.gpkg").write_bytes(b"SQLite format 3\0")
+    result = RUNNER.invoke(app, [*words.split(), str(tmp_path / "line.gpkg")])
+    assert result.exit_code == code, result.output
+    sentence = "line.gpkg: is a GeoPackage, which pyogrio and shapely read; install it with: pip install 'railfix[maps]"
+    assert sentence in " ".join((result.stderr + result.stdout).split())
+
+
 @pytest.mark.requirement("G4")
 def test_a_package_of_an_extra_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cbor2", None)
