@@ -177,7 +177,7 @@ def test_a_geopackage_without_the_extra_for_maps_names_it(
     (tmp_path / "line.gpkg").write_bytes(b"SQLite format 3\0")
     result = RUNNER.invoke(app, [*words.split(), str(tmp_path / "line.gpkg")])
     assert result.exit_code == code, result.output
-    sentence = "line.gpkg: is a GeoPackage, which pyogrio and shapely read; install it with: pip install 'railfix[maps]"
+    sentence = "line.gpkg: is a GeoPackage, which pyogrio and shapely read; install it with: pip install 'railfix[maps"
     assert sentence in " ".join((result.stderr + result.stdout).split())
 
 
