@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -157,6 +158,7 @@ def test_an_error_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_manual_needs_no_array_library() -> None:
     program = """
 import sys
+from pathlib import Path
 from railfix.__main__ import main
 sys.argv = ["railfix", "--help"]
 try:
