@@ -142,10 +142,10 @@ def test_features_of_a_map_are_where_the_line_bends() -> None:
 def test_features_are_the_same_at_any_spacing_of_the_map(
     spacing_m: float, start_m: float, radii: str, transition_m: float
 ) -> None:
-    """Four transitions, or none, between straight and radii of 300 m, and three vertical curves of 15 to 60 m."""
+    """Four transitions to 300 m radius, or curves of 120 m without any, and three vertical curves of 15 to 60 m."""
     middles = np.array([150.0, 330.0, 510.0, 690.0])
     breaks = np.array([0.0, *np.sort([*(middles - transition_m / 2.0), *(middles + transition_m / 2.0)]), 840.0])
-    bends = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]) / 300.0
+    bends = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]) / (300.0 if transition_m > 1.0 else 120.0)
     grid = np.linspace(0.0, 840.0, 84_001)
     heading = cumulative_simpson(np.interp(grid, breaks, bends), x=grid, initial=0.0)
     gradient = np.interp(
