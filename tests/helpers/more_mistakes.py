@@ -215,7 +215,7 @@ MORE: Final[dict[str, Mistake]] = {
     ),
     # -- maps from positions
     "one_position": ({"s.csv": _TIMED + "2024-05-01T08:00:00,48,11,500\n"}, _MAP, 7, "1 of 1 positions left, a track"),
-    "standing_still": ({"s.csv": _rows("48,11,500")}, _MAP, 3, "(30 standing still)"),
+    "standing_still": ({"s.csv": _rows("48,11,500")}, _MAP, 7, "(30 standing still)"),
     "beyond_the_pole": ({"s.csv": _rows("91.k,11,500")}, _MAP, 3, "latitude_deg 91"),
     "time_backwards": (
         {"s.csv": _rows("48.k,11,500", 59, -1).replace("08:00:5", "10:00:5")}, _MAP, 3, "the time is before that of",
