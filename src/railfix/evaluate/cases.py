@@ -69,7 +69,7 @@ class CaseFile(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A case with its files where they are."""
+    """A case with the paths of its files."""
 
     name: str  #: Name of its folder.
     folder: Path

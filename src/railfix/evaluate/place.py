@@ -135,8 +135,7 @@ SAME_MAP_M: Final = 1.0
 SAME_TRAJECTORY_M: Final = 0.01
 #: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: A distance along the line that exceeds twice the error by this much leads to another pass, and is no chord of a curve
-#: [m].
+#: Excess of the distance along the line over twice the error, above which it belongs to another pass of the line [m].
 _ANOTHER_PASS_M: Final = 50.0
 #: Rounding of chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3

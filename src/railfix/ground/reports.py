@@ -19,7 +19,7 @@ from railfix.ground.layout import Layout
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
-#: Difference of a reported length from the configured one that is rounding [m].
+#: Largest rounding difference between a reported and the configured length [m].
 LENGTH_ROUNDING_M: Final = 0.02
 #: Largest speed of a standing train; and against the facing, beyond which a train rolls back [m/s].
 STANDING_MPS: Final = 0.5

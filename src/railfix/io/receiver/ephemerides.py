@@ -196,7 +196,7 @@ class _EphemerisBuilder:
                 self.issue(self._glonass(satellite, after, within=_FRAME_S), after)
 
     def issue(self, record: Record | None, time: np.datetime64) -> None:
-        """Append a record, unless it is the satellite's last one of that message again or cannot be."""
+        """Append a record unless it repeats the satellite's last one of that message or is implausible."""
         if record is None:
             return
         raw, issue = record
