@@ -111,9 +111,7 @@ def read_case(folder: Path) -> Case:
 
 
 def read_cases(folder: Path) -> list[Case]:
-    """Read the cases in the subfolders of a folder, or the one in the folder itself, in order of their names
-    (`read_case`).
-    """
+    """Read the cases in the subfolders of a folder, or the one in the folder itself, by name (`read_case`)."""
     if not folder.is_dir():
         raise InputFileError(folder, "there is no such folder; expected one of folders with a case.toml")
     folders = (

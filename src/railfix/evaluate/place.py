@@ -185,9 +185,7 @@ def compute_errors(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Return the errors of one antenna, by chainage where run and reference share a map within `SAME_MAP_M`, otherwise
-    along the trajectory.
-    """
+    """Return one antenna's errors, by chainage on a shared map (`SAME_MAP_M`), else along the trajectory."""
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
     turn = run.turn_m(antenna)
@@ -286,9 +284,7 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory of a run's positions, its files and notes; MismatchError: the positions do not lie on the
-    line.
-    """
+    """Return the trajectory of a run's positions, files and notes; MismatchError: the positions are off it."""
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:

@@ -341,9 +341,7 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """At rest the force is the component of gravity; when released it falls toward zero, and the change is the
-        motion.
-        """
+        """At rest the force is the component of gravity; its fall toward zero at release is the motion."""
         limits = self.limits
         if self.state == MotionState.STANDING and self._silent < _STANDING_S + _SETTLING_S:
             self._rest = force

@@ -176,9 +176,7 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the equilibrium probabilities of the states of an urn, and its transition matrix after a time, from row to
-    column.
-    """
+    """Return an urn's equilibrium probabilities and transition matrix after a time, from row to column."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)

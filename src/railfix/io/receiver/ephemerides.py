@@ -51,9 +51,7 @@ _FRAME_S: Final = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """Subframes of unfinished records: `latest` identifies the last record (`issued`); `waiting` are GLONASS
-    satellites.
-    """
+    """Unfinished records: `latest` identifies the last record (`issued`); `waiting` are GLONASS satellites."""
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
