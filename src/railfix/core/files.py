@@ -122,13 +122,19 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of texts; ValueError where none is given, SettingsError: not a path."""
+    """Return one or several paths as a list of texts; SettingsError where none is given, or it is not a path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
-        raise ValueError("no file was given")
+        raise SettingsError("no file was given")
     if wrong := [name for name in names if not isinstance(name, str | PathLike)]:
         raise SettingsError(f"a path, or several, were expected, got {type(wrong[0]).__name__}")
     return [str(name) for name in names]
+
+
+def check_path(path: object, *, what: str = "a path") -> None:
+    """Raise SettingsError where a value is not a path; `what` names what was expected."""
+    if not isinstance(path, str | PathLike):
+        raise SettingsError(f"{what} was expected, got {type(path).__name__}")
 
 
 def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:
@@ -255,9 +261,7 @@ def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[s
 
 
 def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file; `what` names the expected kind of file with its article ("the record of a
-    run").
-    """
+    """Return the object in a JSON file; `what` names the expected kind, with its article ("the record of a run")."""
     try:
         content = json.loads(read_text(path))
     except RecursionError:
@@ -362,7 +366,7 @@ def hatanaka_program(name: str) -> AbstractContextManager[Path]:
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the decoder on an open source and take ownership of the resources in `held`."""
+    """Start the decoder on an open source; it owns the resources in `held` from then on."""
     if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:

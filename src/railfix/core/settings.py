@@ -13,7 +13,8 @@ import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import FilePath, write_whole
+from railfix.core.files import FilePath, check_path, write_whole
+from railfix.core.tables import html_table
 
 
 def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
@@ -53,6 +54,9 @@ class Settings(BaseModel):
                 f"{type(self).__name__} cannot be changed; make another one: settings.replaced({name}={value!r})"
             )
 
+        def __delattr__(self, name: str) -> None:
+            raise SettingsError(f"{type(self).__name__} cannot be changed; Config().replaced() keeps all settings")
+
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Yield the settings that differ from their defaults, of which some are computed from the settings before."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
@@ -60,6 +64,11 @@ class Settings(BaseModel):
             value = values[name]
             if field.is_required() or value != field.get_default(call_default_factory=True, validated_data=values):
                 yield name, value
+
+    def _repr_html_(self) -> str:
+        rows = [{"setting": str(name), "value": repr(value)} for name, value in self.__repr_args__()]
+        of = f"{len(rows)} of {len(type(self).model_fields)} settings are not the defaults"
+        return html_table(rows, caption=f"{type(self).__name__}: {of}")
 
     @field_validator("*", mode="before")
     @classmethod
@@ -75,9 +84,11 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _one_word_for_a_list(cls, value: Any, info: ValidationInfo) -> Any:
-        """Take words with commas between them for a list: ``systems=G``."""
-        if isinstance(value, str) and get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
-            return tuple(word.strip() for word in value.split(",") if word.strip())
+        """Take words with commas between them, or one path, for a list: ``systems=G``."""
+        if get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
+            if isinstance(value, str):
+                return tuple(word.strip() for word in value.split(",") if word.strip())
+            return (value,) if isinstance(value, Path) else value
         return value
 
     def replaced(self, **changes: Any) -> Self:
@@ -168,6 +179,7 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
 
     InputFileError: the file is missing, unreadable, not UTF-8, or not TOML.
     """
+    check_path(path, what=f"the path of {what}")
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:

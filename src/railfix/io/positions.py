@@ -10,7 +10,7 @@ import numpy as np
 
 from railfix.core.arrays import take_rows
 from railfix.core.errors import InputFileError, NoPositionError, SettingsError
-from railfix.core.files import BrokenLines, FilePath
+from railfix.core.files import BrokenLines, FilePath, check_path
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.tables import plural
 from railfix.core.timescale import from_week, utc_to_gpst
@@ -138,6 +138,7 @@ def read_positions(
     SettingsError
         `columns` names a column that railfix does not know, or the file is no table.
     """
+    check_path(path)
     kind = find_kind(path)
     if columns and kind != "table":
         raise SettingsError(f"{path}: columns can be renamed in a table with named columns only")

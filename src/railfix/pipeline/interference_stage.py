@@ -13,6 +13,7 @@ from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, M
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.epoch_rows import join_epochs, take_epochs
 from railfix.core.reasons import Reason, Status
+from railfix.core.tables import NotebookTable
 from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.interference import (
     CAUSES,
@@ -84,8 +85,8 @@ class InterferenceState:
     latest: Interference | None = None  #: Of that epoch.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Interference:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Interference(NotebookTable):
     """Interference of T epochs."""
 
     causes: Bits  #: `Sign` bits, each for as long as its time of release; shape (T,).
@@ -131,9 +132,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites that are wrong individually, not by a spoofer who moves all satellites of a clock; shape
-    (T, K).
-    """
+    """Return the satellites that are wrong individually, not by a spoofer of a whole clock; shape (T, K)."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:

@@ -22,6 +22,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, kern
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.core.settings import Settings
+from railfix.core.tables import NotebookTable
 from railfix.core.timescale import nearest_rows
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.corrected import AntennaRanges
@@ -32,8 +33,8 @@ Limits = TypeVar("Limits", bound=Settings)
 LEAST_SUSPICION: Final = 2.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Screened:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Screened(NotebookTable):
     """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions."""
 
     metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot be run.

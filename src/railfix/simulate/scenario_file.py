@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import FilePath
+from railfix.core.files import FilePath, check_path
 from railfix.core.settings import read_toml, validate
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
@@ -103,6 +103,7 @@ def load_recipe(name: FilePath) -> Recipe:
     InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a recipe is not one (names
     twice, other keys); settings of a run are checked by `Recipe.scenario`.
     """
+    check_path(name, what="a path or the name of a shipped scenario")
     path = find_scenario(name)
     table = read_toml(path, what="a scenario file")
     description = str(table.pop("description", ""))
