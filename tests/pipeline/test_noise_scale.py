@@ -20,7 +20,8 @@ from railfix.pipeline.result_tables import antenna_positions
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, noise_scale, robust_fit
+from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, noise_scale
+from railfix.positioning.robust_fit import robust_fit
 from railfix.simulate.demonstration import demo_files
 
 

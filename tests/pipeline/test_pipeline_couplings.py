@@ -27,7 +27,7 @@ from railfix.pipeline.results import AntennaResult
 from railfix.positioning import inter_system, line_fix, receiver_noise
 from railfix.positioning.approximate import ApproximatePosition
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import RobustFit
+from railfix.positioning.robust_fit import RobustFit
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
 

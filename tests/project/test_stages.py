@@ -29,7 +29,7 @@ from railfix import (
 )
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.positioning.receiver_noise import LastingErrorLimits
+from railfix.integrity.persistent_biases import LastingErrorLimits
 from railfix.track import Track, from_positions
 from railfix.track.point_files import write_track_csv
 

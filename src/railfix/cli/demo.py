@@ -18,7 +18,7 @@ from railfix.cli.console import (
     show_table,
 )
 from railfix.cli.options import OverwriteOption, VerboseOption, overwriting
-from railfix.core.tables import plural
+from railfix.core.notebook import plural
 from railfix.evaluate import Evaluation
 from railfix.evaluate.tables import error_tables
 from railfix.pipeline.config import Config

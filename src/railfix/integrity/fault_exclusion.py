@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,14 +17,13 @@ from railfix.integrity.raim import (
     detect,
     exclude,
     linear_model,
-    reliability,
     worst_channel,
 )
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.line_fix import FixLimits, LineFix, fix_on_line, refit_epochs
 from railfix.positioning.normal_equations import point_position
 from railfix.positioning.range_arrays import Ranges, without
-from railfix.positioning.receiver_noise import robust_on_line
+from railfix.positioning.robust_fit import robust_on_line
 from railfix.positioning.search_index import SearchIndex
 
 
@@ -176,9 +175,3 @@ def _second_attempt(
     return exclude(
         linear_model(all_ranges, index, solved.arc_m, section=solved.section), limits=limits, scale=scale[epochs]
     )
-
-
-def add_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, *, limits: RaimLimits) -> RaimResult:
-    """Return the RAIM result with P4's protection level, where the position contains no fault."""
-    level = reliability(model, limits=limits, scale=scale).protection_level_m
-    return replace(raim, protection_level_m=np.where(raim.faulty, np.nan, level))

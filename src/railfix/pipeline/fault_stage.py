@@ -23,12 +23,8 @@ from railfix.positioning.line_fix import LineFix
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.normal_equations import misfit
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import (
-    NoiseState,
-    RobustFit,
-    noise_scale,
-    robust_on_line,
-)
+from railfix.positioning.receiver_noise import NoiseState, noise_scale
+from railfix.positioning.robust_fit import RobustFit, robust_on_line
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.

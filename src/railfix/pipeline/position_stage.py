@@ -16,9 +16,8 @@ from railfix.core.arrays import Codes, Floats, Masks, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status
-from railfix.integrity.fault_exclusion import add_p4_level
 from railfix.integrity.point_validation import validate_point
-from railfix.integrity.raim import LinearModel
+from railfix.integrity.raim import LinearModel, reliability
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.fault_stage import CheckedRanges, check_ranges, contradict_map
@@ -91,7 +90,8 @@ def position_stage(
     )  # fmt: skip
     raim = checked.raim
     if "raim" in config.screens and config.raim_protection == "on":
-        raim = add_p4_level(raim, model, scale, limits=config.raim)
+        level = reliability(model, limits=config.raim, scale=scale).protection_level_m
+        raim = copy_with(raim, protection_level_m=np.where(raim.faulty, np.nan, level))
     corrected = reject(corrected, raim.excluded, Reason.FAULT_EXCLUDED)
     checked = checked._replace(corrected=corrected, raim=raim)
     level, open_elsewhere = level_stage(checked, antennas, offset, config)

@@ -54,7 +54,7 @@ from railfix.screens import (
     ScreenSetup,
     in_order,
 )
-from railfix.screens.base import pair_antennas
+from railfix.screens.pairs import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line

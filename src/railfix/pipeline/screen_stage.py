@@ -18,7 +18,7 @@ from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import apply_verdict
 from railfix.pipeline.solution import Solution, with_coordinates
 from railfix.screens import FilteredMotion, PairedEpochs, Screened, ScreenSetup
-from railfix.screens.base import on_pairs
+from railfix.screens.pairs import on_pairs
 
 
 def screen_antennas(

@@ -23,7 +23,7 @@ from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_
 from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
 from railfix.positioning.normal_equations import SinglePoint, point_position
 from railfix.positioning.range_arrays import Ranges, weighted_ranges, without
-from railfix.positioning.receiver_noise import robust_fit
+from railfix.positioning.robust_fit import robust_fit
 from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_satellites
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 

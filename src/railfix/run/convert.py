@@ -19,7 +19,7 @@ import polars.selectors as cs
 
 from railfix import __version__
 from railfix.core.errors import InputFileError, NoPositionError, OutputError
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc, utc_to_gpst
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations

@@ -19,11 +19,7 @@ from railfix.screens.antenna_pair import (
 )
 from railfix.screens.antenna_spacing import AntennaSpacingLimits, antenna_spacing_screen
 from railfix.screens.base import (
-    FilteredMotion,
     ObservationScreen,
-    PairedEpochs,
-    PairScreen,
-    PositionScreen,
     RunTables,
     Screen,
     ScreenColumn,
@@ -31,8 +27,6 @@ from railfix.screens.base import (
     ScreenPicture,
     ScreenSetup,
     Verdict,
-    pair_channels,
-    pair_epochs,
     suspicion_sigma_m,
 )
 from railfix.screens.cn0 import Cn0Limits, Cn0Screened, cn0_screen
@@ -45,6 +39,7 @@ from railfix.screens.doppler import (
     doppler_screen,
 )
 from railfix.screens.elevation import ElevationLimits, elevation_screen
+from railfix.screens.pairs import FilteredMotion, PairedEpochs, PairScreen, PositionScreen, pair_channels, pair_epochs
 from railfix.screens.registry import SCREENS, in_order
 
 __all__ = [

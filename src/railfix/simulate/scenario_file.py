@@ -32,7 +32,8 @@ from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
-from railfix.core.settings import read_toml, validate
+from railfix.core.settings import validate
+from railfix.core.settings_files import read_toml
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario

@@ -5,25 +5,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from railfix.core.arrays import copy_with
+from railfix.core.arrays import Floats, Indices, Strings, copy_with
 from railfix.kernels.tracking import constants, layout
 from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Trace
 from railfix.tracking.chunk import Chunk, finish_chunk, prepare_chunk
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.packing import pack_parameters, pack_sensors, pack_state, unpack_state
 from railfix.tracking.result import Tracked, TrackStatus, new_results
-from railfix.tracking.search import Sought, begin, seek
-from railfix.tracking.smoother import Step
+from railfix.tracking.search import Sought, SplitHypothesis, begin, seek
 from railfix.tracking.state import TrackState
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+
+@dataclass(kw_only=True)
+class Step:
+    """One epoch of the filter with H hypotheses, as it was left."""
+
+    dt: float  #: Since the epoch before [s].
+    satellite: Strings  #: Shape (N - ix.SATELLITES,).
+    trace: Trace | None = None  #: Measurements and restarts; None without a hypothesis.
+    #: After the epoch; shapes (H, N), (H, N, N).
+    mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
+    #: Hypothesis of the epoch before; -1 where one began; shape (H,).
+    parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+    splits: list[SplitHypothesis | None] | None = None
 
 
 class Recursion:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, ParamSpec, cast
 
 import numpy as np
 
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import timedelta
 from railfix.report.plots.chart import (
     BLUE,
