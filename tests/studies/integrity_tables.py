@@ -36,9 +36,9 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.igg3_fit import map_information
 from railfix.positioning.normal_equations import normal_equations
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.robust_fit import map_information
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track

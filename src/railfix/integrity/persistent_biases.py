@@ -115,7 +115,7 @@ def reject_persistent_biases(
     error = _own_errors(model, noise, lasting.clipped)
     for turn in range(lasting.most_satellites):
         mean, sums[turn] = windows.sums(joined.widen(share * error, 0.0), sums[turn])
-        found = _find_worst(mean[:, : joined.present], ranges, lasting.share)
+        found = _find_worst(mean[:, : joined.present], ranges.weight > 0, lasting.share)
         if not found.any():
             continue
         found &= (without(ranges, found).redundancy >= _LEAST_FREEDOM)[:, None]
@@ -133,9 +133,8 @@ def reject_persistent_biases(
     return PersistentBiases(ranges, fix, model, left_out), after_states
 
 
-def _find_worst(mean: Floats, ranges: Ranges, share: float) -> Masks:
+def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
     """Return the used range of each epoch whose mean is the largest, where it is beyond the limit, shape (T, K)."""
-    used = ranges.weight > 0
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)

@@ -38,7 +38,7 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
     `noise_scale`: standard deviation of this receiver's ranges over the sigmas of the weights, shape (T,).
     """
     test = detect(
-        point.wsse, point.residual_m, ranges.n_used - ranges.n_clocks - 3, scale=noise_scale,
+        point.wsse, point.residual_m, ranges.space_redundancy, scale=noise_scale,
         limits=_of_residuals(limits),
     )  # fmt: skip
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))

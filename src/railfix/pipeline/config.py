@@ -33,12 +33,12 @@ from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
+from railfix.positioning.igg3_fit import RobustFitLimits
 from railfix.positioning.inter_system import ClockOffsetLimits
 from railfix.positioning.line_fix import FixLimits
 from railfix.positioning.map_offset import MapOffsetLimits
 from railfix.positioning.normal_equations import ConstrainedLimits, SinglePointLimits
 from railfix.positioning.receiver_noise import NoiseScaleLimits
-from railfix.positioning.robust_fit import RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.base_station import BaseLimits

@@ -2,6 +2,7 @@
 
 from .antenna_rows import AntennaRows
 from .approximate import ApproximatePosition, approximate_position
+from .igg3_fit import RobustFit, RobustFitLimits, robust_fit, robust_on_line
 from .inter_system import (
     ClockOffsetLimits,
     OffsetState,
@@ -22,7 +23,6 @@ from .normal_equations import (
 )
 from .range_arrays import InterSystemBiases, Ranges, weighted_ranges, without
 from .receiver_noise import NoiseScaleLimits, noise_scale
-from .robust_fit import RobustFit, RobustFitLimits, robust_fit, robust_on_line
 from .search_index import SearchIndex
 from .section_search import Section, SectionLimits, find_section
 

@@ -19,10 +19,10 @@ from railfix.core.arrays import Datetimes, Floats, Masks, patch_rows
 from railfix.core.epoch_rows import EVERY
 from railfix.core.settings import Settings
 from railfix.positioning.gross_errors import gross_alone
+from railfix.positioning.igg3_fit import RobustFitLimits, robust_fit
 from railfix.positioning.noise_windows import Dated, correlated_sums
 from railfix.positioning.normal_equations import SinglePoint, SinglePointLimits, point_position
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
-from railfix.positioning.robust_fit import RobustFitLimits, robust_fit
 
 
 class ClockOffsetLimits(Settings):
@@ -84,7 +84,7 @@ def tie_clocks(
     limits = limits or ClockOffsetLimits()
     epochs = len(time)
     offset, sigma = np.zeros((epochs, len(clocks))), np.full((epochs, len(clocks)), UNTIED_M)
-    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
+    freedom = np.maximum(ranges.space_redundancy, 1)
     misfit = np.maximum(1.0, free.wsse / freedom)
     others = [g for g, letter in enumerate(clocks) if letter != reference]
     letters = [clocks[g] for g in others]
@@ -95,7 +95,7 @@ def tie_clocks(
         used = ranges.weight > 0
         total = np.maximum(np.add.reduceat(ranges.weight, ranges.starts, axis=1), 1e-12)
         two = np.add.reduceat(used, ranges.starts, axis=1, dtype=np.intp) >= 2
-        known = np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 3)
+        known = np.isfinite(free.wsse) & (ranges.space_redundancy > 0)
         usable = two[:, others] & two[:, base] & known[:, None]
         variance = misfit[:, None] * (1.0 / total[:, others] + 1.0 / total[:, base])
         weight = np.where(usable, 1.0 / variance, 0.0)

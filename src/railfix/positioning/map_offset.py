@@ -140,7 +140,7 @@ def map_offset(
     antenna.
     """
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
-    usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
+    usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.space_redundancy > 0)
     arc = np.where(usable, arc_m, 0.0)
     axes, place = antennas.get_axes(antennas.segment_at(arc))[:, 1:], antennas.at_arc(arc)
     at = np.where(usable[:, None], point.ecef_m, place)

@@ -109,7 +109,7 @@ def position_on_line(
     """
     limits = limits or ConstrainedLimits()
     lines = ((line, EVERY),) if isinstance(line, Trajectory) else AntennaRows.on(line).lines
-    enough = ranges.n_used - ranges.n_clocks >= 1
+    enough = ranges.redundancy >= 0
     parts = []
     for trajectory, rows in lines:
         start = np.full(len(vertex), -1, dtype=np.intp)
@@ -207,7 +207,7 @@ def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePoin
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterate_points(
         ranges.arrays, kernel_array(np.broadcast_to(near_ecef_m, (len(ranges), 3))),
-        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        ranges.space_redundancy >= 0,
         limits.tolerance_m, limits.max_iterations,
     )  # fmt: skip
     return SinglePoint(

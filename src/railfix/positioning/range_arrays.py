@@ -111,6 +111,11 @@ class Ranges:
         """Ranges beyond the clocks and the distance along the line, shape (T,)."""
         return np.asarray(self.n_used - self.n_clocks - 1, dtype=np.int64)
 
+    @property
+    def space_redundancy(self) -> Integers:
+        """Ranges beyond the clocks and a 3-D position, shape (T,)."""
+        return np.asarray(self.n_used - self.n_clocks - 3, dtype=np.int64)
+
 
 #: Satellite position of ranges without weight: any finite value will do [m].
 FILLER_SATELLITE_M: Final = (2.6e7, 0.0, 0.0)

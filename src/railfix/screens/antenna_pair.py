@@ -32,7 +32,7 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.ranges.corrected import AntennaRanges
 from railfix.screens.base import ObservationPicture, ScreenColumn, Screened, Verdict
-from railfix.screens.clock_medians import clock_medians
+from railfix.screens.medians import clock_medians
 from railfix.screens.pairs import PairedEpochs, PairScreen, on_pairs, pair_channels
 
 #: Treatments of the receiver clocks, as named in the output.

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,9 +21,6 @@ from railfix.tracking.packing import pack_parameters, pack_sensors, pack_state, 
 from railfix.tracking.result import Tracked, TrackStatus, new_results
 from railfix.tracking.search import Sought, SplitHypothesis, begin, seek
 from railfix.tracking.state import TrackState
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 @dataclass(kw_only=True)
@@ -55,7 +51,9 @@ class Recursion:
         *,
         levels: bool,
     ) -> None:
-        self.kernel = _kernel()
+        from railfix.kernels.tracking.recursion import advance  # numba: what runs no filter does without
+
+        self.kernel = advance
         self.chunk, self.line, self.limits, self.levels = chunk, line, limits, levels
         self.results = new_results(len(chunk.time), len(chunk.satellite))
         vertex, whole = line.records
@@ -74,16 +72,12 @@ class Recursion:
         """
         last = len(self.chunk.time) if trace is None else first + 1
         parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
-        return self._run(state, (first, last), ix.WHOLE, parents, trace)
+        return self._run(state, (first, last), ix.NOT_SOUGHT, parents, trace)
 
     def search(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> None:
-        """Do an epoch before which places have to be sought, for the reasons of `advance`."""
+        """Do an epoch, predicted where there are hypotheses, in which places have to be sought for some reasons."""
         chunk = self.chunk
-        if state.hypotheses:
-            packed = pack_state(state, self.limits, levels=self.levels)
-            self.kernel(self.given, packed, self.results, _new_trace(0, 0, 0), (epoch, epoch + 1), ix.PREDICTION)
-            unpack_state(state, packed)
-        else:
+        if not state.hypotheses:
             state.code_bias = np.where(chunk.fresh[epoch], 0.0, state.code_bias)
         found = seek(state, chunk, epoch, self.line, self.limits, reasons)
         state.time = chunk.time[epoch]
@@ -93,19 +87,19 @@ class Recursion:
             return
         if found.lost:
             state.bank = None
-        self._run(state, (epoch, epoch + 1), ix.REST_LOST if found.lost else ix.REST, found, trace)
+        self._run(state, (epoch, epoch + 1), ix.SOUGHT_AS_LOST if found.lost else ix.SOUGHT, found, trace)
 
     def _run(
-        self, state: TrackState, span: tuple[int, int], part: int, found: Sought, trace: list[Step] | None
+        self, state: TrackState, span: tuple[int, int], sought: int, found: Sought, trace: list[Step] | None
     ) -> tuple[int, int]:
         """Run the recursion over a span of epochs and change the state; return what `recursion.advance` does."""
         count, width = state.mean.shape
         rows = 3 * len(self.chunk.satellite) + self.given.sensor.shape[1]
         traced = _new_trace(0, 0, 0) if trace is None else _new_trace(count, rows, width)
         packed = pack_state(state, self.limits, levels=self.levels)
-        done, reasons = self.kernel(self.given, packed, self.results, traced, span, part)
+        done, reasons = self.kernel(self.given, packed, self.results, traced, span, sought)
+        unpack_state(state, packed)
         if done > span[0]:
-            unpack_state(state, packed)
             state.time = self.chunk.time[done - 1]
             if trace is not None:
                 step = self.make_step(state, span[0])
@@ -129,13 +123,6 @@ def _new_trace(hypotheses: int, rows: int, unknowns: int) -> layout.Trace:
         value=np.zeros((hypotheses, rows)), variance=np.full((hypotheses, rows), np.inf),
         restarted=np.zeros((hypotheses, unknowns), dtype=np.bool_), kept=np.arange(hypotheses),
     )  # fmt: skip
-
-
-def _kernel() -> Callable[..., tuple[int, int]]:
-    """Return the compiled recursion; numba is imported here, for what runs no filter does without."""
-    from railfix.kernels.tracking.recursion import advance
-
-    return advance
 
 
 def track(

@@ -167,13 +167,12 @@ def track_with_levels(
     else:
         tracked, track_state = track(epochs, line, track_state, limits=limits, sensors=sensors)
     state = copy_with(state, track=after, since=since, every=every)
-    tracked, state = carried_levels(tracked, epochs, taken, place, line, state, limits)
+    tracked, state = carried_levels(tracked, taken, place, line, state, limits)
     return tracked, track_state, state
 
 
 def carried_levels(
     tracked: Tracked,
-    epochs: GnssEpochs,
     taken: Indices,
     place: Tracked | None,
     line: Line,
@@ -185,7 +184,7 @@ def carried_levels(
     `tracked` has the places of the filter, `taken` the epochs that the one with sub-filters took, `place` its places
     there, None without any, and `state` its last epoch before these.
     """
-    number = taken.searchsorted(np.arange(len(epochs)), side="right")
+    number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
     if place is not None:
         columns = np.array([getattr(place, name) for name in _KEPT], dtype=np.float64).T

@@ -318,23 +318,24 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
 
 @kernel
 def advance(
-    given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], part: int
+    given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], sought: int
 ) -> tuple[int, int]:
-    """Do the epochs of a span; return the first before which places have to be sought, and why, or its end and 0.
+    """Do the epochs of a span; return the first in which places have to be sought, and why, or its end and 0.
 
-    `part` says what of an epoch is done: `index.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
+    That epoch is left predicted; a call for it alone with `index.SOUGHT` does the rest of it. An epoch that begins anew
+    is returned with 0.
     """
     for t in range(span[0], span[1]):
-        if part < ix.REST:
-            reasons = _find_search_reasons(given, t, state) if part == ix.WHOLE else 0
-            if given.epoch[t].begins or reasons:
-                return t, reasons
+        if sought == ix.NOT_SOUGHT:
+            if given.epoch[t].begins:
+                return t, 0
+            reasons = _find_search_reasons(given, t, state)
             _reset_code_errors(given, t, state)
             _wrap_closed_line(given, state)
             _predict_all(given, t, state)
-            if part == ix.PREDICTION:
-                return t, 0
-        _advance_epoch(given, t, state, results, trace, part == ix.REST_LOST)
+            if reasons:
+                return t, reasons
+        _advance_epoch(given, t, state, results, trace, sought == ix.SOUGHT_AS_LOST)
         if not math.isfinite(state.x[0, ix.ARC]):
             return t + 1, 0
     return span[1], 0

@@ -69,7 +69,7 @@ def robust_fit(
     if not used.shape[1]:
         nothing = np.zeros(len(ranges), dtype=np.int64)
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
-    freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
+    freedom = ranges.space_redundancy if information is None else ranges.redundancy
     kept, wsse, solved = kernels.robust.reweight_ranges(
         ranges.arrays, kernel_array(place_ecef_m),
         kernel_array(np.empty((0, 3, 3)) if information is None else information),
