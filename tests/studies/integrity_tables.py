@@ -461,7 +461,7 @@ def reweighted(
     )
     elevation, _ = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(np.nan_to_num(arc)))
     weighed = (elevation <= how.elevation_deg) & (ranges.n_used - ranges.n_clocks - 1 >= how.redundancy)[:, None]
-    factor = np.where(weighed, how.tails.weight(residual, residual**2, residual.shape[1]), 1.0)
+    factor = np.where(weighed, how.tails.weight(residual, residual**2), 1.0)
     weight = ranges.weight * factor
     return np.nan_to_num(linear_model(replace(ranges, weight=weight), line, arc, section=section).step_m[:, 0])
 

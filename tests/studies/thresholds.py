@@ -5,8 +5,9 @@ tenth and ten times). Constants are compiled in: what runs here is a copy of the
 of one C function (``cc`` is needed). The filter's measurements are computed once a recording. Each line has the changes
 of the error's median and 95th percentile [m], of the epochs with a level on the ground and with the status `tracking`
 [% of all], of the level's median [m], and how many epochs are over their level, largest change over the recordings.
-``--faults`` takes every fault of `belief_campaign.faults` in a window of 120 s of each recording instead, and ``--only
-NAME ...`` some of the thresholds.
+
+``--length`` takes so many epochs of each. ``--faults`` takes every fault of `belief_campaign.faults` in a window of
+120 s of each recording instead, and ``--only NAME ...`` some of the thresholds.
 """
 
 from __future__ import annotations
@@ -127,6 +128,7 @@ def variations(names: list[str]) -> dict[str, tuple[float, tuple[float, float]]]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recordings", nargs="+")
+    parser.add_argument("--length", type=int)
     parser.add_argument("--faults", action="store_true")
     parser.add_argument("--only", nargs="+", default=[])
     args = parser.parse_args()
@@ -147,7 +149,7 @@ def main() -> None:
                 listed = belief_campaign.faults(part, along[first : first + 120], np.random.default_rng(7))
                 groups[name] = [prepare(faulty) for _, faulty in listed]
             else:
-                groups[name] = [prepare(case)]
+                groups[name] = [prepare(case.part(0, args.length or len(case.observations)))]
         usual = {name: score(trials, {}) for name, trials in groups.items()}
         for name, row in usual.items():
             print(f"{name}: {len(groups[name])} trials,", np.round(row, 2).tolist(), flush=True)

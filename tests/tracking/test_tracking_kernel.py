@@ -327,7 +327,7 @@ def test_first_weights_are_students_with_the_clock_of_each_kind_known() -> None:
 
 @pytest.mark.requirement("E5")
 def test_a_second_fit_sets_place_and_speed_free_by_their_own_variances(monkeypatch: pytest.MonkeyPatch) -> None:
-    (rows, one), evidence = _made_epoch(), plain("tracking.evidence")
+    (rows, one), evidence = _made_epoch(), plain("tracking.update")
     weights, covariances, reweight = list[np.ndarray](), list[np.ndarray](), evidence.reweight
     reweight(rows, one.equations, one.covariance, rows.variance, one.fit)
 

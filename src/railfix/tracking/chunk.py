@@ -39,7 +39,6 @@ class Chunk:
     satellite: Strings  #: Of each channel; shape (K,).
     epoch: Records  #: `railfix.kernels.tracking.layout.EPOCH`; shape (T,).
     channel: Records  #: `railfix.kernels.tracking.layout.CHANNEL`; shape (T, K).
-    apart: Masks  #: Epochs so long after the one before that they restart; shape (T,).
     off_map: Masks  #: The train is away from the line; shape (T,).
     fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
     within_memory: Masks  #: Satellites whose error lasts from before an epoch; shape (T, S).
@@ -98,7 +97,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     if epochs.near_ecef_m is not None:
         _write_velocities(epoch, channel, epochs.near_ecef_m)
     return Chunk(
-        time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, apart=apart, off_map=epochs.off_map,
+        time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, off_map=epochs.off_map,
         fresh=present & ~kept, within_memory=kept,
     )  # fmt: skip
 

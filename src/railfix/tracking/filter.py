@@ -65,50 +65,43 @@ class Recursion:
             start_variance=np.diagonal(unknown[0]).copy(),
         )  # fmt: skip
 
-    def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, int]:
+    def seek(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> Sought | None:
+        """Seek places for an epoch that hypotheses are predicted to; None where there is none, which ends the epoch."""
+        if not state.hypotheses:
+            state.code_bias = np.where(self.chunk.fresh[epoch], 0.0, state.code_bias)
+        found = seek(state, self.chunk, epoch, self.line, self.limits, reasons)
+        state.time = self.chunk.time[epoch]
+        if state.hypotheses:
+            state.bank = None if found.lost else state.bank
+            return found
+        if trace is not None:
+            trace.append(self.make_step(state, epoch))
+        return None
+
+    def run(self, state: TrackState, first: int, found: Sought | None, trace: list[Step] | None) -> tuple[int, int]:
         """Do epochs from `first` on and change the state; return the next, and why places have to be sought there or 0.
 
-        One at a time where the smoother needs something of each.
+        That epoch alone where places have been `found` in it, and where the smoother needs something of each.
         """
-        last = len(self.chunk.time) if trace is None else first + 1
-        parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
-        return self._run(state, (first, last), ix.NOT_SOUGHT, parents, trace)
-
-    def search(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> None:
-        """Do an epoch, predicted where there are hypotheses, in which places have to be sought for some reasons."""
-        chunk = self.chunk
-        if not state.hypotheses:
-            state.code_bias = np.where(chunk.fresh[epoch], 0.0, state.code_bias)
-        found = seek(state, chunk, epoch, self.line, self.limits, reasons)
-        state.time = chunk.time[epoch]
-        if not state.hypotheses:
-            if trace is not None:
-                trace.append(self.make_step(state, epoch))
-            return
-        if found.lost:
-            state.bank = None
-        self._run(state, (epoch, epoch + 1), ix.SOUGHT_AS_LOST if found.lost else ix.SOUGHT, found, trace)
-
-    def _run(
-        self, state: TrackState, span: tuple[int, int], sought: int, found: Sought, trace: list[Step] | None
-    ) -> tuple[int, int]:
-        """Run the recursion over a span of epochs and change the state; return what `recursion.advance` does."""
         count, width = state.mean.shape
+        last = len(self.chunk.time) if trace is None and found is None else first + 1
+        sought = ix.NOT_SOUGHT if found is None else ix.SOUGHT_AS_LOST if found.lost else ix.SOUGHT
         rows = 3 * len(self.chunk.satellite) + self.given.sensor.shape[1]
         traced = _new_trace(0, 0, 0) if trace is None else _new_trace(count, rows, width)
         packed = pack_state(state, self.limits, levels=self.levels)
-        done, reasons = self.kernel(self.given, packed, self.results, traced, span, sought)
+        done, reasons = self.kernel(self.given, packed, self.results, traced, (first, last), sought)
         unpack_state(state, packed)
-        if done > span[0]:
+        if done > first:
             state.time = self.chunk.time[done - 1]
-            if trace is not None:
-                step = self.make_step(state, span[0])
-                traced.restarted[:, ix.SATELLITES + self.chunk.fresh[span[0]].nonzero()[0]] = True
-                kept = traced.kept[: state.hypotheses]
-                step.trace = layout.Trace._make([values[kept] for values in traced])
-                step.mean, step.covariance, step.parent = state.mean, state.covariance, found.parent[kept]
-                step.splits = None if found.splits is None else [found.splits[k] for k in kept.tolist()]
-                trace.append(step)
+        if done > first and trace is not None:
+            step, kept = self.make_step(state, first), traced.kept[: state.hypotheses]
+            traced.restarted[:, ix.SATELLITES + self.chunk.fresh[first].nonzero()[0]] = True
+            step.trace = layout.Trace._make([values[kept] for values in traced])
+            step.mean, step.covariance = state.mean, state.covariance
+            step.parent = kept if found is None else found.parent[kept]
+            if found is not None and found.splits is not None:
+                step.splits = [found.splits[k] for k in kept.tolist()]
+            trace.append(step)
         return done, reasons
 
     def make_step(self, state: TrackState, epoch: int) -> Step:
@@ -169,7 +162,7 @@ def track(
     epoch, reasons = 0, 0
     while epoch < len(epochs):
         lost = not np.isfinite(state.mean[:, ix.ARC]).all()
-        if lost or chunk.apart[epoch] or chunk.off_map[epoch]:
+        if lost or chunk.epoch["begins"][epoch]:
             state.reset()
         if chunk.off_map[epoch]:
             state.time, recursion.results.epoch["status"][epoch] = chunk.time[epoch], TrackStatus.OFF_MAP
@@ -177,11 +170,13 @@ def track(
                 trace.append(recursion.make_step(state, epoch))
             epoch += 1
             continue
-        if state.hypotheses and not reasons:
-            epoch, reasons = recursion.advance(state, epoch, trace)
+        found = None
+        if reasons or not state.hypotheses:
+            found, reasons = recursion.seek(state, epoch, reasons, trace), 0
+        if state.hypotheses:
+            epoch, reasons = recursion.run(state, epoch, found, trace)
         else:
-            recursion.search(state, epoch, reasons, trace)
-            epoch, reasons = epoch + 1, 0
+            epoch += 1
     finish_chunk(chunk, epochs, state)
     result = Tracked.from_records(epochs.time, recursion.results)
     np.add(result.arc_m, line.round_m(result.arc_m), out=result.arc_m)

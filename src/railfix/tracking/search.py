@@ -65,10 +65,10 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floa
         clock = np.median(residual, axis=1, keepdims=True)
         for _ in range(constants.PASSES):
             away = residual - clock
-            weight = tails.weight(away, away**2 / variance, away.shape[1]) / variance
+            weight = tails.weight(away, away**2 / variance) / variance
             clock = (weight * residual).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
         away = residual - clock
-        likelihood += tails.log_density(away, away**2 / variance, away.shape[1]).sum(axis=1)
+        likelihood += tails.log_density(away, away**2 / variance).sum(axis=1)
     order = np.argsort(-likelihood, kind="stable")
     order = order[likelihood[order] > likelihood[order[0]] - _WORSE]
     chosen: list[int] = []

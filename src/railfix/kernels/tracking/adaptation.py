@@ -119,9 +119,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
             h[j] -= share * h[i]
             v[j] -= share * v[i]
             S[j, i:] -= share * S[i, i:]
-    if not information > 0.0:
-        return 0.0
-    return float(min(max(score / math.sqrt(information), -constants.MISFIT_MOST), constants.MISFIT_MOST))
+    return score / math.sqrt(information) if information > 0.0 else 0.0
 
 
 @inner

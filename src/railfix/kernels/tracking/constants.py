@@ -110,7 +110,6 @@ MISFIT_CODES: Final = 4  #: Fewer codes of an epoch do not tell a shift from clo
 #: A single epoch counts with at most so many standard deviations; beyond `STEP_SIGMAS` it is a step of all codes and
 #: shows nothing of the map.
 MISFIT_CLIPPED: Final = 3.0
-MISFIT_MOST: Final = 20.0
 #: Time constant of learning [s], and the largest logarithm: beyond 1.6 m in the square root of a metre nothing changes.
 MISFIT_LEARNT_S: Final = 5.0
 MISFIT_LARGEST: Final = 8.0

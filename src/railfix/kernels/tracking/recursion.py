@@ -16,7 +16,6 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
 from railfix.kernels.tracking.equations import find_wheel_sign, linearise, new_equations
-from railfix.kernels.tracking.evidence import compute_evidence, refit_inflated_prior
 from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
 from railfix.kernels.tracking.layout import Given, Results, Rows, State, Trace
 from railfix.kernels.tracking.level import bound_speed, find_branches, write_level
@@ -27,10 +26,12 @@ from railfix.kernels.tracking.monitors import compute_contradiction, update_moni
 from railfix.kernels.tracking.subfilters import advance_subfilters, find_others
 from railfix.kernels.tracking.update import (
     Correction,
+    compute_evidence,
     correct_state,
     mean_weights,
     new_fit,
     predict_quantities,
+    refit_inflated_prior,
     reweight,
     write_first_weights,
 )

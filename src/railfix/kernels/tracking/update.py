@@ -165,14 +165,7 @@ def compute_weight(rows: Rows, square: float, late: bool) -> float:
 @inner
 def median(values: Floats) -> float:
     """Return the median of values; NaN of none."""
-    ordered, size = np.empty(len(values)), len(values)
-    for a in range(size):  # by insertion
-        b = a
-        while b > 0 and ordered[b - 1] > values[a]:
-            ordered[b] = ordered[b - 1]
-            b -= 1
-        ordered[b] = values[a]
-    return float(0.5 * (ordered[(size - 1) // 2] + ordered[size // 2])) if size else math.nan
+    return float(np.median(values)) if len(values) else math.nan
 
 
 @inner
@@ -355,3 +348,39 @@ def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, f
             else:
                 motion, motions = motion + weight[j], motions + 1
     return code / codes if codes else math.nan, motion / motions if motions else math.nan
+
+
+@inner
+def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
+    """Return the logarithms of the evidence of all measurements but the codes, and of the codes beside them.
+
+    0 for too few of them: they fit any speed and place.
+    """
+    joint = compute_log_evidence(rows, rows.variance, one.fit)
+    without_codes, found = rows.variance.copy(), new_fit(rows)
+    without_codes[rows.code] = math.inf
+    found.weight[:] = one.fit.weight
+    reweight(rows, one.equations, one.covariance, without_codes, found)
+    motion = compute_log_evidence(rows, without_codes, found)
+    codes = joint - motion if rows.code.stop >= constants.MOTION_SATELLITES else 0.0
+    satellites = max(rows.phase.stop - rows.phase.start, rows.doppler.stop - rows.doppler.start)
+    if satellites < constants.MOTION_SATELLITES and rows.sensor.stop == rows.sensor.start:
+        motion = 0.0
+    return motion, codes
+
+
+@inner
+def refit_inflated_prior(rows: Rows, one: Correction) -> None:
+    """Fit again with weights from innovations with place and speed set free; keep the fit with more evidence."""
+    inflated, found = one.P_prior.copy(), new_fit(rows)
+    inflated[ix.ARC, ix.ARC] += constants.FREEDOM_PLACE_M2
+    inflated[ix.SPEED, ix.SPEED] += constants.FREEDOM_SPEED_M2PS2
+    expected = predict_quantities(inflated, one.equations)
+    write_first_weights(rows, one.equations, expected, rows.variance, found.weight)
+    reweight(rows, one.equations, expected[0], rows.variance, found)
+    reweight(rows, one.equations, one.covariance, rows.variance, found)
+    first = compute_log_evidence(rows, rows.variance, one.fit)
+    if compute_log_evidence(rows, rows.variance, found) > first:
+        one.fit.weight[:], one.fit.residual[:] = found.weight, found.residual
+        one.fit.fitted[:], one.fit.distance[:] = found.fitted, found.distance
+        one.fit.log_determinant[:] = found.log_determinant
