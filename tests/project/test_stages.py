@@ -35,6 +35,8 @@ from railfix.track.point_files import write_track_csv
 
 #: The example that calls the stages one by one.
 EXAMPLE = ROOT / "docs" / "gallery" / "stages_by_hand.py"
+#: Has a table of arguments that cannot be right, each with its sentence.
+PAGE = (ROOT / "docs" / "researcher.md").read_text(encoding="utf-8")
 #: Stages of P1's figure 1, in their order, by room.
 STAGES = {
     "ranges": ("select_channels", "find_satellites", "corrected_ranges"),
@@ -209,10 +211,11 @@ def test_a_range_that_is_nan_is_not_used_and_a_faulty_one_is_excluded() -> None:
     level = integrity.protection_level(model, clock.tolist(), n_excluded=found.excluded)
     assert (level.level_m > np.abs(clean.constrained.arc_m - arc)).all()
     before = integrity.linear_model(used, line, fix.constrained.arc_m, section=fix.constrained.section)
-    with pytest.raises(ValueError, match="uses satellites that were excluded; make it from the ranges and positions"):
+    with pytest.raises(ValueError, match="uses satellites that were excluded; make it from the") as solved:
         integrity.protection_level(before, clock.tolist(), n_excluded=found.excluded)
-    with pytest.raises(ValueError, match="scale must be positive"):
+    with pytest.raises(ValueError, match="scale must be positive") as scaled:
         integrity.exclude_faults(used, line, fix, scale=0.0)
+    assert all(f"`{error.value}`" in PAGE for error in (solved, scaled))
 
 
 #: Arguments of `weighted_ranges` (satellites, codes, sigmas, clocks) that cannot be right: which, how, the sentence.
@@ -249,6 +252,7 @@ def test_nonsense_is_one_sentence(case: str) -> None:
     with pytest.raises(ValueError, match=sentence) as error:
         positioning.weighted_ranges(*given)
     assert "\n" not in str(error.value)
+    assert f"`{error.value}`" in PAGE
 
 
 @pytest.mark.requirement("S1")
@@ -259,8 +263,9 @@ def test_lists_are_arrays_and_systems_are_known() -> None:
     assert np.abs(fix.constrained.arc_m - arc).max() < 3.0
     channels = np.array(["G01", "E05"]), np.array(["1C", "1C"])
     for letter in ("X", "g"):
-        with pytest.raises(ValueError, match=f"systems names '{letter}', which is no constellation; known are G"):
+        with pytest.raises(ValueError, match=f"systems names '{letter}', which is no constellation; known are G") as e:
             ranges.select_channels(*channels, systems=(letter,))
+        assert f"`{e.value}`".replace("'g'", "'X'") in PAGE
 
 
 @pytest.mark.requirement("S1")
