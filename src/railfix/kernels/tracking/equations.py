@@ -31,7 +31,7 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Given, Record, Rows
 from railfix.kernels.tracking.line import gradient_at, nearest_arc, wrap_arc, write_point
-from railfix.kernels.tracking.update import Equations
+from railfix.kernels.tracking.update import Equations, find_quantity
 
 
 class Geometry(NamedTuple):
@@ -54,7 +54,7 @@ DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
 def new_equations(rows: Rows) -> Equations:
     """Return equations of an epoch's measurements, to be written."""
     size = rows.code.stop + ix.MOTION + rows.sensor.stop - rows.sensor.start
-    count = rows.sensor.stop
+    count = len(rows.variance)
     return Equations(
         np.zeros((size, ix.TERMS), dtype=np.intp),
         np.zeros((size, ix.TERMS)),
@@ -209,7 +209,7 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: floa
     """Write the sensors."""
     dt, vertex, line, value = given.epoch[t].interval_s, given.vertex, given.line[0], equations.value
     for j in range(rows.sensor.start, rows.sensor.stop):
-        column, q = rows.channel[j], rows.code.stop + ix.MOTION + j - rows.sensor.start
+        column, q = rows.channel[j], find_quantity(rows, j)
         sensor, unknown, coefficient = given.sensor[t, column], equations.unknown[q], equations.coefficient[q]
         measured, age = sensor.value, sensor.age_s
         if column in (ix.WHEEL_COLUMN, ix.RADAR_COLUMN):

@@ -210,7 +210,7 @@ def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, res
 def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> None:
     """Write the record of the corrections for the smoother."""
     for h, one in enumerate(corrections):
-        codes, count, equations = rows.code.stop, rows.sensor.stop, one.equations
+        codes, count, equations = rows.code.stop, len(rows.variance), one.equations
         H = np.zeros((len(equations.unknown), len(one.x)))  # of the quantities
         for q in range(len(H)):
             for k in range(ix.TERMS):
@@ -289,7 +289,7 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
     """Do an epoch whose state is predicted."""
     monitors, dt, leads = state.monitors[0], given.epoch[t].interval_s, 0
     rows = choose_measurements(given, t, state)
-    believed = rows.sensor.stop > 0
+    believed = len(rows.variance) > 0  # of an epoch without measurements the prediction is all there is
     if believed:
         corrections, shift = _correct_hypotheses(given, t, state, rows)
         if len(corrections) > 1:

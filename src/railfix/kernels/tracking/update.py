@@ -70,9 +70,21 @@ class Correction(NamedTuple):
 
 
 @inner
+def find_row(rows: Rows, q: int) -> int:
+    """Return the row that measures a quantity alone: that of a code or a sensor. The six of the motion have none."""
+    return q if q < rows.code.stop else q - rows.code.stop - ix.MOTION + rows.sensor.start
+
+
+@inner
+def find_quantity(rows: Rows, j: int) -> int:
+    """Return the quantity of a code or a sensor by its row: codes first, then the six of the motion, then sensors."""
+    return j if j < rows.code.stop else j - rows.sensor.start + rows.code.stop + ix.MOTION
+
+
+@inner
 def new_fit(rows: Rows) -> Fit:
     """Return the fit of an epoch's measurements, to be written."""
-    count = rows.sensor.stop
+    count = len(rows.variance)
     return Fit(np.ones(count), np.zeros(count), np.zeros(count), np.zeros(1), np.zeros(1))
 
 
@@ -195,7 +207,7 @@ def write_first_weights(
         away = value[j] - middle
         weight[j] = compute_weight(rows, away * away / (without_clock[j] + variance[j]), away > 0.0)
     for j in range(rows.sensor.start, rows.sensor.stop):
-        spread = without_clock[codes + ix.MOTION + j - rows.sensor.start]
+        spread = without_clock[find_quantity(rows, j)]
         weight[j] = compute_weight(rows, value[j] * value[j] / (spread + variance[j]), False)
 
 
@@ -219,7 +231,7 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
             for c in range(r, ix.MOTION):
                 S += T[r, c] * g[codes + c]
         else:
-            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
+            j = find_row(rows, q)
             if variance[j] == math.inf:
                 continue
             g[:], noise = C[q], variance[j] / weight[j]
@@ -240,7 +252,7 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
 def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, variance: Floats, found: Fit) -> float:
     """Write residuals and variances of the fitted quantities; return the weighted square sum of codes and sensors."""
     design, value, codes, square = equations.design, equations.value, rows.code.stop, 0.0
-    for j in range(rows.sensor.stop):
+    for j in range(len(rows.variance)):
         residual, fitted = value[j], 0.0
         if codes <= j < rows.sensor.start:
             for a in range(ix.MOTION):
@@ -248,7 +260,7 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
                 for b in range(ix.MOTION):
                     fitted += design[j, a] * design[j, b] * C[codes + a, codes + b]
         else:
-            q = j if j < codes else j - rows.sensor.start + codes + ix.MOTION
+            q = find_quantity(rows, j)
             residual, fitted = residual - mean[q], C[q, q]
             if variance[j] < math.inf:
                 square += found.weight[j] * residual * residual / variance[j]
@@ -259,7 +271,7 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
 @inner
 def write_weights(rows: Rows, variance: Floats, found: Fit) -> None:
     """Write the weights that follow from the residuals of a fit and their variances."""
-    for j in range(rows.sensor.stop):
+    for j in range(len(rows.variance)):
         relative = (found.residual[j] ** 2 + found.fitted[j]) / variance[j]
         late = j < rows.code.stop and found.residual[j] > 0.0
         found.weight[j] = compute_weight(rows, relative, late)
@@ -296,7 +308,7 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
             for c in range(r, ix.MOTION):
                 S += T[r, c] * _project(equations, codes + c, g)
         else:
-            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
+            j = find_row(rows, q)
             if variance[j] == math.inf:
                 continue
             y = value[j] - _add_quantity(equations, q, 1.0, P, change, g)
@@ -331,7 +343,7 @@ def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: 
 def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
     """Return the logarithm of the evidence of the measurements of finite variance, by Laplace with Student's t."""
     usual, density = rows.degrees, 0.0
-    for j in range(rows.sensor.stop):
+    for j in range(len(rows.variance)):
         own = rows.late_degrees if j < rows.code.stop and found.residual[j] > 0.0 else usual
         density += own * math.log1p(found.residual[j] ** 2 / (own * variance[j]))
     return float(-0.5 * (usual + 1.0) / usual * density - 0.5 * found.distance[0] - 0.5 * found.log_determinant[0])
