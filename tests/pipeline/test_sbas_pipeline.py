@@ -25,7 +25,7 @@ from railfix.integrity.protection.solution_separation import RangeBounds
 from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.level_stage import level_facts, low_sides, prior_basis_text, protection_levels
+from railfix.pipeline.level_stage import late_sides, level_facts, prior_basis_text, protection_levels
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.range_stage import fit_ranges
 from railfix.pipeline.results import AntennaResult
@@ -177,7 +177,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     nothing = (np.zeros(len(ranges)), np.zeros(len(ranges)))
     offset = cast("MapOffset", SimpleNamespace(beyond_m=nothing, seen=None))
 
-    sides = low_sides(one.azimuth_deg, one.elevation_deg, np.zeros(len(scale)), config.risk.side_elevation_deg)
+    sides = late_sides(one.azimuth_deg, one.elevation_deg, np.zeros(len(scale)), config.risk)
 
     def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
         bounds = None if settings.error_model is None else RangeBounds(one.bound_sigma_m, one.bias_m)

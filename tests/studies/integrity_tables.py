@@ -1,7 +1,7 @@
 """Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
 
 ``python tests/studies/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
-``docs/level-results.md``: faults, maps, sigmas, starts, priors, together, sides, late, ionosphere,
+``docs/level-results.md``: faults, maps, sigmas, starts, priors, together, sides, ahead, late, ionosphere,
 coefficients.
 """
 
@@ -33,6 +33,7 @@ from railfix.integrity.protection import LevelStatus, RiskBudget
 from railfix.integrity.protection.risk import set_sums
 from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
+from railfix.kernels.tracking.constants import AHEAD
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
@@ -399,6 +400,28 @@ def side_rows() -> Iterator[str]:
             )
 
 
+def late_ahead_rows() -> Iterator[str]:
+    """Levels with the satellites beside the track as sides, or also those ahead and behind; codes ahead late or not."""
+    yield "log    late_sides   codes ahead   levels %   median [m]   largest error [m]   over"
+    for name, case in cases().items():
+        plain = case.solved()
+        section = np.maximum(plain.fix.constrained.section, 0)
+        off_heading = np.radians(plain.azimuth_deg - case.trajectory.heading_deg[section][:, None])
+        ahead = np.cos(off_heading) * np.cos(np.radians(plain.elevation_deg)) > AHEAD
+        for sides in ("beside", "all"):
+            for late_m in (0.0, 15.0, 30.0):
+                result = case.solved(
+                    SETTINGS.model_copy(update={"risk": RiskBudget(late_sides=sides)}), bias_m=late_m * ahead
+                )
+                level, calm = bounds(result)
+                error, known = case.errors(result)[1], np.isfinite(level)
+                yield (
+                    f"{name:6s} {sides:>10s} {f'{late_m:g} m late':>13s} {100.0 * known.mean():10.1f}"
+                    f" {np.median(level[known]):12.2f} {np.nanmax(error[known]):19.1f}"
+                    f" {int((calm & (error > level)).sum()):6d}"
+                )
+
+
 def ionosphere_rows() -> Iterator[str]:
     """Positions and levels with and without Klobuchar's coefficients, and without them under delays twice as large."""
     yield "log    coefficients, delays   vertical [m]   straight p50     p95    max   ratio p95   level median   over"
@@ -508,6 +531,7 @@ PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "priors": prior_rows,
     "together": class_rows,
     "sides": side_rows,
+    "ahead": late_ahead_rows,
     "late": late_rows,
     "ionosphere": ionosphere_rows,
     "coefficients": coefficient_rows,

@@ -25,6 +25,7 @@ from railfix.integrity.protection.araim import AraimGeometry, AraimResult, Integ
 from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.protection.solution_separation import MapDeviation, RangeBounds
 from railfix.integrity.raim import LinearModel, linear_model
+from railfix.kernels.tracking.constants import AHEAD
 from railfix.pipeline.config import Config
 from railfix.pipeline.fault_stage import CheckedRanges
 from railfix.pipeline.solution import ProtectionResult, Solution
@@ -119,7 +120,7 @@ def level_stage(
         return None, np.zeros(len(ranges), dtype=bool)
     section = np.maximum(fix.constrained.section, 0)
     heading = antennas.each(lambda index, rows: index.trajectory.heading_deg[section[rows]])
-    sides = low_sides(corrected.azimuth_deg, corrected.elevation_deg, heading, config.risk.side_elevation_deg)
+    sides = late_sides(corrected.azimuth_deg, corrected.elevation_deg, heading, config.risk)
     systems = [name[0] for name in corrected.satellite.tolist()]
     overbound = None if config.error_model is None else RangeBounds(corrected.bound_sigma_m, corrected.bias_m)
     level = protection_levels(model, systems, offset, raim, scale, sides, config, overbound=overbound)
@@ -149,7 +150,7 @@ def protection_levels(
 
     The part of the map's offset beyond its own sigma is a bias of the level; an undetected offset is covered by the
     hypothesis of a wrong map. Quiet residuals shrink no level: the receiver's noise scale, shape (T,), counts as 1 at
-    least, and with an error model the sigma of no range falls below the model's. `sides`: `low_sides`.
+    least, and with an error model the sigma of no range falls below the model's. `sides`: `late_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = protection_level(
@@ -170,11 +171,18 @@ def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix:
     return model, np.ones(len(ranges))
 
 
-def low_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, lowest_deg: float) -> Masks:
-    """Return the low satellites left and right of the track, shape (T, 2, K); `heading_deg` is its azimuth (T,)."""
-    right = np.sin(np.radians(azimuth_deg - heading_deg[:, None])) > 0
-    low = elevation_deg < lowest_deg
-    return np.concatenate([(low & ~right)[:, None], (low & right)[:, None]], axis=1)
+def late_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, risk: RiskBudget) -> Masks:
+    """Return the satellites that can be late together, shape (T, S, K); `heading_deg` is the track's azimuth (T,).
+
+    Low ones left and right of the track, and with `RiskBudget.late_sides` "all" those ahead and behind.
+    """
+    off_heading = np.radians(azimuth_deg - heading_deg[:, None])
+    right, low = np.sin(off_heading) > 0, elevation_deg < risk.side_elevation_deg
+    sides = [low & ~right, low & right]
+    if risk.late_sides == "all":
+        along = np.cos(off_heading) * np.cos(np.radians(elevation_deg))
+        sides += [along > AHEAD, along < -AHEAD]
+    return np.stack(sides, axis=1)
 
 
 def apply_verdicts(

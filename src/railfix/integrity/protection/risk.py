@@ -91,6 +91,10 @@ class RiskBudget(Settings):
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
     #: Elevation up to which satellites count as low: of a wall as high as it is away.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
+    #: Satellites that are faulty together: the low ones left of the track, or right of it ("beside"); also all
+    #: satellites ahead, or behind, as in the filter ("all"). One epoch without them knows the position along the track
+    #: badly: the levels become up to three times as large.
+    late_sides: Literal["beside", "all"] = "beside"
     #: Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are called
     #: indicative in every output: no hourly risk is claimed. "measured" needs `local_prior` and `side_prior` to be
     #: given.
