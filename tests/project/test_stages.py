@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
+import re
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
@@ -282,3 +285,16 @@ def test_every_screen_has_metric_limit_and_reject() -> None:
     np.testing.assert_array_equal(weak.floor.reject, weak.floor.metric < weak.floor.limit)
     apart = screens.antenna_spacing_screen(np.array([100.0, 120.0]), np.array([80.0, 80.0]), 20.0)
     np.testing.assert_array_equal(apart.reject, np.abs(apart.metric) > apart.limit)
+
+
+#: Sources of stages: a paper with its section, another publication with its year, a program with its function.
+SOURCE = re.compile(r"P[1-5]\b|\b(19|20)\d\d\b|RTKLIB: `\w+`")
+
+
+@pytest.mark.requirement("S1")
+@pytest.mark.parametrize("room", STAGES)
+def test_a_public_stage_names_its_source_first(room: str) -> None:
+    package = importlib.import_module(f"railfix.{room}")
+    for name in STAGES[room]:
+        first = " ".join(inspect.getdoc(getattr(package, name)).split("\n\n")[:2])
+        assert SOURCE.search(first), name

@@ -81,7 +81,7 @@ def reject_persistent_biases(
 ) -> tuple[PersistentBiases, list[LastingErrorState]]:
     """Return ranges, positions and model without satellites whose codes are wrong for a minute, and the new states.
 
-    RAIM tests single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
+    P4 tests single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
     time. The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
 
     Parameters

@@ -60,7 +60,9 @@ def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float
 def robust_fit(
     ranges: Ranges, place_ecef_m: Floats, *, information: Floats | None = None, limits: RobustFitLimits | None = None
 ) -> RobustFit:
-    """Fit each epoch with IGG-III weights around the solution of the plain fit, shape (T, 3); steps from it are linear.
+    """Return the ranges of each epoch that agree, by IGG-III weights (Yang, Song and Xu, 2002) around a plain fit.
+
+    `place_ecef_m` is the solution of the plain fit, shape (T, 3); steps from it are linear.
 
     `information`, shape (T, 3, 3) [1/m^2]: known beforehand (`map_information`: one unknown is left); none: three.
     """
@@ -91,7 +93,10 @@ def robust_on_line(
     near_ecef_m: Floats | None = None,
     limits: RobustFitLimits | None = None,
 ) -> RobustFit:
-    """Fit the ranges at positions on the line, or where these are missing at approximate positions, shape (T, 3)."""
+    """Return the ranges that agree at positions on the line, by IGG-III weights (Yang, Song and Xu, 2002).
+
+    Where these are missing the fit is at approximate positions `near_ecef_m`, shape (T, 3).
+    """
     antennas, arc = AntennaRows.on(line), position.arc_m
     if near_ecef_m is None:
         near_ecef_m = antennas.each(lambda index, rows: index.middle_ecef_m[None].repeat(len(arc[rows]), axis=0))

@@ -76,7 +76,7 @@ def tie_clocks(
     parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
 ) -> tuple[InterSystemBiases, list[OffsetState]]:
-    """Return the offsets known at each epoch from the epochs before it, and the new states of the receivers.
+    """Return the inter-system biases (P1 3.3: constellations) known from the epochs before each, and new states.
 
     `ranges`: without ties, those that agree with each other alone, with the letter of each of its groups in `clocks`;
     `free`: position with every clock on its own and a redundant range; `parts`: rows of each receiver.

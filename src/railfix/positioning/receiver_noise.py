@@ -63,9 +63,10 @@ def noise_scale(
     limits: NoiseScaleLimits,
     least: float = 0.0,
 ) -> tuple[Floats, Floats]:
-    """Scale of the ranges against their weights (T,) by the epochs before, `least` at least; and new sums (A, 2).
+    """Return the standard deviation of the ranges over that of their weights (P4 takes 1), and new sums.
 
-    Root mean square of the residuals with forgetting around a prior scale (T,); `start`: sums before (A, 2).
+    Root mean square of the residuals of the epochs before, with forgetting, around a prior scale, shape (T,); it is at
+    least `least`. `start`: sums before (A, 2).
     """
     use = teaching & (freedom > 0) & np.isfinite(wsse)
     values = np.array([np.where(use, wsse, 0.0), np.where(use, freedom, 0)], dtype=np.float64).T

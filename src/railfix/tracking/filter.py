@@ -128,10 +128,10 @@ def track(
     levels: bool = False,
     trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
-    """Return places along the trajectory, each from its own and earlier epochs.
+    """Return places along the trajectory, each from its own and earlier epochs (model: R. A. Singer, 1970).
 
-    The recursion is compiled (`railfix.kernels.tracking.recursion`); with ``NUMBA_DISABLE_JIT=1`` in the environment
-    the same code runs as plain Python, for a debugger.
+    The equations are in docs/filter-equations.md, the compiled recursion in `railfix.kernels.tracking.recursion`. With
+    ``NUMBA_DISABLE_JIT=1`` in the environment the same code runs as plain Python, for a debugger.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ class Smoothed:
 def smooth_steps(
     steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
 ) -> tuple[Smoothed, BackwardInformation]:
-    """Smooth the epochs of a chunk.
+    """Return places from both directions of a chunk (adjoint smoother: G. J. Bierman, 1973).
 
     Parameters
     ----------

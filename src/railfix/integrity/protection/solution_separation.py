@@ -358,7 +358,9 @@ class LevelStatus(IntEnum):
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """LevelStatus of epochs, int8 of shape (T,), from protection levels [m], NaN without a position.
+    """Return the `LevelStatus` of epochs by their levels and an alarm limit (P1 2.4), int8 of shape (T,).
+
+    Levels [m] are NaN without a position.
 
     An epoch with a position and without consistency (`ProtectionLevel.consistent`) alarms.
     """
