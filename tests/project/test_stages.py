@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import inspect
 import re
 import runpy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -294,7 +294,33 @@ SOURCE = re.compile(r"P[1-5]\b|\b(19|20)\d\d\b|RTKLIB: `\w+`")
 @pytest.mark.requirement("S1")
 @pytest.mark.parametrize("room", STAGES)
 def test_a_public_stage_names_its_source_first(room: str) -> None:
-    package = importlib.import_module(f"railfix.{room}")
+    package = import_module(f"railfix.{room}")
     for name in STAGES[room]:
         first = " ".join(inspect.getdoc(getattr(package, name)).split("\n\n")[:2])
         assert SOURCE.search(first), name
+
+
+def _own_types(annotation: Any) -> Iterator[type]:
+    """Yield the classes of the package that an annotation names."""
+    if isinstance(annotation, type) and annotation.__module__.startswith("railfix"):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _own_types(part)
+
+
+@pytest.mark.requirement("S1")
+def test_types_that_a_call_of_a_stage_needs_are_exported() -> None:
+    faces = [
+        import_module(f"railfix.{room}") for room in (*STAGES, "core", "gnss", "screens", "track", "integrity.raim")
+    ]
+    exported = {getattr(face, name) for face in faces for name in face.__all__ if isinstance(getattr(face, name), type)}
+    functions = [getattr(import_module(f"railfix.{room}"), name) for room, names in STAGES.items() for name in names]
+    functions += [getattr(screens, name) for name in screens.__all__ if name.endswith("_screen")]
+    assert len(functions) > 20
+    hidden = {
+        f"{function.__name__}: {own.__name__}"
+        for function in functions
+        for annotation in get_type_hints(function).values()
+        for own in set(_own_types(annotation)) - exported
+    }
+    assert not hidden
