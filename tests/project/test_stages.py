@@ -283,6 +283,10 @@ def test_every_screen_has_metric_limit_and_reject() -> None:
     )  # fmt: skip
     assert weak.reject.tolist() == [[True, False, False]]
     np.testing.assert_array_equal(weak.floor.reject, weak.floor.metric < weak.floor.limit)
+    for name in screens.__all__:
+        if name.endswith("_screen"):
+            returned = _own_types(get_type_hints(getattr(screens, name))["return"])
+            assert any(issubclass(own, screens.Screened) for own in returned), name
     apart = screens.antenna_spacing_screen(np.array([100.0, 120.0]), np.array([80.0, 80.0]), 20.0)
     np.testing.assert_array_equal(apart.reject, np.abs(apart.metric) > apart.limit)
 
