@@ -100,17 +100,13 @@ def decimate_epochs(
     share = np.where(_MEAN, 1.0 / np.maximum(size, 1)[:, None], 1.0)
     total, square = (np.add.reduceat(values[:end], first, axis=0) * share for values in (total, square))
     sensed = SensorEpochs(
-        wheel_sign=sensors.wheel_sign, balises=balises, place_m=_take(sensors.place_m, taken),
-        place_sigma_m=_take(sensors.place_sigma_m, taken), ranges=sensors.ranges and sensors.ranges.take(taken),
+        wheel_sign=sensors.wheel_sign, balises=balises, place_m=take_epochs(sensors.place_m, taken),
+        place_sigma_m=take_epochs(sensors.place_sigma_m, taken), ranges=sensors.ranges and sensors.ranges.take(taken),
     )  # fmt: skip
     for column, names in enumerate(_SUMMED):
         if getattr(sensors, names[0]) is not None:
             sensed = replace(sensed, **{names[0]: total[:, column], names[1]: np.sqrt(square[:, column])})
     return taken, some, sensed, left
-
-
-def _take(values: Floats | None, rows: Indices) -> Floats | None:
-    return None if values is None else values[rows]
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:

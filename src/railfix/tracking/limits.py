@@ -100,8 +100,3 @@ class TrackingLimits(Settings):
     #: Probability that the ionosphere is tilted over the sky by more than `slow_code_m`: a storm, or the equatorial
     #: anomaly (`tracking.line.TILT_M` has the size). An assumption.
     level_tilt_prior: float = Field(default=1e-3, ge=0, lt=1)
-
-    @property
-    def tails(self) -> Tails:
-        """Degrees of freedom on both sides."""
-        return Tails(self.degrees_of_freedom, self.late_degrees_of_freedom)

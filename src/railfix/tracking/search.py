@@ -13,7 +13,7 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Records
 from railfix.tracking.chunk import Chunk
-from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.limits import Tails, TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 
@@ -57,7 +57,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floa
     arc = np.linspace(line.arc_m[0], line.arc_m[-1], 1 + int(np.ceil((line.arc_m[-1] - line.arc_m[0]) / _SPACING_M)))
     points, _ = line.at(arc)
     likelihood = np.zeros(len(arc))
-    tails = limits.tails
+    tails = Tails(limits.degrees_of_freedom, limits.late_degrees_of_freedom)
     for group in groups:
         distance, _ = range_with_rotation(channel["sat_ecef_m"][group], points[:, None, :])
         residual = channel["measured"][group, ix.CODE] - distance

@@ -48,6 +48,10 @@ class Geometry(NamedTuple):
 
 #: Unknowns of the distance run since the epoch before: s - s' + q_a.
 DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
+#: Quantities of the motion that are one unknown each.
+OWN_UNKNOWNS = (
+    (ix.M_CLOCK, ix.PHASE_CLOCK), (ix.M_RIGHT, ix.STEP_RIGHT), (ix.M_UP, ix.STEP_UP), (ix.M_DRIFT, ix.DRIFT),
+)  # fmt: skip
 
 
 @inner
@@ -117,12 +121,7 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
     unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(ix.MOTION)
     unknown[first + ix.M_DISTANCE, :3], coefficient[first + ix.M_DISTANCE, :3] = DISTANCE, (1.0, -1.0, 1.0)
     unknown[first + ix.M_SPEED, :2], coefficient[first + ix.M_SPEED, :2] = (ix.SPEED, ix.DOPPLER_SPEED), (1.0, 1.0)
-    for q, i in (
-        (ix.M_CLOCK, ix.PHASE_CLOCK),
-        (ix.M_RIGHT, ix.STEP_RIGHT),
-        (ix.M_UP, ix.STEP_UP),
-        (ix.M_DRIFT, ix.DRIFT),
-    ):
+    for q, i in OWN_UNKNOWNS:
         unknown[first + q, 0], coefficient[first + q, 0], motion[q] = i, 1.0, x[i]
     motion[ix.M_DISTANCE] = x[ix.ARC] - at[0] - (x[ix.PREVIOUS_ARC] - at[1]) + x[ix.MAP_LENGTH_ERROR]
     motion[ix.M_SPEED] = x[ix.SPEED] + x[ix.DOPPLER_SPEED]

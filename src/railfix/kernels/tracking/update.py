@@ -393,6 +393,5 @@ def refit_inflated_prior(rows: Rows, one: Correction) -> None:
     reweight(rows, one.equations, one.covariance, rows.variance, found)
     first = compute_log_evidence(rows, rows.variance, one.fit)
     if compute_log_evidence(rows, rows.variance, found) > first:
-        one.fit.weight[:], one.fit.residual[:] = found.weight, found.residual
-        one.fit.fitted[:], one.fit.distance[:] = found.fitted, found.distance
-        one.fit.log_determinant[:] = found.log_determinant
+        for k in range(len(found)):
+            one.fit[k][:] = found[k]
