@@ -52,12 +52,13 @@ OTHERS: Final = {
     "map": SourceKind.MAP,
     "all in view": SourceKind.ALL_IN_VIEW,
 }
-#: Kinds of the sources after the satellites, in the order of the recursion.
-AFTER_SATELLITES: Final = (
-    *(SourceKind.CONSTELLATION for _ in ix.CLOCKS),
-    *(SourceKind.BALISE if kind in (Kind.BALISE, Kind.NEXT_BALISE) else SourceKind.SENSOR for kind in SENSORS),
-    *OTHERS.values(),
-)
+#: Kind of each source that is no satellite.
+KINDS: Final = {
+    **dict.fromkeys(ix.CLOCKS, SourceKind.CONSTELLATION),
+    **dict.fromkeys(SENSORS.values(), SourceKind.SENSOR),
+    **dict.fromkeys((SENSORS[Kind.BALISE], SENSORS[Kind.NEXT_BALISE]), SourceKind.BALISE),
+    **OTHERS,
+}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -91,8 +91,8 @@ def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
     """Return the sources with their probabilities and factors, `layout.SOURCE`; shape (B,)."""
     source = np.zeros(len(names), dtype=layout.SOURCE)
     if names:
-        given, satellites = bank.budget(limits), names[: -len(bank.AFTER_SATELLITES)]
-        kinds = [*(bank.SourceKind.SATELLITE for _ in satellites), *bank.AFTER_SATELLITES]
+        given, kinds = bank.budget(limits), [bank.KINDS.get(name, bank.SourceKind.SATELLITE) for name in names]
+        satellites = names[: kinds.count(bank.SourceKind.SATELLITE)]
         for field, values in (("prior", given.prior), ("k", given.k_fault), ("k_speed", given.k_speed_fault)):
             source[field] = np.array(values)[kinds]
         source["clock"][: len(satellites)] = [ix.CLOCKS.index(CLOCK_GROUP[name[0]]) for name in satellites]
