@@ -94,8 +94,12 @@ def prepare(case: Any) -> Trial:
 def score(trials: list[Trial], change: dict[str, float]) -> np.ndarray:
     """Return median and 95th percentile of the error, shares of levels and of `tracking`, median level, epochs over."""
     from belief_campaign import joined, judged
+    from railfix.tracking.bank import budget
     from railfix.tracking.levels import track_with_levels
+    from railfix.tracking.packing import pack_parameters
 
+    pack_parameters.cache_clear()
+    budget.cache_clear()
     parts = []
     for trial in trials:
         epochs, line, state, levels, limits, sensors = trial.given
@@ -136,6 +140,7 @@ def main() -> None:
         write_copy(Path(folder))
         sys.path.insert(0, folder)
         import belief_campaign
+        from railfix.core.errors import RailfixError
         from railfix.kernels.tracking import constants
 
         array = (ctypes.c_double * 1000).in_dll(constants._library, "values")
@@ -164,7 +169,7 @@ def main() -> None:
                     rows = np.array([score(trials, change) - usual[group] for group, trials in groups.items()])
                     worst = rows[np.abs(rows).argmax(axis=0), np.arange(rows.shape[1])]
                     moved = "nothing" if not rows.any() else " ".join(f"{x:+.2f}" for x in worst)
-                except (ValueError, ArithmeticError) as error:  # a value that is out of range
+                except (RailfixError, ArithmeticError) as error:  # a value that is out of range
                     moved = str(error).splitlines()[0]
                 if number is not None:
                     array[number] = value

@@ -1,8 +1,7 @@
 """Process model: transition F and noise Q of all unknowns from one epoch to the next, for filter, bank and smoother.
 
-docs/filter-equations.md has both as a table. The prediction's own standard deviation of the speed grows with every
-epoch without redundancy, so that reflections off one wall, which agree with each other, can give a wrong speed;
-`narrow_speed_range` follows what a train can do.
+docs/filter-equations.md has both as a table. The standard deviation of the speed grows with every epoch without
+redundancy: reflections off one wall, which agree, can then give a wrong speed. `narrow_speed_range` limits it.
 """
 
 from __future__ import annotations
