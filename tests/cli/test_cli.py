@@ -157,7 +157,7 @@ def test_an_error_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_manual_needs_no_array_library() -> None:
     program = """
 import sys
-from railfix.cli import main
+from railfix.__main__ import main
 sys.argv = ["railfix", "--help"]
 try:
     main()

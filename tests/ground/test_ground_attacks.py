@@ -24,7 +24,7 @@ from railfix.ground.layout import Layout, LoopStation
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.reports import report_received
 from railfix.ground.serve import CentreFile, _check_line
-from railfix.ground.state import Interlocking, InterlockingLimits, from_documents
+from railfix.ground.state import Interlocking, InterlockingLimits, from_documents, to_documents
 from railfix.ground.stops import overlaps_stopped, release_train
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
@@ -338,9 +338,13 @@ trains = [{ number = 1, station = "A", track = 1, direction = 1, front_m = 300, 
             _check_line(load_settings(CentreFile, path, what="a file of a centre"), store, path)
 
 
-def test_a_state_of_an_older_version_is_refused() -> None:
+def test_a_state_of_an_older_version_is_refused(state: Interlocking) -> None:
     with pytest.raises(InputFileError, match="older version of railfix; name another database"):
         from_documents({"interlocking": '{"trains": [], "points": [], "stopped": false, "granted": 3}'})
+    texts = to_documents(state)
+    older = {name: str(text).replace('"runs_by"', '"unbraked"') for name, text in texts.items()}
+    with pytest.raises(InputFileError, match="older version of railfix; name another database"):
+        from_documents(older)
 
 
 def test_one_centre_has_a_database(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ import pytest
 from railfix.ground.authority import Authority, BrakeOrder
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.layout import Layout, LoopStation, overlap
+from railfix.ground.on_board import OnBoard
 from railfix.ground.state import HEAD, TrainInterval, from_documents, to_documents
 from railfix.ground.stops import OCCUPIED, UNKNOWN, pieces_of
 from railfix.ground.store import DatabaseError, Store
@@ -99,6 +101,10 @@ class Desk:
         if "order it again" not in first:
             return first
         return self.orders[order](values, "ben")
+
+    def order_to(self, number: int) -> int:
+        """The number of the newest order to brake sent to a train."""
+        return max(order.number for order in self.sent if isinstance(order, BrakeOrder) and order.train == number)
 
     @property
     def state(self) -> Any:
@@ -355,7 +361,7 @@ def test_an_order_frees_a_line_that_a_wrong_report_has_stopped(desk: Desk, wrong
     assert desk.state.trains[2].stop is not None
     for _ in range(5):
         for number, front in ((1, 400.0), (2, 2900.0)):
-            desk.report(number, front)
+            desk.report(number, front, brake_order=desk.order_to(number))
         desk.steps(1.0)
     values = {"train": 2, "rear_m": 2690, "front_m": 2906, "direction": 1, "track": 1, "reason": "seen in Mid, whole"}
     assert "reason: one to" in (desk.orders["correct-train"]({**values, "reason": " "}, "anna") or "")
@@ -374,6 +380,77 @@ def test_an_order_frees_a_line_that_a_wrong_report_has_stopped(desk: Desk, wrong
         desk.steps(1.0)
     assert [known.stop for known in desk.state.trains.values()] == [None, None]
     assert any(line.split(": ", 1)[1].startswith("order of ben: correct-train") for line in desk.centre.lines)
+
+
+def test_an_interval_is_not_shortened_while_an_authority_is_on_the_way(desk: Desk) -> None:
+    """The train obeyed an order to brake, was released, and is stopped again while its next authority is late.
+
+    So its newest report names an order to brake which that authority ends. Only an order to brake that is as new as the
+    authority frees the track beyond the corrected interval, or 60 s: no unit takes one that has lapsed.
+    """
+    unit = OnBoard(direction=1, end_m=400.0)
+    desk.centre.supervision.routes = "automatic"
+
+    def answer(*, late: list[Authority] | None = None) -> None:
+        desk.report(2, 2900.0)
+        unit.note_report(desk.sequence + 1, desk.now)
+        unit.note_position(405.0, 0.0)
+        desk.report(1, 400.0, **unit.acknowledgement())
+        desk.steps(1.0)
+        for name in {point for point, _ in desk.commands}:
+            desk.centre.supervision.set_detected(name, desk.state.points[name].wanted)
+        for message in (sent := desk.sent[:]):
+            if message.train == 1 and late is None:
+                unit.receive(message)
+        desk.sent.clear()
+        if late is not None:
+            late += [message for message in sent if message.train == 1]
+
+    for _ in range(3):
+        answer()
+    assert unit.end_m > 2000.0
+    desk.orders["stop"]({"train": 1}, "anna")
+    answer()
+    answer()
+    assert unit.end_m < 410.0
+    assert desk.orders["release-train"]({"train": 1}, "anna") is None
+    late: list[Authority] = []
+    answer(late=late)
+    assert not late[-1].stopped
+    assert late[-1].end_cm > 200_000
+    desk.orders["stop"]({"train": 1}, "anna")
+    values = {"train": 1, "rear_m": 190, "front_m": 410, "direction": 1, "track": 1, "reason": "seen in West, whole"}
+    assert "has not reported that it obeys" in (desk.twice("correct-train", values) or "")
+    for message in late:
+        unit.receive(message)
+    assert unit.end_m > 2000.0
+    answer()
+    answer()
+    assert unit.order is not None
+    assert desk.twice("correct-train", values) is None
+    for message in late:
+        unit.receive(message)
+    assert unit.end_m < 410.0
+
+
+def test_an_interval_is_corrected_once_every_authority_has_lapsed(desk: Desk) -> None:
+    """A unit that names no order to brake, and from whose newest report on 60 s have passed, or since a stop."""
+    unit = OnBoard(direction=1, end_m=400.0)
+    desk.report(1, 400.0)
+    unit.note_report(desk.sequence, desk.now)
+    desk.steps(1.0)
+    authority = next(message for message in desk.sent if message.train == 1 and not message.stopped)
+    desk.orders["stop"]({"train": 1}, "anna")
+    values = {"train": 1, "rear_m": 190, "front_m": 410, "direction": 1, "track": 1, "reason": "seen in West, whole"}
+    for _ in range(58):
+        desk.report(1, 400.0)
+        desk.steps(1.0)
+    assert "has not reported that it obeys" in (desk.twice("correct-train", values) or "")
+    desk.report(1, 400.0)
+    desk.steps(3.0)
+    assert desk.twice("correct-train", values) is None
+    unit.note_report(desk.sequence, desk.now)
+    assert not unit.receive(authority)  # it answers a report of more than 45 s ago
 
 
 def test_a_train_is_entered_anywhere_and_removed(desk: Desk) -> None:
@@ -423,6 +500,46 @@ def test_no_authority_into_a_section_of_vehicles_that_report_nothing(desk: Desk)
     assert desk.state.bars == {("West to Mid", OCCUPIED), ("West to Mid", UNKNOWN)}
     assert desk.orders["detect-section"]({"section": "West to Mid", "occupied": False}) is None
     assert desk.state.bars == set()
+
+
+def test_a_detection_that_falls_silent_leaves_its_section_unknown(desk: Desk) -> None:
+    """One that repeats its answer keeps the section free; 10 s after the last answer nothing is granted into it."""
+    desk.centre.supervision.answered_s["Mid to East"] = -math.inf
+    desk.centre.supervision.set_section_detected("Mid to East", None)
+    free = {"section": "Mid to East", "occupied": False}
+    assert desk.orders["route"]({"train": 2}) == "Mid to East is unknown to its detection"
+    for _ in range(4):
+        assert desk.orders["detect-section"](free, "axle counter") is None
+        desk.steps(8.0)
+    assert desk.state.bars == set()
+    assert sum("axle counter" in line for line in desk.centre.lines) == 1
+    desk.steps(3.0)
+    assert desk.state.bars == {("Mid to East", UNKNOWN)}
+    assert desk.orders["route"]({"train": 2}) == "Mid to East is unknown to its detection"
+    assert desk.orders["detect-section"](free, "axle counter") is None
+    assert desk.orders["route"]({"train": 2}) is None
+
+
+def test_no_authority_leaves_the_area(desk: Desk) -> None:
+    """A train passes to another area by orders, where it stands: no route and no authority leads out of the last
+    station, a place beyond it stops the train, and the track it is removed from stays occupied until it is seen free.
+    """
+    front_m = 5500.0
+    values = {
+        "train": 9, "length_m": 100, "rear_m": 5390, "front_m": front_m, "direction": 1, "track": 1, "reason": "enters",
+    }  # fmt: skip
+    assert desk.twice("enter-train", values) is None
+    desk.report(9, front_m, length_cm=10_000)
+    assert desk.orders["release-train"]({"train": 9}, "anna") is None
+    desk.report(9, front_m, length_cm=10_000)
+    desk.steps(2.0)
+    assert desk.orders["route"]({"train": 9}) == "there is no station ahead"
+    assert desk.state.trains[9].end_m <= LINE.stations[-1].end_m
+    assert desk.twice("enter-train", {**values, "train": 10, "rear_m": 5590, "front_m": 5700}) is not None
+    desk.report(9, 5640.0, length_cm=10_000)
+    assert desk.state.trains[9].stop == "the position is not on the line: 5640 m"
+    assert desk.twice("remove-train", {"train": 9, "reason": "in the other area"}) is None
+    assert {name for name, kind in desk.state.bars if kind == OCCUPIED} >= {"East track 1"}
 
 
 def test_trains_are_divided_and_joined(desk: Desk) -> None:

@@ -227,7 +227,11 @@ class ChangedLine(AttackedLine):
         if len(tracks) > 1:
             return
         track = tracks.pop() if tracks else 1
-        self.centre.state, reason = correct_interval(self.centre.state, train.number, LINE, track=track, **values)
+        lapsed = self.centre.has_lapsed(train.number, self.now_s)
+        self.seen["lapsed"] += lapsed
+        self.centre.state, reason = correct_interval(
+            self.centre.state, train.number, LINE, track=track, lapsed=lapsed, **values
+        )
         self.seen["corrected"] += reason is None
 
     def restart_older(self) -> None:

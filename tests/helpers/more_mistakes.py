@@ -214,7 +214,7 @@ MORE: Final[dict[str, Mistake]] = {
         {}, _REPORT + " --reference {desk}/truth.csv --reference {desk}/rtk.csv", 4, "2 references for 1 runs",
     ),
     # -- maps from positions
-    "one_position": ({"s.csv": _TIMED + "2024-05-01T08:00:00,48,11,500\n"}, _MAP, 3, "1 of 1 positions left, a track"),
+    "one_position": ({"s.csv": _TIMED + "2024-05-01T08:00:00,48,11,500\n"}, _MAP, 7, "1 of 1 positions left, a track"),
     "standing_still": ({"s.csv": _rows("48,11,500")}, _MAP, 3, "(30 standing still)"),
     "beyond_the_pole": ({"s.csv": _rows("91.k,11,500")}, _MAP, 3, "latitude_deg 91"),
     "time_backwards": (

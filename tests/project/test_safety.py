@@ -22,7 +22,7 @@ TESTS = {
 def test_each_hazard_and_condition_has_a_test_that_exists_or_says_that_it_is_not_checked() -> None:
     rows = list(safety_rows(TEXT))
     numbers = [number for number, _, _ in rows]
-    assert sorted(numbers) == sorted([f"H{k}" for k in range(1, 32)] + [f"C{k}" for k in range(1, 18)])
+    assert sorted(numbers) == sorted([f"H{k}" for k in range(1, 34)] + [f"C{k}" for k in range(1, 19)])
     assert [test for _, _, tests in rows for test in tests if test not in TESTS] == []
     without = [number for number, _, tests in rows if not tests]
     assert without == re.findall(r"\| (C\d+) \|[^|]*\| \*\*not checked\*\*", TEXT)

@@ -117,6 +117,10 @@ def _position_rows() -> Iterator[Row]:
         yield Row(name, "from-positions", made, 3 if backward else 0, text)
         along = f"map route {line} --positions reports/{name} --out {{out}}/r.csv --overwrite"
         yield Row(name, "route", along, 0, f"route: T1.*{note}")
+        fixed = f"reference --rtk reports/{name} --track {line} --out {{out}}/reference --overwrite"
+        # heights that lack the geoid's 50 m are off the line
+        good, of_12 = (7, "12 off_height") if name.startswith("sep") else (0, r"\d+ positions, (8|11) good fixes")
+        yield Row(name, "reference", fixed, good, f"{of_12}.*{note.replace('1 of 12 fixes have no height', '')}")
 
 
 def _map_rows() -> Iterator[Row]:
@@ -127,23 +131,42 @@ def _map_rows() -> Iterator[Row]:
         "easting-first.xml": (heights, "points, 890", "easting before northing"),
         "wgs84-egm96.fgb": ("", "12 points", "EGM96"),
     }
+    elsewhere = {
+        "match": (5, "the map lies 8,?[68]49 km from where"),
+        "run": (5, "the track lies 8,?[68][45]. km from"),
+    }
     for name, (given, text, note) in read.items():
         words = {"{map}": "reports/" + name, "{heights}": given}
-        yield _map_row(name, "check", words, 0, f"{text}.*{note}")
-        yield _map_row(name, "network", words, 0, "1 tracks")
-        yield _map_row(name, "doctor", words, 5, f"{text}.*{note}")
+        found = {
+            "check": (0, f"{text}.*{note}"), "network": (0, f"1 tracks.*{note}"), "doctor": (5, f"{text}.*{note}"),
+            "route": (0, f"{text}.*{note}"), **elsewhere,
+        }  # fmt: skip
+        for command, (code, expected) in found.items():
+            yield _map_row(name, command, words, code, expected)
+    flat, grid = (3, "the coordinates have no height"), (4, "nl_nsgi_nlgeo2018.tif, not installed .projsync")
+    without = {
+        "check": flat, "network": (0, "1 tracks"), "doctor": (5, "without heights"), "route": flat, "run": flat,
+        "match": elsewhere["match"],
+    }  # fmt: skip
     refused = {
-        "zero-heights.geojson": (heights, 3, "the coordinates have no height", "without heights"),
-        "rd-nap.fgb": ("", 4, "nl_nsgi_nlgeo2018.tif, not installed .projsync", "nl_nsgi_nlgeo2018.tif"),
-    }
-    for name, (given, code, text, found) in refused.items():
-        words = {"{map}": "reports/" + name, "{heights}": given}
-        yield _map_row(name, "check", words, code, text)
-        yield _map_row(name, "doctor", words, 5, found)
-    yield Row("way-of-one-node.osm", "network", "map network reports/way-of-one-node.osm", 0, "2 tracks.*way/3")
-    yield Row("way-of-one-node.osm", "doctor", "doctor reports/way-of-one-node.osm", 5, "8 points, 708 m.*way/3")
+        "zero-heights.geojson": (heights, without),
+        "easting-first-no-profile.xml": (heights, without),
+        "rd-nap.fgb": ("", dict.fromkeys(without, grid) | {"doctor": (5, "nl_nsgi_nlgeo2018.tif")}),
+        "way-of-one-node.osm": (
+            "",
+            without | {
+                "network": (0, "2 tracks.*way/3"), "doctor": (5, "8 points, 708 m.*way/3"),
+                "route": (4, "the map has 2 tracks; give --tracks, --via or --positions"),
+            },
+        ),
+    }  # fmt: skip
+    for name, (given, rows) in refused.items():
+        for command, (code, text) in rows.items():
+            yield _map_row(name, command, {"{map}": "reports/" + name, "{heights}": given}, code, text)
     route = "map route reports/easting-first-no-profile.xml --tracks A --heights reports/heights-by-chainage.csv"
-    yield Row("easting-first-no-profile.xml", "route", f"{route} {heights} --out {{out}}/e.csv", 0, r"890\.1 m")
+    yield Row("heights-by-chainage.csv", "route", f"{route} {heights} --out {{out}}/e.csv", 0, r"890\.1 m")
+    made = "map from-positions reports/heights-by-chainage.csv --out {out}/h.csv"
+    yield Row("heights-by-chainage.csv", "from-positions", made, 3, "no columns latitude_deg, longitude_deg, height_m")
     yield from _newcomer_rows()
 
 
@@ -187,6 +210,10 @@ def _receiver_rows() -> Iterator[Row]:
     located = f"locate --log {log} --out {{out}}/r.pos --overwrite"
     yield Row("three-epochs.rtcm3", "locate", located, 7, "2 no valid and healthy navigation record")
     yield Row("three-epochs.rtcm3", "doctor", f"doctor {log}", 5, "2024-08-18 21:14:25.*8 ephemerides inside")
+    which = f"which-track --front {log} --nav {log} --map {{line}}"
+    yield Row("three-epochs.rtcm3", "which-track", which, 7, "the log has no position")
+    ran = f"run --front {log} --track {{line}} --out {{out}}/run --overwrite"
+    yield Row("three-epochs.rtcm3", "run", ran, 7, "a position in 0 of 4 epochs")
 
 
 def list_rows() -> list[Row]:

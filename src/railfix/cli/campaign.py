@@ -14,7 +14,7 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
-from railfix.cli.command import raise_exit
+from railfix.cli.command import SIGNALLED
 from railfix.cli.console import (
     TableConsole,
     prepare_kernels,
@@ -125,11 +125,11 @@ def _prepare_worker() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
 
 
-def _end(number_of_signal: int, frame: object) -> None:
+def _end(number_of_signal: int, _frame: object) -> None:
     """End by an exception, which a second signal does not interrupt."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
-    raise_exit(number_of_signal, frame)
+    raise SystemExit(SIGNALLED + number_of_signal)
 
 
 @contextmanager

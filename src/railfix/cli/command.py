@@ -101,9 +101,6 @@ class Commands(TyperGroup):
             if extra is None:
                 raise
             _end(SettingsError(f"this needs {error.name}, which is not installed; pip install 'railfix[{extra}]'"))
-        except KeyboardInterrupt:
-            typer.echo("railfix: interrupted; what was unfinished is removed, finished files are kept", err=True)
-            raise typer.Exit(SIGNALLED + signal.SIGINT) from None
         except MemoryError:
             _end(SettingsError("this needs more memory than there is; give a shorter time or fewer epochs at a time"))
         except RuntimeError as error:
@@ -166,10 +163,9 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program: signals that end it clean up first, and a reader that stops reading is no error."""
-    for name, handler in (("SIGTERM", raise_exit), ("SIGHUP", raise_exit), ("SIGPIPE", _end_at_closed_pipe)):
-        if number := getattr(signal, name, None):
-            signal.signal(number, handler)
+    """Run the program; a reader of its output that stops reading is no error."""
+    if number := getattr(signal, "SIGPIPE", None):
+        signal.signal(number, _end_at_closed_pipe)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         try:
@@ -185,11 +181,6 @@ def run_program(app: typer.Typer) -> NoReturn:
         code = OutputError.exit_code
     _discard_output()
     sys.exit(code)
-
-
-def raise_exit(number: int, _frame: object) -> None:
-    """End by an exception, so that staging folders are removed."""
-    raise SystemExit(SIGNALLED + number)
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:

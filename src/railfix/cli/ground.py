@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections import Counter
-from dataclasses import replace
+from collections.abc import AsyncIterator, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,6 +23,7 @@ from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
 
 if TYPE_CHECKING:
+    from railfix.ground.station_fixes import StationFixes
     from railfix.ground.triangle import Order
 
 app = command_group("ground")
@@ -88,92 +89,60 @@ def monitor(
 
     Exit codes are those of `railfix --help`; 5 where the logs have no satellite or no epoch in common.
     """
-    from railfix.ground.station_fixes import read_fixes
-    from railfix.ground.triangle import draw_triangle, monitor_log
-
     if len(logs) != 3:
         raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
     out = choices.out
-    files = [out / "monitor.csv", out / "triangle.png"]
     if out.exists():
         inputs = [*(Path(log) for log in logs), *choices.nav]
         overwrite = choices.overwrite == "replace"
-        check_outputs((files[0], "any"), (files[1], "any"), overwrite=overwrite, inputs=inputs)
+        check_outputs((out / "monitor.csv", "any"), (out / "triangle.png", "any"), overwrite=overwrite, inputs=inputs)
     if len(choices.point) not in (0, 3):
         raise SettingsError(f"--point was given {len(choices.point)} times; give it once for each receiver")
     if choices.live and choices.fixes:
         raise SettingsError("--live judges streams of observations; --fixes is for logs of positions")
-    if choices.live:
-        _monitor_live(logs, choices, files[0], limits=limits, times=times)
-        return
-    fixes = read_fixes(logs, choices.nav, choices.point, computed=choices.fixes)
-    result = monitor_log(fixes, limits=limits, times=times)
+    if choices.live and not choices.point:
+        raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        result.table().write_csv(files[0])
-        draw_triangle(files[1], result, limits=limits)
+        _monitor(logs, choices, limits=limits, times=times)
     except OSError as error:
         raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
-    console = TableConsole()
-    _show_verdicts(console, Counter(result.triangle.verdict.tolist()))
-    for time, order, cause, receiver in result.orders:
-        named = "" if receiver < 0 else f", receiver {receiver}"
-        console.print(f"{np.datetime_as_string(time, unit='s')} {order.value}: {cause.name.lower()}{named}")
-    if not result.orders:
-        console.print("no stop")
-    show_files(console, files)
 
 
-def _show_verdicts(console: TableConsole, epochs: Counter[int]) -> None:
-    """Print how many epochs have each verdict."""
-    from railfix.ground.triangle import TriangleVerdict
-
-    rows = [[TriangleVerdict(verdict).name.lower(), str(count)] for verdict, count in sorted(epochs.items())]
-    show_table(console, plain_table(["verdict", "epochs"], rows, texts=2, boxed=True))
-
-
-def _monitor_live(
-    sources: list[str], choices: MonitorChoices, path: Path, *, limits: TriangleLimits, times: MonitorLimits
-) -> None:
-    """Judge streams until they end, or for a time; rows go to a file and orders are printed as they come."""
+def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits, times: MonitorLimits) -> None:
+    """Judge logs, or streams until they end or for a time; rows go to a file and orders are printed as they come."""
     import asyncio
     import time
 
-    from railfix.ground.station_fixes import stream_fixes
-    from railfix.ground.triangle import LiveMonitor
-    from railfix.io import read_navigation
-    from railfix.live.sources import check_source, is_file
-    from railfix.run.processor_setup import parse_position
+    from railfix.ground.triangle import Monitor, TriangleVerdict, draw_triangle
+    from railfix.live.sources import is_file
 
-    if not choices.point:
-        raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")
-    for source in sources:
-        check_source(source)
-    points = np.stack([parse_position(text, "--point") for text in choices.point])
-    navigation = read_navigation(choices.nav) if choices.nav else None
-    monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[int](), TableConsole()
-    recorded = all(is_file(source) for source in sources)
+    monitor, counts, console = Monitor(limits=limits, times=times), Counter[int](), TableConsole()
+    path, picture = choices.out / "monitor.csv", choices.out / "triangle.png"
+    recorded = not choices.live or all(is_file(log) for log in logs)
 
-    def show(orders: tuple[Order, ...], when: str) -> None:
+    def show(when: str, orders: Iterable[Order]) -> None:
+        cause = "" if monitor.state.cause is None else f": {monitor.state.cause.name.lower()}"
+        named = "" if monitor.state.receiver < 0 else f", receiver {monitor.state.receiver}"
         for order in orders:
-            cause = "" if monitor.state.cause is None else f": {monitor.state.cause.name.lower()}"
-            named = "" if monitor.state.receiver < 0 else f", receiver {monitor.state.receiver}"
             console.print(f"{when} {order.value}{cause}{named}")
 
     async def work() -> None:
-        async for fixes in stream_fixes(sources, points, navigation=navigation):
+        async for fixes in _fixes(logs, choices):
             # recorded streams have the clock of their tags
-            tag_s = float(fixes.time[0].astype(np.int64)) / 1e9
-            judged, orders = monitor.judge(fixes, tag_s if recorded else time.monotonic())
-            judged.table().write_csv(file, include_header=not counts)
-            file.flush()
-            counts[int(judged.triangle.verdict[0])] += 1
-            show(orders, np.datetime_as_string(fixes.time[0], unit="s"))
+            judged = monitor.judge(fixes, None if recorded else time.monotonic())
+            choices.out.mkdir(parents=True, exist_ok=True)
+            with path.open("ab" if counts else "wb") as file:
+                judged.table().write_csv(file, include_header=not counts)
+            counts.update(judged.triangle.verdict.tolist())
+            for tag, order, _, _ in judged.orders:
+                show(np.datetime_as_string(tag, unit="s"), [order])
+            if not choices.live:
+                draw_triangle(picture, judged, limits=limits)
 
     async def watch() -> None:
         while not recorded:
             await asyncio.sleep(0.5)
-            show(monitor.silent(time.monotonic()), "nothing for too long:")
+            show("nothing for too long:", monitor.silent(time.monotonic()))
 
     async def session() -> None:
         tasks = [asyncio.create_task(work()), asyncio.create_task(watch())]
@@ -185,17 +154,31 @@ def _monitor_live(
             task.result()
 
     if not recorded:
-        monitor.state = replace(monitor.state, complete_s=time.monotonic())
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as file:
-            asyncio.run(session())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
-    _show_verdicts(console, counts)
+        monitor.begin(time.monotonic())
+    asyncio.run(session())
+    rows = [[TriangleVerdict(verdict).name.lower(), str(count)] for verdict, count in sorted(counts.items())]
+    show_table(console, plain_table(["verdict", "epochs"], rows, texts=2, boxed=True))
     if not monitor.state.stopped:
         console.print("no stop")
-    show_files(console, [path])
+    show_files(console, [path] * bool(counts) + [picture] * (not choices.live))
+
+
+async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[StationFixes]:
+    """Yield the fixes of the receivers: of logs at once, of streams epoch by epoch."""
+    from railfix.ground.station_fixes import read_fixes, stream_fixes
+    from railfix.io import read_navigation
+    from railfix.live.sources import check_source
+    from railfix.run.processor_setup import parse_position
+
+    if not choices.live:
+        yield read_fixes(logs, choices.nav, choices.point, computed=choices.fixes)
+        return
+    for source in logs:
+        check_source(source)
+    points = np.stack([parse_position(text, "--point") for text in choices.point])
+    navigation = read_navigation(choices.nav) if choices.nav else None
+    async for fixes in stream_fixes(logs, points, navigation=navigation):
+        yield fixes
 
 
 class KeyChoices(Settings):

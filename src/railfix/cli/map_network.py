@@ -23,7 +23,7 @@ from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
 from railfix.track.network_read import TOLERANCE_M, check_network, read_network
-from railfix.track.network_route import Filled, Rows, fill_gaps, find_route
+from railfix.track.network_route import Filled, Rows, fill_gaps, find_route, left_out_note
 from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 
@@ -205,13 +205,8 @@ def _route_tracks(
             return [0], []
         raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
     log, notes = _in_frame_of(net, log, connecting, reading)
-    passed, left_out = find_route(net, match(net, log))
-    if not passed:
-        raise MismatchError(f"{choice.positions}: no position lies near a track of the network")
-    if left_out:
-        beside = ", ".join(net.names[k] for k in left_out)
-        notes.append(f"no route joins these tracks to {beside}: the run turned back there, or the map has a gap")
-    return passed, notes
+    passed, left_out = find_route(net, match(net, log), log.path)
+    return passed, [*notes, *([left_out_note(net, left_out)] if left_out else [])]
 
 
 def _in_frame_of(

@@ -13,7 +13,7 @@ code meaning
 4    a setting is misspelt, out of range, or contradicts another
 5    the inputs are readable but do not match each other (other day, other place)
 6    the track map was checked and has errors
-7    the run ended without a single position
+7    not a single position: none in the results, or none in the inputs that can be used
 8    the output cannot be written
 9    two channels of a live session gave different answers to the same input
 ==== =====================================================================
@@ -78,7 +78,7 @@ class MapQualityError(RailfixError):
 
 
 class NoPositionError(RailfixError):
-    """A run ended without a single position."""
+    """Inputs are readable, but not a single position of them can be used."""
 
     exit_code = 7
 

@@ -54,19 +54,19 @@ def correct_interval(
     rear_m: float,
     front_m: float,
     track: int,
-    silent: bool = False,
+    lapsed: bool = False,
 ) -> Changed:
     """Return the state with the interval of a stopped train set by hand, and the reason of a refusal.
 
-    Its routes and its authority end, and points that it no longer stands on are free: so the train has to report that
-    it obeys the order to brake, unless it has been `silent` for longer than an authority lasts on board.
+    Its routes and its authority end, and points that it no longer stands on are free. So the train has to report that
+    it obeys an order to brake which no authority on the way to it can end, unless all of them have `lapsed` on board.
     """
     known = state.trains.get(train)
     if known is None:
         return state, f"no such train: {train}"
     if known.stop is None:
         return state, f"train {train} is not stopped: stop it first"
-    if known.unbraked and not silent:
+    if known.runs_by is not None and not lapsed:
         return state, f"train {train} has not reported that it obeys the order to brake, and may run on: wait for that"
     moved = _placed(known, layout, direction=direction, rear_m=rear_m, front_m=front_m, track=track)
     if isinstance(moved, str):

@@ -19,7 +19,7 @@ from railfix.ground.interlocking import stop_orders
 from railfix.ground.layout import PointName
 from railfix.ground.reports import stands
 from railfix.ground.state import HEAD, Interlocking, TrainInterval, from_documents, stop_trains, to_documents
-from railfix.ground.stops import CLOSED, release_train
+from railfix.ground.stops import CLOSED
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, is_obeyed
 from railfix.ground.triangle import STOPPING, MonitorLimits, MonitorState, TriangleVerdict, advance, release
@@ -316,30 +316,6 @@ class ControlCentre:
         self.log("every train stopped by hand" if train is None else f"train {train}: stopped by hand", train=train)
         return None
 
-    def confirm_start(self) -> str | None:
-        """Continue without the trains that have not reported since the start; return the reason if refused."""
-        if not self.supervision.awaited:
-            return "every train has reported since the start"
-        self.supervision.awaited.clear()
-        return None
-
-    def released(self, train: int) -> tuple[Interlocking, str | None]:
-        """Return the state with the stop of a train released, and the reason of a refusal."""
-        return release_train(self.supervision.state, train, self.supervision.layout)
-
-    def changed(self, state: Interlocking) -> None:
-        """Set a state in which an order has changed trains; data of removed trains are dropped."""
-        self.supervision.forget([number for number in self.supervision.state.trains if number not in state.trains])
-        self.supervision.state = state
-
-    def set_route(self, train: int) -> str | None:
-        """Set a train's route to the next station by hand; return the reason of a refusal."""
-        return self.supervision.set_route(train)
-
-    def ask_route_back(self, train: int) -> str | None:
-        """Request a train by hand to return its route to the next station; return the reason of a refusal."""
-        return self.supervision.ask_route_back(train)
-
     def _monitor(self, now: float) -> None:
         if self.monitor is None:
             return
@@ -416,4 +392,7 @@ class ControlCentre:
 
 def list_orders(centre: ControlCentre) -> dict[str, Order]:
     """Return the orders of the page by name."""
-    return OrderDesk(centre=centre).orders()
+    desk = OrderDesk(
+        supervision=centre.supervision, clock=centre.clock, log=centre.log, release=centre.release, stop=centre.stop
+    )
+    return desk.orders()

@@ -10,20 +10,18 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from railfix.ground.centre import TrainState
 from railfix.ground.changes import correct_interval, divide_train, enter_train, join_trains, remove_train
 from railfix.ground.layout import MOST_PARTS
 from railfix.ground.state import Interlocking, Restriction
-from railfix.ground.stops import CLOSED, OCCUPIED, close_section, open_section
+from railfix.ground.stops import CLOSED, OCCUPIED, close_section, open_section, release_train
 from railfix.ground.supervision import Supervision
 from railfix.ground.web import Order
 
 #: Shortest and longest time between two orders of the same person [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
-#: A train that was silent for this time runs by no authority any more (`OnBoardLimits.fresh_s`) and stands [s].
-SILENT_S: Final = 60.0
 #: Longest reason that is taken [characters].
 LONGEST_REASON: Final = 200
 Values = dict[str, Any]
@@ -44,45 +42,15 @@ def metres_of(values: Values, *names: str) -> list[float] | str:
     return [float(value) for value in found]  # type: ignore[arg-type]
 
 
-class OrderedCentre(Protocol):
-    """Methods of the centre that orders need (`railfix.ground.control.ControlCentre`)."""
-
-    supervision: Supervision
-
-    @property
-    def clock(self) -> Callable[[], float]:
-        """Centre's clock [s]."""
-
-    def log(self, text: str, *, train: int | None = None) -> None:
-        """Write a line of the log."""
-
-    def released(self, train: int) -> tuple[Interlocking, str | None]:
-        """Return the state with the stop of a train released, and the reason of a refusal."""
-
-    def confirm_start(self) -> str | None:
-        """Continue without the trains that have not reported since the start."""
-
-    def changed(self, state: Interlocking) -> None:
-        """Take a state in which an order has changed trains."""
-
-    def release(self) -> str | None:
-        """Release a stop of all trains."""
-
-    def stop(self, train: int | None) -> str | None:
-        """Stop a train, or every train with None."""
-
-    def set_route(self, train: int) -> str | None:
-        """Set a train's route to the next station."""
-
-    def ask_route_back(self, train: int) -> str | None:
-        """Request a train to return its route to the next station."""
-
-
 @dataclass(kw_only=True)
 class OrderDesk:
-    """Orders of one centre."""
+    """Orders of one centre (`railfix.ground.control.ControlCentre`)."""
 
-    centre: OrderedCentre
+    supervision: Supervision
+    clock: Callable[[], float]  #: Centre's clock [s].
+    log: Callable[..., None]  #: Writes a line of the log.
+    release: Callable[[], str | None]  #: Releases a stop of all trains.
+    stop: Callable[[int | None], str | None]  #: Stops a train, or every train with None.
     #: Orders that have been given once, by name and values: time and author.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
 
@@ -93,12 +61,12 @@ class OrderDesk:
         outcome = "done" if reason is None else f"refused: {reason}"
         train = values.get("train")
         who = by or "the page"
-        self.centre.log(f"order of {who}: {name} {shown}: {outcome}", train=train if type(train) is int else None)
+        self.log(f"order of {who}: {name} {shown}: {outcome}", train=train if type(train) is int else None)
         return reason
 
     def confirmed(self, name: str, values: Values, by: str, what: str) -> str | None:
         """Return None where an order is the second one, in time; otherwise the next step."""
-        key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.centre.clock(), AGAIN_S
+        key, now, (least_s, most_s) = f"{name} {json.dumps(values, sort_keys=True)}", self.clock(), AGAIN_S
         asked = self._asked.pop(key, None)
         if asked is not None:
             least_s = 0.0 if asked[1] != by else least_s
@@ -113,7 +81,7 @@ class OrderDesk:
     def asked_s(self, name: str, values: Values) -> float:
         """Return when an order was given the first time, now where it was not [s]."""
         key = f"{name} {json.dumps(values, sort_keys=True)}"
-        return self._asked.get(key, (self.centre.clock(), ""))[0]
+        return self._asked.get(key, (self.clock(), ""))[0]
 
     def release_train(self, values: Values, by: str) -> str | None:
         """Release the stop of a train; as nothing confirms the position of a silent train, its release is ordered
@@ -122,13 +90,13 @@ class OrderDesk:
         train = number_of(values, "train")
         if isinstance(train, str):
             return train
-        state, reason = self.centre.released(train)
-        record = self.centre.supervision.records.get(train)
+        state, reason = release_train(self.supervision.state, train, self.supervision.layout)
+        record = self.supervision.records.get(train)
         silent = record is None or record.state is not TrainState.TRACKED
         if reason is None and silent:
             reason = self.confirmed("release-train", values, by, f"train {train} is silent, and stands, whole")
         if reason is None:
-            self.centre.supervision.state = state
+            self.supervision.state = state
         return reason
 
     def twice(
@@ -139,37 +107,31 @@ class OrderDesk:
         if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
             return f"reason: one to {LONGEST_REASON} characters were expected: who has seen what"
         since_s = self.asked_s(name, values)
-        before = self.centre.supervision.state
+        before = self.supervision.state
         state, refused = change(values)
         refused = refused or self._moved_meanwhile(before, state, since_s)
         refused = refused or self.confirmed(name, values, by, what)
         if refused is None:
-            self.centre.changed(state)
+            self.supervision.forget([number for number in before.trains if number not in state.trains])
+            self.supervision.state = state
         return refused
 
     def _moved_meanwhile(self, before: Interlocking, after: Interlocking, since_s: float) -> str | None:
         """Return the train whose position, reported since the first order, is outside its new interval."""
         for number, train in after.trains.items():
-            known, record = before.trains.get(number), self.centre.supervision.records.get(number)
+            known, record = before.trains.get(number), self.supervision.records.get(number)
             if known is None or known is train or known.reported_m is None or record is None:
                 continue
             if (
-                record.heard_s >= since_s - self.centre.supervision.centre.lost_s
+                record.heard_s >= since_s - self.supervision.centre.lost_s
                 and replace(train, reported_m=known.reported_m).outside_m() > 0.0
             ):
                 return "train {} reports {:.0f} to {:.0f} m, outside of that interval".format(number, *known.reported_m)
         return None
 
-    def is_silent(self, train: int) -> bool:
-        """Return whether a train has not been heard for so long that it stands, whatever it was granted."""
-        supervision = self.centre.supervision
-        record = supervision.records.get(train)
-        heard_s = supervision.begun_s if record is None else max(record.heard_s, supervision.begun_s)
-        return self.centre.clock() - heard_s > SILENT_S
-
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
         """Return the state after a change of trains, and the reason of a refusal."""
-        state, layout = self.centre.supervision.state, self.centre.supervision.layout
+        state, layout = self.supervision.state, self.supervision.layout
         train = number_of(values, "train")
         if isinstance(train, str):
             return state, train
@@ -181,7 +143,8 @@ class OrderDesk:
                     return state, value
             place: Any = {"rear_m": ends[0], "front_m": ends[1], "track": track, "direction": direction}
             if of == "correct":
-                return correct_interval(state, train, layout, **place, silent=self.is_silent(train))
+                lapsed = self.supervision.has_lapsed(train, self.clock())
+                return correct_interval(state, train, layout, **place, lapsed=lapsed)
             length = metres_of(values, "length_m")
             if isinstance(length, str):
                 return state, length
@@ -199,15 +162,17 @@ class OrderDesk:
         return divide_train(state, train, other, length_m=length[0])
 
     def confirm_start(self, values: Values, by: str) -> str | None:
-        """Continue after a start without silent trains: the database is the newest."""
-        if not self.centre.supervision.awaited:
-            return self.centre.confirm_start()
-        what = f"the database is no older copy, and these trains are silent: {self.centre.supervision.awaited_text}"
-        return self.confirmed("confirm-start", values, by, what) or self.centre.confirm_start()
+        """Continue after a start without the trains that have not reported since: the database is the newest."""
+        if not self.supervision.awaited:
+            return "every train has reported since the start"
+        what = f"the database is no older copy, and these trains are silent: {self.supervision.awaited_text}"
+        if (reason := self.confirmed("confirm-start", values, by, what)) is None:
+            self.supervision.awaited.clear()
+        return reason
 
     def section(self, values: Values, by: str, *, of: str) -> str | None:
         """Bar a section, or end that; for a section that was occupied at the second order."""
-        supervision, name = self.centre.supervision, str(values.get("section", ""))
+        supervision, name = self.supervision, str(values.get("section", ""))
         layout, state = supervision.layout, supervision.state
         if name not in layout.sections:
             return f"no such section: {name!r}"
@@ -222,19 +187,22 @@ class OrderDesk:
         supervision.state = open_section(state, name, kind)
         return None
 
-    def detect(self, values: Values, _by: str) -> str | None:
-        """Process the detection of a section: occupied, free, or null where it is unknown."""
+    def detect(self, values: Values, by: str = "") -> str | None:
+        """Process the detection of a section: occupied, free, or null where it is unknown; a change is logged."""
         name, occupied = str(values.get("section", "")), values.get("occupied")
-        if name not in self.centre.supervision.layout.sections:
+        if name not in self.supervision.layout.sections:
             return f"no such section: {name!r}"
         if occupied is not None and not isinstance(occupied, bool):
             return "occupied: true, false or null was expected"
-        self.centre.supervision.set_section_detected(name, occupied)
+        if self.supervision.detected.get(name, "not yet") != occupied:
+            word = {True: "occupied", False: "free", None: "unknown"}[occupied]
+            self.log(f"detection of {by or 'the page'}: {name} is {word}")
+        self.supervision.set_section_detected(name, occupied, self.clock())
         return None
 
     def restrict(self, values: Values, by: str) -> str | None:
         """Set a temporary speed restriction by its name, or lift it, ordered twice."""
-        supervision, name = self.centre.supervision, str(values.get("name", "")).strip()
+        supervision, name = self.supervision, str(values.get("name", "")).strip()
         state = supervision.state
         if not 0 < len(name) <= 40:
             return "name: one to 40 characters were expected"
@@ -261,7 +229,7 @@ class OrderDesk:
 
     def orders(self) -> dict[str, Order]:
         """Return the orders by name; each is called with its values and its author."""
-        centre = self.centre
+        supervision = self.supervision
 
         def of_train(order: Callable[[int], str | None]) -> Callable[[Values, str], str | None]:
             def given(values: Values, _: str) -> str | None:
@@ -278,14 +246,13 @@ class OrderDesk:
             "open-section": partial(self.section, of="open"),
             "occupy-section": partial(self.section, of="occupy"),
             "free-section": partial(self.section, of="free"),
-            "detect-section": self.detect,
             "restrict": self.restrict,
             "confirm-start": self.confirm_start,
-            "release": lambda _values, _by: centre.release(),
-            "route": of_train(centre.set_route),
-            "route-back": of_train(centre.ask_route_back),
-            "stop": of_train(centre.stop),
-            "stop-all": lambda _values, _by: centre.stop(None),
+            "release": lambda _values, _by: self.release(),
+            "route": of_train(supervision.set_route),
+            "route-back": of_train(supervision.ask_route_back),
+            "stop": of_train(self.stop),
+            "stop-all": lambda _values, _by: self.stop(None),
             "release-train": self.release_train,
             "correct-train": changing("correct", "the train is inside that interval, and stands"),
             "enter-train": changing("enter", "the train is inside that interval, and stands"),
@@ -293,4 +260,6 @@ class OrderDesk:
             "join-trains": changing("join", "the trains are coupled, and stand"),
             "divide-train": changing("divide", "the train is divided there, and both parts stand"),
         }
-        return {name: partial(self.given, name, order) for name, order in orders.items()}
+        return {name: partial(self.given, name, order) for name, order in orders.items()} | {
+            "detect-section": self.detect  # repeated every few seconds
+        }

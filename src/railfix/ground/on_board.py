@@ -20,6 +20,7 @@ ROLLED_M: Final = 50.0
 #: Number of reports whose time of sending is stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
+LONGEST_FRESH_S: Final = 45.0  #: Longest time limit of authorities: one that is older when it arrives is not taken.
 
 
 class OnBoardLimits(BrakeLimits):
@@ -27,7 +28,12 @@ class OnBoardLimits(BrakeLimits):
 
     #: Time limit of authorities: the train brakes where the newest one answers a report that was sent longer ago.
     fresh_s: float = option(
-        "Time limit of authorities: older ones brake the train.", 15.0, name="--fresh", metavar="S", gt=0
+        "Time limit of authorities: older ones brake the train.",
+        15.0,
+        name="--fresh",
+        metavar="S",
+        gt=0,
+        le=LONGEST_FRESH_S,
     )
     #: A train without a position continues from the last one for this time, at its highest speed; then it brakes.
     placeless_s: float = Field(default=5.0, ge=0)
@@ -134,7 +140,8 @@ class OnBoard:
         """Take an authority; return whether it counts: it is newer, for this direction, and of this side of a turn.
 
         One that answers a report from before the last change of ends may have been granted for the direction of now
-        two changes ago. An order to brake always counts; one that is late lasts until the next authority.
+        two changes ago; one that has lapsed on the way counts no more. An order to brake always counts; one that is
+        late lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
             # also of a centre whose database is an older copy, and knows no numbers as high as the train's
@@ -169,8 +176,14 @@ class OnBoard:
         return False
 
     def _answers(self, authority: Authority) -> bool:
-        """Return whether an authority answers a report of this start on board and since the last change of ends."""
-        return authority.session == self.session and authority.report > self.before_turn
+        """Return whether an authority answers a report of this start on board, since the last change of ends, that is
+        not older than `LONGEST_FRESH_S`.
+        """
+        if authority.session != self.session or authority.report <= self.before_turn:
+            return False
+        remembered = authority.report >= next(iter(self._sent), -1)
+        sent_s = self._sent.get(authority.report, math.inf if remembered else -math.inf)
+        return self._sent.get(self._newest, -math.inf) - sent_s <= LONGEST_FRESH_S
 
     def _begins(self) -> bool:
         """Return whether an authority is the first since the start, the last turn or an order to brake."""

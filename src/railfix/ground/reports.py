@@ -271,8 +271,15 @@ def _noted(report: PlacedReport) -> TrainInterval:
         claimed_m=None,
         contradiction=None,
         held_end_m=report.held_m,
-        unbraked=message.brake_order is None and (message.authority is not None or report.known.unbraked),
+        runs_by=_runs_by(report),
     )
+
+
+def _runs_by(report: PlacedReport) -> int | None:
+    """Return `TrainInterval.runs_by` after a report."""
+    newest = max((n for n in (report.known.runs_by, report.message.authority) if n is not None), default=None)
+    order = report.message.brake_order
+    return None if newest is None or (order is not None and order >= newest) else newest
 
 
 def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:

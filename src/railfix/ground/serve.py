@@ -7,6 +7,7 @@ import contextlib
 import gc
 import ipaddress
 import json
+import math
 import signal
 import time
 from collections.abc import Callable, Coroutine, Mapping
@@ -97,8 +98,8 @@ class CentreFile(Settings):
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Stations of the line, in order of chainage.
-    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection: unknown until it answers, by the order
-    #: ``detect-section``.
+    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection, which answers by the order
+    #: ``detect-section`` at least every `InterlockingLimits.detection_s`: unknown without.
     detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
     #: Where they are at the first start; afterwards the database knows.
@@ -308,6 +309,7 @@ def _centre(
         ask=points.ask,
     )
     for section in settings.detected_sections:
+        supervision.answered_s[section] = -math.inf
         supervision.set_section_detected(section, None)
     return control, links
 

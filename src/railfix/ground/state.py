@@ -29,6 +29,8 @@ class InterlockingLimits(Settings):
     #: The field answers a request for the detection of points within this time; otherwise the trains on them are
     #: stopped.
     answer_s: float = Field(default=10.0, gt=0)
+    #: The detection of a section answers at least this often; otherwise the section is unknown.
+    detection_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
     #: Highest acceleration and deceleration, between two reports with speeds.
     acceleration_mps2: float = Field(default=2.0, gt=0)
@@ -61,8 +63,9 @@ class TrainInterval:
     reported_m: tuple[float, float] | None = None
     contradiction: str | None = None
     held_end_m: float | None = None  #: End of the authority that the train has, by its newest report.
-    #: Its reports have named an authority, and no order to brake since: it may run on by what it was granted.
-    unbraked: bool = False
+    #: Number of the newest authority by which it may run, sent or named by a report; None before the first, and once a
+    #: report names an order to brake of that number or a later one: none that is still on the way ends that order.
+    runs_by: int | None = None
     stop: str | None = None  #: Why the train is stopped, until it is released by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
     asked_number: int = 0  #: Number of the first authority that requests it.
@@ -187,7 +190,9 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
     InputFileError: when an older version wrote them.
     """
     head = json.loads(texts[HEAD] or "")
-    if "bars" not in head:
+    names = {field.name for field in fields(TrainInterval)}
+    of_trains = [json.loads(text or "").keys() for name, text in texts.items() if name.startswith(_TRAIN)]
+    if "bars" not in head or any(found != names for found in of_trains):
         raise InputFileError("the centre's database", "is of an older version of railfix; name another database")
     trains, points = {}, {}
     for name, text in texts.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks
 from railfix.core.errors import MismatchError, SettingsError
@@ -33,8 +34,10 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.run.processor_setup import parse_position
 
-#: Median C/N0 over the satellites that is this far below that of the log counts as fallen [dB-Hz].
+#: Mean C/N0 over the satellites that is this far below its median over the epochs before counts as fallen [dB-Hz].
 FALLEN_DBHZ = 6.0
+#: Epochs over which that median is taken.
+USUAL_EPOCHS: Final = 600
 #: Tags of different receivers that round to the same multiple of this are one epoch.
 SAME_EPOCH = np.timedelta64(100, "ms")
 
@@ -81,11 +84,13 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
     satellite, signal = (np.array(column) for column in zip(*common, strict=True))
     shape = (len(logs), len(time), len(common))
     code, cn0 = np.full((2, *shape), np.nan)
+    level = np.full((len(time), len(logs)), np.nan)
     for k, (log, chosen, known) in enumerate(zip(logs, channels, names, strict=True)):
         columns = chosen.columns[[known.index(name) for name in common]]
         rows = np.searchsorted(time, epochs[k])
         tags[k, rows] = log.time
         code[k, rows], cn0[k, rows] = log.code_m[:, columns], log.cn0_dbhz[:, columns]
+        level[rows, k] = mean_cn0(log)
     frequency = channels[0].frequency_hz[[names[0].index(name) for name in common]]
     klobuchar = known_from_start(config, navigation=navigation).klobuchar
     corrected, sigma, usable, states_of = np.empty(shape), np.empty(shape), np.empty(shape, bool), []
@@ -110,7 +115,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         usable_ranges(states, corrected[k], 1.0 / common_sigma**2, np.where(usable[k] & shared, 0, 1), groups)
         for k, states in enumerate(states_of)
     ]
-    return fixes_of_ranges(time, ranges, points_ecef_m, cn0_fallen=_fallen(cn0))
+    return fixes_of_ranges(time, ranges, points_ecef_m, cn0_fallen=fallen_cn0(level, level[:0]))
 
 
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
@@ -191,17 +196,24 @@ def round_tags(time: Datetimes) -> Datetimes:
     return np.asarray(rounded.astype("datetime64[ns]"))
 
 
-def _fallen(cn0: Floats) -> Masks:
-    """Return where the median C/N0 of a receiver is far below its median over the log, shape (T, N)."""
-    level = np.where(np.isfinite(cn0), cn0, 0.0).sum(axis=2) / np.maximum(np.isfinite(cn0).sum(axis=2), 1)
-    usual = np.median(level, axis=1, keepdims=True)
-    return np.asarray((level < usual - FALLEN_DBHZ).T)
+def mean_cn0(log: Observations) -> Floats:
+    """Return the mean C/N0 of a receiver's observations at each epoch, 0 without any, shape (T,) [dB-Hz]."""
+    seen = np.isfinite(log.cn0_dbhz)
+    return np.asarray(np.where(seen, log.cn0_dbhz, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
+
+
+def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
+    """Return where the mean C/N0 of a receiver has fallen by `FALLEN_DBHZ`, shape (T, N).
+
+    Against its median over the `USUAL_EPOCHS` before each epoch, of the `earlier_dbhz` too, shape (M, N).
+    """
+    table = pl.DataFrame(np.vstack([earlier_dbhz, level_dbhz])).fill_nan(None)
+    usual = table.select(pl.all().rolling_median(USUAL_EPOCHS, min_samples=1).shift(1)).to_numpy()
+    return np.asarray(level_dbhz < usual[len(earlier_dbhz) :] - FALLEN_DBHZ)
 
 
 #: Number of epochs that may wait for the other receivers.
 _LONGEST_QUEUE: Final = 1000
-#: Epochs over which the usual C/N0 of a receiver is taken.
-_USUAL_EPOCHS: Final = 600
 
 
 class StationStreams:
@@ -219,7 +231,7 @@ class StationStreams:
         self._known: Known = known_from_start(self._config, navigation=navigation)
         self._waiting: dict[np.datetime64, dict[int, Observations]] = {}
         self._done = np.datetime64("1980-01-06", "ns")
-        self._levels = [deque[float](maxlen=_USUAL_EPOCHS) for _ in points_ecef_m]
+        self._levels = np.empty((0, len(points_ecef_m)))
 
     def add_navigation(self, navigation: Navigation) -> None:
         """Take navigation records."""
@@ -248,12 +260,9 @@ class StationStreams:
         return self._fixes(tag, [together[k] for k in range(len(self._points))])
 
     def _fixes(self, tag: np.datetime64, epochs: list[Observations]) -> StationFixes:
-        fallen = np.zeros((1, len(epochs)), dtype=bool)
-        for k, epoch in enumerate(epochs):
-            seen = epoch.cn0_dbhz[np.isfinite(epoch.cn0_dbhz)]
-            level = float(seen.mean()) if len(seen) else 0.0
-            fallen[0, k] = bool(self._levels[k]) and level < float(np.median(self._levels[k])) - FALLEN_DBHZ
-            self._levels[k].append(level)
+        level = np.stack([mean_cn0(epoch) for epoch in epochs], axis=1)
+        fallen = fallen_cn0(level, self._levels)
+        self._levels = np.vstack([self._levels, level])[-USUAL_EPOCHS:]
         try:
             fixes = station_fixes(epochs, self._points, self._known.navigation)
             self.counts["used"] += 1

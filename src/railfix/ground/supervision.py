@@ -43,6 +43,8 @@ ROUTE_AHEAD_M = 700.0
 AUTHORITY_S = 1.0
 #: Numbers of authorities that are skipped at a start: more than an older copy of the database can be behind.
 SKIPPED: Final = 1 << 32
+#: An authority has lapsed on board this long after the report that it answers: longer than `LONGEST_FRESH_S` [s].
+LAPSED_S: Final = 60.0
 #: Largest drift between clocks of a train and of the centre.
 CLOCK_DRIFT: Final = 1e-4
 
@@ -64,6 +66,7 @@ class Supervision:
     heard: set[int] = field(default_factory=set)  #: Trains that have reported since the last authorities.
     #: When a train was sent its last authority [s], and whether it was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
+    granted_s: dict[int, float] = field(default_factory=dict)  #: When it was sent the last one that was no such order.
 
     #: When a train was sent the order to brake that it has not acknowledged yet, and the number of the order.
     ordered: dict[int, tuple[float, int]] = field(default_factory=dict)
@@ -71,8 +74,10 @@ class Supervision:
     begun_s: float = -math.inf  #: Centre's clock at its start with a stored state.
     #: Trains that must report before anything is granted (`begin_again`).
     awaited: set[int] = field(default_factory=set)
-    #: Sections that are detected as occupied; None: not answered yet.
+    #: Sections that are detected as occupied; None: not answered yet, or too long ago.
     detected: dict[str, bool | None] = field(default_factory=dict)
+    #: When the detection of a section has answered last [s], of those that have to repeat it.
+    answered_s: dict[str, float] = field(default_factory=dict)
 
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
     _asked_s: dict[PointName, float] = field(default_factory=dict)
@@ -139,6 +144,16 @@ class Supervision:
         self._asked_s.pop(point, None)
         self.state = points_reported(self.state, point, track, self.layout)
 
+    def has_lapsed(self, train: int, now_s: float) -> bool:
+        """Return whether every authority by which a train may run has lapsed on board.
+
+        Each answers a report that arrived before it was sent, so that its age is counted from then at the latest.
+        """
+        record = self.records.get(train)
+        counted_s = -math.inf if record is None or record.counted_s is None else record.counted_s
+        answered_s = min(self.granted_s.get(train, -math.inf), counted_s)
+        return now_s - max(answered_s, self.begun_s) > LAPSED_S
+
     def begin_again(self, now_s: float) -> tuple[PointName, ...]:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
@@ -147,7 +162,7 @@ class Supervision:
         stored detection of points is dropped.
         """
         self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
-        trains = {n: replace(t, unbraked=t.sequence > 0) for n, t in self.state.trains.items()}
+        trains = {n: replace(t, runs_by=last + SKIPPED) for n, t in self.state.trains.items()}
         points = {name: replace(p, detected=None, commanded=False) for name, p in self.state.points.items()}
         self.state = replace(
             self.state, trains=trains, points=points, granted=last + SKIPPED, skipped=(last, last + SKIPPED)
@@ -155,9 +170,11 @@ class Supervision:
         self._asked_s = dict.fromkeys(points, now_s)
         return tuple(points)
 
-    def set_section_detected(self, section: str, occupied: bool | None) -> None:
+    def set_section_detected(self, section: str, occupied: bool | None, now_s: float = -math.inf) -> None:
         """Process the detection of a section; None where it is unknown."""
         self.detected[section] = occupied
+        if section in self.answered_s:
+            self.answered_s[section] = now_s
         cleared = SWEPT if occupied is False else {UNKNOWN}
         bars = {bar for bar in self.state.bars if bar[0] != section or bar[1] not in cleared}
         unknown = {(section, UNKNOWN)} if occupied is None else set()
@@ -192,7 +209,7 @@ class Supervision:
     def forget(self, trains: Iterable[int]) -> None:
         """Drop the data of trains that are not supervised any more."""
         for number in trains:
-            for kept in (self.records, self.sent, self.ordered, self.issued, self._clocks):
+            for kept in (self.records, self.sent, self.granted_s, self.ordered, self.issued, self._clocks):
                 kept.pop(number, None)
             self.heard.discard(number)
             self.awaited.discard(number)
@@ -209,6 +226,9 @@ class Supervision:
 
         An order is repeated every `AUTHORITY_S` until a report of the train names it.
         """
+        for section, at_s in self.answered_s.items():
+            if now_s - at_s > self.limits.detection_s and self.detected[section] is not None:
+                self.set_section_detected(section, None)
         self.state = overlaps_stopped(parted_cleared(self.state), self.layout)
         self.state = occupied_detected(self.state, self.layout, [n for n, found in self.detected.items() if found])
         for point, asked_s in list(self._asked_s.items()):
@@ -245,11 +265,15 @@ class Supervision:
         due = [number for number in self.state.trains if self._is_due(number, now_s, stopped)]
         if not due:
             return []
-        self.state = replace(self.state, granted=self.state.granted + 1)
+        granted, trains, stop = self.state.granted + 1, dict(self.state.trains), self.state.stopped
+        for number in due:
+            self.sent[number] = now_s, stop or number in stopped
+            if not self.sent[number][1]:
+                self.granted_s[number] = now_s
+                trains[number] = replace(trains[number], runs_by=granted)
+        self.state = replace(self.state, granted=granted, trains=trains)
         self.heard.clear()
-        self.sent.update((number, (now_s, self.state.stopped or number in stopped)) for number in due)
-        stop = self.state.stopped
-        return [self._authority(self.state.trains[number], stopped=stop or number in stopped) for number in due]
+        return [self._authority(trains[number], stopped=self.sent[number][1]) for number in due]
 
     def _grant(self, now_s: float, stopped: Mapping[int, str]) -> None:
         """Release points, set routes, and extend authorities."""

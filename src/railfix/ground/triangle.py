@@ -330,24 +330,51 @@ class MonitoredLog:
         return pl.DataFrame(columns).fill_nan(None)
 
 
+@dataclass(kw_only=True)
+class Monitor:
+    """Monitor of fixes in order of time, in pieces of any number of epochs; released at the start."""
+
+    limits: TriangleLimits
+    times: MonitorLimits
+    state: MonitorState = field(default_factory=lambda: MonitorState(stopped=False))
+    begun: bool = False
+
+    def begin(self, now_s: float) -> None:
+        """Begin at a clock time: fixes are late `MonitorLimits.late_s` after it."""
+        self.state, self.begun = replace(self.state, complete_s=now_s), True
+
+    def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
+        """Process fixes at a clock time, by default each at its tag; return their verdicts with the orders to be sent.
+
+        The cause of an order is the one that the stop has at the end of the fixes: it may have become more exact.
+        SettingsError: the sides of the triangle are too short for the limits.
+        """
+        triangle, orders = judge_fixes(fixes, self.limits), []
+        seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9
+        for k, second in enumerate(seconds.tolist()):
+            now, verdict = second if now_s is None else now_s, TriangleVerdict(int(triangle.verdict[k]))
+            if not self.begun:
+                self.begin(now)
+            receiver = int(triangle.receiver[k])
+            self.state, given = advance(self.state, now, verdict, receiver=receiver, limits=self.times)
+            orders += [(fixes.time[k], order) for order in given]
+        cause = self.state.cause or TriangleVerdict.HEALTHY
+        latched = tuple((time, order, cause, self.state.receiver) for time, order in orders)
+        return MonitoredLog(fixes=fixes, triangle=triangle, orders=latched)
+
+    def silent(self, now_s: float) -> tuple[Order, ...]:
+        """Process that nothing has come since the last epoch; return the orders to be sent where it is late."""
+        if now_s - self.state.complete_s <= self.times.late_s:
+            return ()
+        self.state, orders = advance(self.state, now_s, None, limits=self.times)
+        return orders
+
+
 def monitor_log(
     fixes: StationFixes, *, limits: TriangleLimits | None = None, times: MonitorLimits | None = None
 ) -> MonitoredLog:
-    """Run the monitor over fixes in order of time, released at the start.
-
-    SettingsError: when the sides of the triangle are too short for the limits.
-    """
-    limits, times = limits or TriangleLimits(), times or MonitorLimits()
-    triangle = judge_fixes(fixes, limits)
-    seconds = (fixes.time - fixes.time[0]) / np.timedelta64(1, "s")
-    state, orders = MonitorState(stopped=False), []
-    for k, now in enumerate(seconds.tolist()):
-        verdict = TriangleVerdict(int(triangle.verdict[k]))
-        state, given = advance(state, now, verdict, receiver=int(triangle.receiver[k]), limits=times)
-        orders += [(fixes.time[k], order, state.cause or verdict, state.receiver) for order in given]
-    # one stop, latched: its cause may have become more exact after the orders
-    orders = [(time, order, state.cause or cause, state.receiver) for time, order, cause, _ in orders]
-    return MonitoredLog(fixes=fixes, triangle=triangle, orders=tuple(orders))
+    """Run the monitor over the fixes of a log; SettingsError as `Monitor.judge`."""
+    return Monitor(limits=limits or TriangleLimits(), times=times or MonitorLimits()).judge(fixes)
 
 
 def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> None:
@@ -382,29 +409,6 @@ def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> N
         axes.legend(loc="upper left", ncols=5, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-
-
-@dataclass(kw_only=True)
-class LiveMonitor:
-    """Monitor of fixes as they arrive, one epoch at a time."""
-
-    limits: TriangleLimits
-    times: MonitorLimits
-    state: MonitorState = field(default_factory=lambda: MonitorState(stopped=False))
-
-    def judge(self, fixes: StationFixes, now_s: float) -> tuple[MonitoredLog, tuple[Order, ...]]:
-        """Process one epoch; return its verdict, and the orders to be sent; SettingsError as `monitor_log`."""
-        triangle = judge_fixes(fixes, self.limits)
-        verdict, receiver = TriangleVerdict(int(triangle.verdict[0])), int(triangle.receiver[0])
-        self.state, orders = advance(self.state, now_s, verdict, receiver=receiver, limits=self.times)
-        return MonitoredLog(fixes=fixes, triangle=triangle, orders=()), orders
-
-    def silent(self, now_s: float) -> tuple[Order, ...]:
-        """Take that nothing has come since the last epoch; return the orders to be sent where it is late."""
-        if now_s - self.state.complete_s <= self.times.late_s:
-            return ()
-        self.state, orders = advance(self.state, now_s, None, limits=self.times)
-        return orders
 
 
 def judge_fixes(fixes: StationFixes, limits: TriangleLimits) -> TriangleResult:

@@ -27,10 +27,11 @@ from railfix.io.receiver.framing import SbasFrames, find_frames
 from railfix.io.receiver.log import StreamState, at_station, decode
 from railfix.io.receiver.measurements import Tracking, join_observations
 from railfix.io.rinex import scan_observations
+from railfix.io.sensor_tables import COLUMNS
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Connected, Lost, Place, is_file, read_source
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.run.sensors import COLUMNS, make_samples
+from railfix.run.sensors import make_samples
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -89,14 +89,10 @@ def prior_of_last_place(
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
     """Return tracks that a train from anywhere on a track can have reached after a distance, turns included."""
-    ends: nx.Graph[int] = nx.Graph()
-    for k, length in enumerate(network.length_m.tolist()):
-        ends.add_edge(2 * k, 2 * k + 1, weight=length)
-    for link in network.links:
-        if link.navigable:
-            ends.add_edge(2 * link.first + link.first_end, 2 * link.second + link.second_end, weight=0.0)
-    near = nx.multi_source_dijkstra_path_length(ends, {2 * track, 2 * track + 1}, cutoff=within_m)
-    return [network.names[k] for k in sorted({node // 2 for node in near})]
+    near = nx.multi_source_dijkstra_path_length(
+        network.graph.to_undirected(as_view=True), {4 * track + k for k in range(4)}, cutoff=within_m
+    )
+    return [network.names[k] for k in sorted({node // 4 for node in near})]
 
 
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
