@@ -158,7 +158,7 @@ def load_scenario(name: FilePath) -> Scenario:
 
 
 def scenario_table(scenario: Scenario) -> dict[str, Any]:
-    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings.write_toml`.
+    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings_files.write_toml`.
 
     None is the word "none"; `multipath` is not in it.
     """
