@@ -17,7 +17,7 @@ from railfix.core.arrays import Floats, Masks
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve
-from railfix.ranges.corrected import AntennaRanges
+from railfix.ranges.corrected import AntennaRanges as AntennaRanges
 
 Limits = TypeVar("Limits", bound=Settings)
 #: Least number of sigmas added to the sigma of a suspected range: at most a fifth of its weight remains.
