@@ -204,7 +204,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     folder = tmp_path / "folder.csv"
     folder.mkdir()
     assert "a folder" in refused(folder)
-    assert "no track map" in refused([], SettingsError)
+    assert "no file was given" in refused([], SettingsError)
 
 
 @pytest.mark.parametrize(("crs", "said"), [("EPSG:6677", "projected coordinates"), ("EPSG:0", "unknown")])

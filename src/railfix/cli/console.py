@@ -98,7 +98,8 @@ def _judge(row: Mapping[str, Any]) -> str:
     """Return one run and antenna in a sentence."""
     from railfix.evaluate.accuracy import WRONG_PLACE_M
 
-    name = f"{row['run']}, {row['antenna']}"
+    run, train, _ = str(row["run"]).partition(" (train)")
+    name = f"{run}, {row['antenna']}, {'filter along the track' if train else 'every single epoch'}"
     if not row["errors"]:
         return f"{name}: no position has a reference"
     text = (

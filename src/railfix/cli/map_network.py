@@ -22,7 +22,7 @@ from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
-from railfix.track.network_read import TOLERANCE_M, check_network, read_network
+from railfix.track.network_read import FAULTS, TOLERANCE_M, check_network, read_network
 from railfix.track.network_route import Filled, Rows, fill_gaps, find_route, left_out_note
 from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
@@ -146,7 +146,7 @@ def network(
 
         write_network_page(tracks, quality, page)
         console.print(f"page: {page}")
-    faults = [f for f in quality.findings if f.kind in ("gap", "joint", "kink")]
+    faults = [f for f in quality.findings if f.kind in FAULTS]
     if faults:
         raise MapQualityError(f"the network has {plural(faults, 'fault')}, the first: {faults[0].sentence}")
 

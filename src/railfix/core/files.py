@@ -121,10 +121,10 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of texts; ValueError where none is given, SettingsError: not a path."""
+    """Return one or several paths as a list of texts; SettingsError where none is given, or it is not a path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
-        raise ValueError("no file was given")
+        raise SettingsError("no file was given")
     if wrong := [name for name in names if not isinstance(name, str | PathLike)]:
         raise SettingsError(f"a path, or several, were expected, got {type(wrong[0]).__name__}")
     return [str(name) for name in names]
@@ -322,7 +322,7 @@ def hatanaka_program(name: str) -> AbstractContextManager[Path]:
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the decoder on an open source and take ownership of the resources in `held`."""
+    """Start the decoder on an open source; it owns the resources in `held` from then on."""
     if not isinstance(getattr(source, "raw", None), io.FileIO):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:

@@ -15,7 +15,18 @@ _MAX_CHARACTERS: Final = 100
 
 
 class NotebookTable:
-    """Base of dataclasses that notebooks show as a table: `repr` as caption, one row a field."""
+    """Base of dataclasses that notebooks show as a table: `repr` as caption, one row per field.
+
+    Classes without a `repr` of their own are dataclasses with ``repr=False``: names of the fields, with shapes.
+    """
+
+    def __repr__(self) -> str:
+        shown = [
+            f"{name} {value.shape}" if isinstance(value, np.ndarray) else name
+            for name in (item.name for item in fields(self))  # type: ignore[arg-type]
+            for value in [getattr(self, name)]
+        ]
+        return f"<{type(self).__name__}: {_cut(', '.join(shown))}>"
 
     def _repr_html_(self) -> str:
         if not is_dataclass(self):

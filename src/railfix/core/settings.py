@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from railfix.core.errors import SettingsError
+from railfix.core.notebook import html_table
 
 
 def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
@@ -49,6 +51,9 @@ class Settings(BaseModel):
                 f"{type(self).__name__} cannot be changed; make another one: settings.replaced({name}={value!r})"
             )
 
+        def __delattr__(self, name: str) -> None:
+            raise SettingsError(f"{type(self).__name__} cannot be changed; Config().replaced() keeps all settings")
+
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Yield the settings that differ from their defaults, of which some are computed from the settings before."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
@@ -56,6 +61,11 @@ class Settings(BaseModel):
             value = values[name]
             if field.is_required() or value != field.get_default(call_default_factory=True, validated_data=values):
                 yield name, value
+
+    def _repr_html_(self) -> str:
+        rows = [{"setting": str(name), "value": repr(value)} for name, value in self.__repr_args__()]
+        of = f"{len(rows)} of {len(type(self).model_fields)} settings are not the defaults"
+        return html_table(rows, caption=f"{type(self).__name__}: {of}")
 
     @field_validator("*", mode="before")
     @classmethod
@@ -71,9 +81,11 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _one_word_for_a_list(cls, value: Any, info: ValidationInfo) -> Any:
-        """Take words with commas between them for a list: ``systems=G``."""
-        if isinstance(value, str) and get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
-            return tuple(word.strip() for word in value.split(",") if word.strip())
+        """Take words with commas between them, or one path, for a list: ``systems=G``."""
+        if get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
+            if isinstance(value, str):
+                return tuple(word.strip() for word in value.split(",") if word.strip())
+            return (value,) if isinstance(value, Path) else value
         return value
 
     def replaced(self, **changes: Any) -> Self:

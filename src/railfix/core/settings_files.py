@@ -11,7 +11,7 @@ import tomli_w
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.settings import Model, Settings, validate
-from railfix.core.staged_files import FilePath, write_whole
+from railfix.core.staged_files import FilePath, check_path, write_whole
 
 
 def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
@@ -19,6 +19,7 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
 
     InputFileError: the file is missing, unreadable, not UTF-8, or not TOML.
     """
+    check_path(path, what=f"the path of {what}")
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:

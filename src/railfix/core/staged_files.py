@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Paths, and files that are written whole or not at all."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from railfix.core.errors import OutputError
+from railfix.core.errors import OutputError, SettingsError
 
 FilePath = str | os.PathLike[str]
 
@@ -51,3 +51,9 @@ def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputErro
     """Return the error of a file that cannot be written: the system's reason, and what to do."""
     hint = _FULL.get(error.errno or 0, "name a folder that can be written to")
     return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
+
+
+def check_path(path: object, *, what: str = "a path") -> None:
+    """Raise SettingsError where a value is not a path; `what` names what was expected."""
+    if not isinstance(path, str | os.PathLike):
+        raise SettingsError(f"{what} was expected, got {type(path).__name__}")

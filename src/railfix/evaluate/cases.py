@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,8 +11,8 @@ from pydantic import Field
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_text
-from railfix.core.settings import Settings
-from railfix.core.settings_files import load_settings
+from railfix.core.settings import Settings, validate
+from railfix.core.settings_files import load_settings, write_toml
 from railfix.evaluate.evaluation_inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
@@ -109,6 +109,13 @@ def read_case(folder: Path) -> Case:
             placed[name] = tuple(root / path for path in value) if isinstance(value, tuple) else root / value
     truth = placed.pop("truth")
     return Case(name=folder.resolve().name, folder=folder, content=content, inputs=RunInputs(**placed), truth=truth)
+
+
+def write_case(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write the ``case.toml`` of a folder from its content without hashes; errors as `read_case`."""
+    case = validate(CaseFile, {**content, "sha256": {}}, source=str(folder / CASE_FILE))
+    hashes = {str(name): file_sha256(folder / name) for name in case.every_file()}
+    write_toml(folder / CASE_FILE, {**content, "sha256": hashes}, what="a case of a benchmark")
 
 
 def read_cases(folder: Path) -> list[Case]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import Field
 
+from railfix.core.errors import needs_extra
 from railfix.core.settings import Settings
 from railfix.ground.layout import MOST_PARTS
 from railfix.io.train_message import MessageError, validate_message
@@ -45,7 +46,8 @@ class Authority(Settings):
 
     def encode(self) -> bytes:
         """Return the bytes of the message."""
-        import cbor2
+        with needs_extra():
+            import cbor2
 
         return cbor2.dumps([self.kind, VERSION, *self.model_dump().values()], canonical=True)
 
@@ -58,7 +60,8 @@ class Authority(Settings):
         MessageError
             The bytes are not an authority of this version.
         """
-        import cbor2
+        with needs_extra():
+            import cbor2
 
         try:
             kind, version, *values = cbor2.loads(data)

@@ -103,7 +103,7 @@ class ReceiverLimits(Settings):
     delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed one.
     #: Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: A sequence number may be further ahead of the newest by so many, and by so many a second since then.
+    #: Largest lead of a sequence number over the newest one, and its growth per second since then.
     jump: int = Field(default=1000, ge=1)
     rate: float = Field(default=100.0, gt=0)
 

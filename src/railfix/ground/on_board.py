@@ -144,7 +144,7 @@ class OnBoard:
         late lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
-            # also of a centre whose database is an older copy, and knows no numbers as high as the train's
+            # also from a centre whose database is an older copy, with smaller numbers than the train's
             if self.order is None or authority.number >= self.order.number:
                 self.order = authority
             return True

@@ -126,7 +126,7 @@ def wide_bounds(report: PlacedReport) -> str | None:
 
 
 def off_line(report: PlacedReport) -> str | None:
-    """Return the reason of a place off the line."""
+    """Return the reason for rejecting a position off the line."""
     first, last = report.layout.stations[0].begin_m, report.layout.stations[-1].end_m
     on_line = first - report.over_m <= report.front_m <= last + report.under_m
     return None if on_line else f"the position is not on the line: {report.front_m:.0f} m"
@@ -139,7 +139,7 @@ def moving_standstill(report: PlacedReport) -> str | None:
 
 
 def unknown_authority(report: PlacedReport) -> str | None:
-    """Return the reason of an authority that the centre has not given, as far as its database knows."""
+    """Return the reason for an authority that is not in the centre's database."""
     held, (last, first) = report.message.authority or 0, report.skipped
     if held <= report.granted and not last < held < first:
         return None

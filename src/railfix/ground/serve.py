@@ -102,7 +102,7 @@ class CentreFile(Settings):
     #: ``detect-section`` at least every `InterlockingLimits.detection_s`: unknown without.
     detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
-    #: Where they are at the first start; afterwards the database knows.
+    #: Initial stations of the trains; later starts read them from the database.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"  #: File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
     log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.

@@ -12,12 +12,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
-import sqlalchemy as sql
-from sqlalchemy import event
-
-from railfix.core.errors import InputFileError, OutputError
+from railfix.core.errors import InputFileError, OutputError, needs_extra
 from railfix.ground.centre import TrainRecord
 from railfix.io.train_message import decode, encode
+
+with needs_extra():
+    import sqlalchemy as sql
+    from sqlalchemy import event
 
 _META: Final = sql.MetaData()
 #: Lines of the log that are kept while the database fails, and in the database.

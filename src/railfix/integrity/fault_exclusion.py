@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
+from railfix.core.notebook import NotebookTable
 from railfix.integrity.raim import (
     Detection,
     Exclusion,
@@ -27,8 +28,8 @@ from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.search_index import SearchIndex
 
 
-@dataclass(frozen=True, kw_only=True)
-class RaimResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RaimResult(NotebookTable):
     """Detection and exclusion of T epochs."""
 
     outcome: Codes  #: `raim.Outcome`, shape (T,).

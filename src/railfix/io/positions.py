@@ -13,6 +13,7 @@ from railfix.core.errors import InputFileError, NoPositionError, SettingsError
 from railfix.core.files import BrokenLines, FilePath
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.notebook import plural
+from railfix.core.staged_files import check_path
 from railfix.core.timescale import from_week, utc_to_gpst
 from railfix.gnss.observations import first_problems
 from railfix.io.file_kind import FileKind, find_kind, wrong_kind
@@ -138,6 +139,7 @@ def read_positions(
     SettingsError
         `columns` names a column that railfix does not know, or the file is no table.
     """
+    check_path(path)
     kind = find_kind(path)
     if columns and kind != "table":
         raise SettingsError(f"{path}: columns can be renamed in a table with named columns only")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath
+from railfix.core.notebook import NotebookTable
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns
 from railfix.io.position_log import PositionLog, numbers_or_nan, qualities_in_words
@@ -34,8 +35,8 @@ _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
 _FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
 
 
-@dataclass(frozen=True, kw_only=True)
-class AntennaReference:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class AntennaReference(NotebookTable):
     """Reference positions of one antenna, R epochs."""
 
     time: Datetimes  #: Rising, GPS time; shape (R,).

@@ -129,7 +129,7 @@ def locate(
         Over travelled distance in rising arc length, `arc_m` about the predicted place (0 in its middle).
     line : LineSeries
     predicted_m, sigma_m : float [m]
-        Place of the middle of the stretch as known before.
+        A-priori arc length of the middle of the stretch.
     quantity : {"gradient", "curvature"}
         By which it is placed; the other one must fit there.
     noise : tuple of float

@@ -95,7 +95,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
     tracked: Tracked  #: Output of the filter; channels as those of `AntennaResult.corrected`.
     trajectory: Trajectory  #: Of the antenna.
     arc_m: Floats  #: Positions on the trajectory, those just beyond an end on it; NaN further out; shape (T,).
-    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed does not tell; shape (T,).
+    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
     standstill: Masks  #: Shape (T,).
     sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
     #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape

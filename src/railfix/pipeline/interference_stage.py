@@ -12,6 +12,7 @@ import numpy as np
 from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, copy_with, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.epoch_rows import join_epochs, take_epochs
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason, Status
 from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.interference import (
@@ -84,8 +85,8 @@ class InterferenceState:
     latest: Interference | None = None  #: Of that epoch.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Interference:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Interference(NotebookTable):
     """Interference of T epochs."""
 
     causes: Bits  #: `Sign` bits, each for as long as its time of release; shape (T,).

@@ -238,7 +238,8 @@ class GrossErrors(NamedTuple):
     """Gross errors of raw ranges, T epochs by M channels."""
 
     gross: Masks  #: Ranges that are grossly wrong, shape (T, M).
-    #: Arc of the best point of the line where the ranges do not tell a position or a grossly wrong one; else NaN; (T,).
+    #: Arc length of the best point of the line where the ranges cannot separate a position from a gross error; else
+    #: NaN; (T,).
     unsure_arc_m: Floats
     unsure: Masks  #: Epochs with a grossly wrong range that cannot be identified, shape (T,).
 

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.noise_windows import correlated_sums
@@ -69,8 +70,8 @@ class MapOffsetState:
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapOffset:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class MapOffset(NotebookTable):
     """Mean offset of the 3-D positions from the line over the window, T epochs; NaN before there are enough samples."""
 
     #: Right of the line in the direction of rising chainage, and above it; shape (T,).

@@ -21,6 +21,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.epoch_rows import EVERY
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
 from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.second_codes import SecondCodes
@@ -71,8 +72,8 @@ class TwoFrequencyState:
         return own, np.array([known[name] for name in names], dtype=np.intp)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Combined:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Combined(NotebookTable):
     """One pseudorange a satellite from two codes: T epochs by K channels; NaN where the first code is alone."""
 
     code_m: Floats  #: Shape (T, K).

@@ -16,7 +16,7 @@ from railfix.core.timescale import SECONDS_PER_DAY, to_week
 
 #: Klobuchar coefficients that GPS broadcast on 2004-01-01, at middling solar activity; RTKLIB too takes them where it
 #: has none. Their vertical delay is 2.8 m RMS over day and latitude; that of the five other available days from 2005 to
-#: 2024 differs from it by 0.7 to 1.7 m RMS (`tests/studies/integrity_tables.py coefficients`).
+#: 2024 differs from it by 0.7 to 1.7 m RMS.
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
 #: Radius of the Earth over that of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.epoch_rows import OnDemand
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates
@@ -23,8 +24,8 @@ from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSate
 ORBITS_M: Final = (2e7, 6e7)
 
 
-@dataclass(frozen=True, kw_only=True)
-class AntennaRanges:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class AntennaRanges(NotebookTable):
     """Corrected ranges of one antenna as input of the screens: T epochs by K channels."""
 
     time: Datetimes  #: Shape (T,).
@@ -48,7 +49,7 @@ class AntennaRanges:
     reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class CorrectedRanges(AntennaRanges, OnDemand):
     """Corrected pseudoranges before positioning: T epochs by the K channels of `select_channels`."""
 

@@ -199,7 +199,8 @@ class ErrorModel:
     #: effect of the screens.
     before: BinStatistics
     after: BinStatistics
-    #: "local": multipath and receiver noise alone (a reference station took the rest away). "satellite_and_atmosphere":
+    #: "local": multipath and receiver noise alone (a reference station removed the other errors).
+    #: "satellite_and_atmosphere":
     #: these, too, as they were on those days.
     covers: Literal["local", "satellite_and_atmosphere"]
     #: Settings under which the model is valid; None: unknown, compared with nothing.

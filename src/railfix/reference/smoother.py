@@ -104,7 +104,7 @@ class _States:
 
 
 def smooth(evidence: Evidence, settings: ReferenceSettings) -> SmoothedReference:
-    """Estimate position and speed at every instant from all measurements, at least one fix among them.
+    """Estimate position and speed at every instant from all measurements, which include at least one fix.
 
     A Kalman filter forward and the smoother of Rauch, Tung and Striebel back (`filterpy.kalman.KalmanFilter`); Doppler
     speeds are weighed by Huber's function of their residuals, in `_ROUNDS` rounds.

@@ -91,11 +91,12 @@ class ReportedRun:
         return None if self.train is None else self.train.filter(antenna=antenna)
 
 
-def get_figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
+def get_figures(
+    evaluation: Evaluation, run: ReportedRun, antenna: str, position: str, table: str = POSITIONS_TABLE
+) -> dict[str, Any]:
     """Return the figures of merit of one antenna and kind of position; empty where none exist."""
-    rows = evaluation.figures.filter(
-        grouping="all", epochs_of="own", run=run.name_in(evaluation), antenna=antenna, position=position
-    )
+    name = run.name_in(evaluation, table)
+    rows = evaluation.figures.filter(grouping="all", epochs_of="own", run=name, antenna=antenna, position=position)
     return rows.row(0, named=True) if len(rows) == 1 else {}
 
 

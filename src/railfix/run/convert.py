@@ -18,7 +18,7 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix import __version__
-from railfix.core.errors import NoPositionError, OutputError
+from railfix.core.errors import NoPositionError, OutputError, needs_extra
 from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 from railfix.gnss.observations import ObservationHeader
@@ -120,9 +120,10 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
     ``/ANTENNA/fix`` is sensor_msgs/NavSatFix, ``/ANTENNA/row`` has every column, and ``/ANTENNA/track``, of the filter
     alone, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The file
     contains the `description`: the kind of positions, and the frame of the coordinates. NoPositionError: no row has
-    coordinates. ModuleNotFoundError: mcap-ros2-support is not installed.
+    coordinates. SettingsError: mcap-ros2-support is not installed.
     """
-    from mcap_ros2.writer import Writer
+    with needs_extra():
+        from mcap_ros2.writer import Writer
 
     known = rows.drop_nulls(COORDINATES)
     if known.is_empty():

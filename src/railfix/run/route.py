@@ -45,7 +45,7 @@ _LEAST_NAMED: Final = 0.01
 _NAMED: Final = 8
 #: Epochs of an alternative nearer than this belong together [s].
 _TOGETHER_S: Final = 60.0
-#: Probability of a track that the map lacks beyond which the log speaks for one: twice what it has before the log.
+#: Probability of a track that the map lacks, above which the log indicates one: twice the prior.
 _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
 #: Name of a track that the map does not have.
 NONE: Final = "none"

@@ -83,7 +83,7 @@ def sign_notes(
 ) -> Iterator[str]:
     """Yield a sentence on each sensor with a wrong sign, unit, axis, or time tags seconds off.
 
-    `places` has ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
+    `places`: positions with ``time_gpst`` and ``chainage_m`` of single epochs of one antenna that passed every check.
     """
     wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
     yield from _forces_at_rest(inertial)

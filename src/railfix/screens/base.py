@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol,
 import numpy as np
 
 from railfix.core.arrays import Floats, Masks
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve
@@ -24,8 +25,8 @@ Limits = TypeVar("Limits", bound=Settings)
 LEAST_SUSPICION: Final = 2.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Screened:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Screened(NotebookTable):
     """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions."""
 
     metric: Floats  #: Measured quantity in the unit that the screen names; NaN where it cannot be run.

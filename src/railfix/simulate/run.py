@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import polars as pl
 
-from railfix.core.errors import OutputError
+from railfix.core.errors import OutputError, check_type
 from railfix.core.files import FilePath
 from railfix.core.settings_files import write_toml
 from railfix.core.timescale import seconds
@@ -219,6 +219,7 @@ def write_run(
     are ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, those of the sensors,
     ``scenario``, ``readme``.
     """
+    check_type(scenario, Scenario, "scenario")
     simulation = Simulation(scenario)
     tables = sensor_tables(simulation)
     with OutputFolder(Path(folder), overwrite=overwrite) as out:

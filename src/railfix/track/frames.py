@@ -15,7 +15,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError, needs_extra
 from railfix.core.files import FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.crs import (
@@ -198,10 +198,8 @@ def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
     """Move JGD2011 by a semi-dynamic correction, once in each thousandth of a degree, and with the plate."""
-    try:
+    with needs_extra(f"{path}: semi-dynamic correction"):
         import jgdtrans
-    except ImportError:
-        raise InputFileError(path, "semi-dynamic correction needs jgdtrans: pip install 'railfix[maps]'") from None
     try:
         correction = jgdtrans.loads(read_text(path), format="SemiDynaEXE")
     except jgdtrans.ParseParFileError as error:

@@ -36,11 +36,11 @@ _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
 _LEAVE_BESIDE_COST: Final = 10.0
 _ENTER_BESIDE_COST: Final = 7.0
-#: And the same of a position that lies farther than this beyond an end of a track at which the map ends [m].
+#: Distance beyond a track end at which the map ends, above which the same applies to a position [m].
 _OPEN_COST: Final = 2.0
 _BEYOND_M: Final = 10.0
 _ROUNDED_M: Final = 1e-6
-#: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
+#: Length by which a connection may exceed the straight distance of two positions [m], and fraction of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Difference of path length and distance at which a joint is half as probable as where they agree [m].

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError, SettingsError, check_type
 from railfix.core.files import FilePath, read_text
 from railfix.core.notebook import plural
 from railfix.core.settings import misspelt
@@ -411,6 +411,7 @@ def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = No
     OutputError
         The file cannot be written.
     """
+    check_type(track, Track, "track")
     columns = {
         "latitude_deg": [f"{v:.10f}" for v in track.latitude_deg],
         "longitude_deg": [f"{v:.10f}" for v in track.longitude_deg],

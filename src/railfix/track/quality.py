@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Floats, Masks
-from railfix.core.notebook import plural
+from railfix.core.errors import check_type
+from railfix.core.notebook import NotebookTable, plural
 from railfix.core.settings import Settings
 from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
@@ -66,8 +67,8 @@ class Finding:
     sentence: str
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackQuality:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class TrackQuality(NotebookTable):
     """Quality report of a track map."""
 
     track: Track
@@ -88,6 +89,7 @@ class TrackQuality:
 
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
     """Check the quality of a map that was read with ``duplicates="keep"``: duplicates are findings and no error."""
+    check_type(track, Track, "track")
     limits = limits or MapLimits()
     geometry = compute_geometry(track)
     findings = [

@@ -178,8 +178,9 @@ def hold_signs(
 ) -> tuple[Masks, Masks, HeldState]:
     """Return which conditions have been true for their time, which within their time of release, and the state.
 
-    An interval between epochs counts for half the time of holding at most, so that one epoch after a gap proves
-    nothing. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a time of holding of 0
+    An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
+    sufficient. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a time of holding of
+    0
     counts at once.
     """
     conditions = signs.shape[1]

@@ -20,8 +20,8 @@ _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one lin
 _APART_WIDTHS: Final = 3.0
 _MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must lie on the line.
 _SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is evened out [m].
-#: Longer without any row [s] a run is followed over no more than a distance [m], and where it goes on in the direction
-#: of that distance: cosine of the largest angle.
+#: Longest gap without rows [s]; a longer one is bridged over at most a distance [m], and only where the run continues
+#: in its direction: cosine of the largest angle.
 _GAP_S: Final = 10.0
 BRIDGED_M: Final = 500.0
 _GOES_ON: Final = 0.9
