@@ -56,9 +56,7 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Print for each run and antenna the accuracy of its positions and whether its stated figures are true; the worst
-    first.
-    """
+    """Return each run's and antenna's accuracy and whether its stated figures are true; the worst first."""
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
@@ -219,9 +217,7 @@ def show_files(console: Console, paths: Iterable[Path]) -> None:
 
 @contextmanager
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
-    """Yield a progress bar on the standard error output, with the rate and the time left; silent where that is not a
-    terminal.
-    """
+    """Yield a progress bar on the standard error output, with rate and time left; silent without a terminal."""
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),

@@ -254,9 +254,7 @@ def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[s
 
 
 def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file; `what` names the expected kind of file with its article ("the record of a
-    run").
-    """
+    """Return the object in a JSON file; `what` names the expected kind, with its article ("the record of a run")."""
     try:
         content = json.loads(read_text(path))
     except RecursionError:

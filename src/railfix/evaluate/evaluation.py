@@ -93,9 +93,7 @@ class Evaluation(NotebookTable):
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return one figure of the row with these values, by default of "all", own, constrained; otherwise
-        LookupError.
-        """
+        """Return one figure of the row with these values, by default "all", own, constrained; otherwise LookupError."""
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:

@@ -176,9 +176,7 @@ class OnBoard:
         return False
 
     def _answers(self, authority: Authority) -> bool:
-        """Return whether an authority answers a report of this start on board, since the last change of ends, that is
-        not older than `LONGEST_FRESH_S`.
-        """
+        """Return whether an authority answers a report of this start and end, at most `LONGEST_FRESH_S` old."""
         if authority.session != self.session or authority.report <= self.before_turn:
             return False
         remembered = authority.report >= next(iter(self._sent), -1)

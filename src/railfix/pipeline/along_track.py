@@ -169,9 +169,7 @@ def with_passings(
     samples: SensorSamples | None,
     limits: BaliseLimits,
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions with the balises that were passed, and the state; called after the last verdict on the
-    positions.
-    """
+    """Return the positions with the passed balises, and the state; after the last verdict on the positions."""
     if listed is None:
         return result, state
     readings = samples.balises if samples else BaliseReadings()

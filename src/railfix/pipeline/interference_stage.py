@@ -132,9 +132,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites that are wrong individually, not by a spoofer who moves all satellites of a clock; shape
-    (T, K).
-    """
+    """Return the satellites that are wrong individually, not by a spoofer of a whole clock; shape (T, K)."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:

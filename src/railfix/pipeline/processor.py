@@ -209,9 +209,7 @@ class EpochProcessor:
         return tuple(notes)
 
     def antenna_order(self) -> AntennaOrder | None:
-        """Return a test, without positions as yet, of the order of two antennas; None without two antennas of one
-        vehicle.
-        """
+        """Return a new test of the order of two antennas; None without two antennas of one vehicle."""
         if len(self.trajectories) < 2 or not self.setup.spacing_known:
             return None
         tolerance = self.config.antenna_pair.tag_tolerance_s

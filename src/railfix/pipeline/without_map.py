@@ -100,9 +100,7 @@ _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OT
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
-    """Return corrected ranges of one antenna without a track: the approximate position is computed from the codes
-    alone.
-    """
+    """Return corrected ranges of one antenna without a track: the codes give the approximate position."""
     channels = book.of(obs, received.navigation)
     source = replace(broadcast_source(received, config), second="none")
     satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)

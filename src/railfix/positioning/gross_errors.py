@@ -104,9 +104,7 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return the one range without which the others agree within `AGREEING_M`, shape (T, M); none where two explain the
-    residuals.
-    """
+    """Return the range without which the others agree within `AGREEING_M`, shape (T, M); none where two do."""
     epochs, channels = ranges.weight.shape
     epoch, channel = np.nonzero(ranges.weight > 0)
     each = ranges.take(epoch)
@@ -210,9 +208,7 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
 
 
 def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at N positions of each epoch, (T, N, 3) [m], each clock at its median, (T, N, M);
-    NaN: not used.
-    """
+    """Return residuals at N positions per epoch, (T, N, 3) [m], each clock at its median, (T, N, M); NaN: unused."""
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
     square += (place_ecef_m**2).sum(axis=2)[..., None] + (satellite**2).sum(axis=2)[:, None]

@@ -43,9 +43,7 @@ class RobustFit:
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
-    """Return the inverse covariance of the position across and above sections of a line, ECEF, shape (T, 3,
-    3) [1/m^2].
-    """
+    """Return the inverse covariance of positions across and above a line, ECEF, shape (T, 3, 3) [1/m^2]."""
     return compute_information(trajectory.get_axes(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 

@@ -137,9 +137,7 @@ def map_offset(
     *,
     limits: MapOffsetLimits | None = None,
 ) -> tuple[MapOffset, list[MapOffsetState]]:
-    """Compute the mean offset of 3-D positions from the line, each epoch's own position included; states are by
-    antenna.
-    """
+    """Compute the mean offset of 3-D positions from the line, each epoch's included; states are by antenna."""
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.space_redundancy > 0)
     arc = np.where(usable, arc_m, 0.0)
@@ -173,9 +171,7 @@ def map_offset(
 
 
 def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
-    """Return how far 3-D positions (T, 3) lie right of positions on the line and above them, shape (T, 2); NaN
-    without.
-    """
+    """Return the offsets of 3-D positions (T, 3) from the line, right and up, shape (T, 2); NaN without."""
     known = np.isfinite(arc_m)
     arc = np.where(known, arc_m, 0.0)
     axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]

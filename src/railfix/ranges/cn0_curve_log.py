@@ -41,9 +41,7 @@ class Cn0Calibration:
 
 
 def satellite_elevation_deg(observations: Observations, navigation: Navigation, position_ecef_m: Floats) -> Floats:
-    """Elevation of each channel's satellite from a fixed position (3,), shape (T, M) [deg]; NaN without
-    orbit or code.
-    """
+    """Elevation of each satellite from a fixed position (3,), shape (T, M) [deg]; NaN without orbit or code."""
     names, first, which = np.unique(observations.satellite, return_index=True, return_inverse=True)
     code = np.full((len(observations), len(names)), np.nan)
     for m, k in enumerate(which.tolist()):

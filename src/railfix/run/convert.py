@@ -265,5 +265,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """Return the columns of a table of the schema in their order; those that railfix has not are empty."""
+    """Return the columns of a table of the schema in their order; those without a value in railfix are empty."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

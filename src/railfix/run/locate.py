@@ -358,9 +358,7 @@ def _features(rows: pl.DataFrame) -> list[Feature]:
 
 
 def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
-    """Return features at the middle of their change: the change of a transition curve is flat, and noise would choose a
-    point on it.
-    """
+    """Return features at the middle of their change, which noise cannot shift on a flat transition."""
     lag = max(round(BASE_M / STEP_M), 1)
     found = []
     for feature in features:

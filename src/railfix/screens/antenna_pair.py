@@ -73,9 +73,7 @@ class AntennaPairScreened(Screened):
 
     @cached_property
     def ambiguity_m(self) -> Floats:
-        """Difference explained by errors of the angles; within it nothing is rejected, whatever the limit; shape (P,
-        C).
-        """
+        """Difference explained by errors of the angles; nothing within it is rejected; shape (P, C)."""
         return self.zone()
 
 

@@ -301,9 +301,7 @@ class Network(NotebookTable):
         return self.names.index(name)
 
     def ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
-        """Lengths and paths from a node, first near it and, where the track is not found there, in the whole
-        network.
-        """
+        """Lengths and paths from a node, first near it, else in the whole network."""
         import networkx as nx
 
         for cutoff in (_NEAR_WAY_M, None):

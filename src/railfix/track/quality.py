@@ -25,7 +25,7 @@ _LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere was meant to b
 _NEAR_DUPLICATE_M: Final = 0.10  #: Points nearer than this are the same point measured twice.
 _CURVED_1PM: Final = 1 / 3000  #: Curvature of less than this is straight [1/m].
 _ADVERSE_M: Final = 0.005  #: Cant of less than this has no side [m].
-_CENTIMETRE_M: Final = 0.01  #: Distance of a chord from its arc that `needed_spacing_m` is for [m].
+_CENTIMETRE_M: Final = 0.01  #: Largest distance of a chord from its arc, from which `needed_spacing_m` follows [m].
 #: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
 _KINK_DEG: Final = 3.0
 _SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, otherwise a warning.

@@ -99,9 +99,7 @@ class Track(NotebookTable):
     def from_geodetic(
         cls, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, **attributes: Unpack[TrackFields]
     ) -> Track:
-        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height); attributes not given are NaN
-        (`TrackFields`).
-        """
+        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height); others are NaN (`TrackFields`)."""
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
             raise TypeError(f"a track has no {', '.join(sorted(unknown))}")
         latitude = np.array(latitude_deg, dtype=np.float64)

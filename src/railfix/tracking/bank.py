@@ -42,8 +42,8 @@ class SourceKind(IntEnum):
     ALL_IN_VIEW = 7
 
 
-#: Sources beside satellites, constellations and sensors: all Dopplers, phases, codes of satellites ahead or behind,
-#: the map; and none, for all satellites in view.
+#: Further sources: all Dopplers, all phases, the codes of satellites ahead or behind, the map; and none, for all
+#: satellites in view.
 OTHERS: Final = {
     "doppler": SourceKind.MOTION,
     "phase": SourceKind.MOTION,
