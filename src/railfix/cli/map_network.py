@@ -216,12 +216,7 @@ def _in_frame_of(
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)
-    size = float(np.hypot(shift.east_m, shift.north_m))
-    note = (
-        f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
-        f"{shift.used}, the frame of the positions (--same-frame: they are in that of the map)"
-    )
-    return moved, [*log.notes, *shift.notes, *([note] if size > 0.0 else [])]
+    return moved, [*log.notes, *shift.sentences]
 
 
 def _track_at(net: Network, text: str) -> int:

@@ -288,13 +288,8 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
             origin[None], network.frame, codes[0].time[0], **reading.motion,
             named=network.named,
         )  # fmt: skip
-        origin, size = place[0], float(np.hypot(shift.east_m, shift.north_m))
-        notes += shift.notes
-        if size > 0.0:
-            notes.append(
-                f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
-                f"{shift.used}, the frame of the train's position"
-            )
+        origin = place[0]
+        notes += shift.sentences
     tracks = yard_tracks(network, origin)
     prior, unmapped = _prior(inputs, options, network)
     if not any(prior[track.name] > 0.0 for track in tracks):
