@@ -14,9 +14,10 @@ from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_ta
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.arrays import Floats
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
-from railfix.core.files import write_whole
+from railfix.core.notebook import plural
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import plain_table, plural
+from railfix.core.staged_files import write_whole
+from railfix.core.tables import plain_table
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network

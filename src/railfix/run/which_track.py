@@ -19,9 +19,10 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import read_json_object, write_whole
+from railfix.core.files import read_json_object
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, option
+from railfix.core.staged_files import write_whole
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import read_navigation
 from railfix.pipeline.config import Config

@@ -12,9 +12,10 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError, check_type
-from railfix.core.files import FilePath, read_text, write_whole
+from railfix.core.files import FilePath, read_text
+from railfix.core.notebook import plural
 from railfix.core.settings import misspelt
-from railfix.core.tables import plural
+from railfix.core.staged_files import write_whole
 from railfix.io.named_columns import NamedColumns, read_named_columns, with_usual_names
 from railfix.track.crs import choose_crs, find_crs, unit_of_heights
 from railfix.track.georeference import Georeference, georeference
