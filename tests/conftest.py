@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from bad_inputs import Desk, desk_in
+from railfix.evaluate import public_data
 from railfix.live.warm_up import prepare_kernels
 
 # A busy machine is no failure: examples have no deadline, and slow drawing of data is no error.
@@ -45,6 +47,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if seen[function] % mark.args[0]:
             item.add_marker(pytest.mark.slow)
         seen[function] += 1
+
+
+@pytest.fixture(scope="session")
+def recorded(request: pytest.FixtureRequest) -> Callable[[str], Path]:
+    """Return a function from the name of a recording to its path: beside the checkout, or after ``public/`` in the
+    wheel of the package index; the test is skipped where it is absent.
+    """
+
+    def find(name: str) -> Path:
+        if not name.startswith("public/"):
+            return request.getfixturevalue("recordings") / name
+        path = public_data.data_folder() / name.removeprefix("public/")
+        if not path.is_file():
+            pytest.skip(f"{path} is not there; `{public_data.COMMAND}` brings it")
+        return path
+
+    return find
 
 
 @pytest.fixture(scope="session")

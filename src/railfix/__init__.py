@@ -30,8 +30,7 @@ stages by hand               `ranges.find_satellites`, `ranges.corrected_ranges`
                              `integrity.exclude_faults`, `integrity.protection_level`
 tables                       `train_table` (the filter), `positions_table`, `observations_table`, `to_xarray`
 evaluate and report          `evaluate_runs`, `write_report`
-from and to georinex         `observations_from_xarray`, `observations_to_xarray`,
-                             `navigation_from_xarray`, `navigation_to_xarray`
+from and to georinex         `observations_from_xarray`, `observations_to_xarray`
 ============================ =========================================================================
 
 docs/example.md goes from a log to positions with these names; ``railfix --help`` lists the same

@@ -32,8 +32,6 @@ from .core import (
 from .evaluate import Evaluation, EvaluationOptions, RunAndReference, evaluate_run, evaluate_runs, write_evaluation
 from .gnss import Navigation, Observations, PreciseEphemeris, concatenate
 from .io import (
-    navigation_from_xarray,
-    navigation_to_xarray,
     observations_from_xarray,
     observations_to_xarray,
     read_navigation,
@@ -120,8 +118,6 @@ __all__ = [
     "io",
     "load_config",
     "load_scenario",
-    "navigation_from_xarray",
-    "navigation_to_xarray",
     "observations_from_xarray",
     "observations_table",
     "observations_to_xarray",

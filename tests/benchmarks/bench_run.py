@@ -134,7 +134,7 @@ def compare(
 
 
 def profiled(folder: Path, scratch: Path, config: Path | None, tracking: list[str]) -> None:
-    from railfix.cli import main as railfix_main
+    from railfix.__main__ import main as railfix_main
 
     def once() -> None:
         sys.argv = ["railfix", *railfix_command(folder, scratch / "profiled", config, tracking)[3:]]

@@ -186,9 +186,7 @@ def test_a_deleted_working_directory_is_one_sentence(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
     source = Path(sys.modules["railfix"].__file__ or "").parents[1]
-    script = (
-        f"cd {gone} && rmdir {gone} && exec {sys.executable} -c 'from railfix.cli import main; main()' simulate --list"
-    )
+    script = f"cd {gone} && rmdir {gone} && exec {sys.executable} -m railfix simulate --list"
     done = subprocess.run(
         ["sh", "-c", script], env={**NARROW, "PYTHONPATH": str(source)}, capture_output=True, text=True, check=False
     )
@@ -233,17 +231,6 @@ def test_tables_are_whole_in_a_log_of_80_columns(
         return [line for line in kept if "epochs/s" not in line]
 
     assert lines(narrow.stdout) == lines(wide.stdout)
-
-
-def test_ctrl_c_is_one_sentence(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("railfix.cli.logs.locate_files", interrupt)
-    command = f"locate --log {{desk}}/front.obs --nav {{desk}}/brdc.nav --out {tmp_path}/p.pos"
-    result = CliRunner().invoke(app, desk.words(command))
-    assert result.exit_code == 130
-    assert result.stderr == "railfix: interrupted; what was unfinished is removed, finished files are kept\n"
 
 
 @pytest.mark.parametrize(

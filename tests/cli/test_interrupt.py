@@ -44,6 +44,12 @@ def is_writing(folder: Path) -> Callable[[subprocess.Popen[str]], bool]:
     return lambda _: any(folder.rglob(".railfix-*"))
 
 
+def is_starting(process: subprocess.Popen[str]) -> bool:
+    """Return whether the program handles signals, SIGTERM among them; its commands are not imported yet."""
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    return bool(int(status.split("SigCgt:")[1].split()[0], 16) >> (signal.SIGTERM - 1) & 1)
+
+
 def has_begun(process: subprocess.Popen[str]) -> bool:
     """Return whether the command itself has been imported, with polars."""
     return "polars" in Path(f"/proc/{process.pid}/maps").read_text()
@@ -59,6 +65,24 @@ def test_a_run_that_is_interrupted_leaves_nothing(tmp_path: Path) -> None:
     code, error = interrupt(words, tmp_path, is_writing(tmp_path / "out"))
     assert (code, error) == (128 + signal.SIGINT, SENTENCE)
     assert [*tmp_path.rglob("*")] == []
+
+
+@pytest.mark.parametrize("words", [["--help"], ["run", "--help"], ["doctor", "a"]])
+def test_ctrl_c_while_the_program_starts_is_one_sentence(tmp_path: Path, words: list[str]) -> None:
+    code, error = interrupt(words, tmp_path, is_starting)
+    assert (code, error) == (128 + signal.SIGINT, SENTENCE)
+
+
+def test_a_signal_that_the_caller_ignores_stays_ignored() -> None:
+    """As `nohup` does with SIGHUP, and a shell with SIGINT of its background jobs."""
+    process = subprocess.Popen(
+        ["sh", "-c", f"trap '' HUP INT; exec {sys.executable} -m railfix simulate --list"], stdout=subprocess.DEVNULL
+    )
+    while not is_starting(process):
+        time.sleep(0.01)
+    for number in (signal.SIGHUP, signal.SIGINT):
+        process.send_signal(number)
+    assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.slow

@@ -14,15 +14,13 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
-import public_recording
-from case_files import write_case
 from conftest import ROOT
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, RailfixError, SettingsError
 from railfix.core.files import file_sha256, read_bytes
-from railfix.evaluate import EvaluationOptions, evaluate_run
+from railfix.evaluate import EvaluationOptions, evaluate_run, public_data
 from railfix.evaluate.benchmark import RTKLIB_SINGLE, rows_at_epochs, run_benchmark
-from railfix.evaluate.cases import read_case, read_cases
+from railfix.evaluate.cases import read_case, read_cases, write_case
 from railfix.pipeline.config import Config
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 
@@ -207,13 +205,12 @@ def test_no_test_and_no_setting_reads_a_held_out_case() -> None:
 
     Cases beside the checkout that are marked so are looked for by the names and hashes of their files as well.
     """
-    words = {Path(name).stem for name in public_recording.FILES.values()}
-    words |= {Path(public_recording.INSIDE).name, public_recording.WHEEL.partition("==")[0], "public_recording"}
+    words = {Path(name).stem for name in public_data.DRIVE_FILES.values()} | {public_data.DRIVE}
     beside = ROOT.parent / "shared" / "data"
     for path in beside.glob("**/case.toml"):
         if (case := read_case(path.parent)).content.held_out:
             words |= {*case.content.sha256.values(), path.parent.name}
-    allowed = {ROOT / "tests/studies/public_recording.py", ROOT / "tests/studies/benchmark_cases.py", Path(__file__)}
+    allowed = {ROOT / "src/railfix/evaluate/public_data.py", ROOT / "tests/studies/benchmark_cases.py", Path(__file__)}
     kinds = {".py", ".toml", ".json", ".csv", ".yaml", ".txt"}
     read = {
         (word, path.relative_to(ROOT).as_posix())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -13,12 +14,14 @@ import pytest
 
 from orbit_cases import one_record
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.evaluate.public_data import DRIVE, DRIVE_FILES
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits import satellite_states
 from railfix.gnss.orbits.ephemerides import Orbits, kepler_state
 from railfix.gnss.orbits.prepared_records import validity_s
 from railfix.io.rinex import read_navigation
 
+PUBLIC_NAVIGATION = f"public/{DRIVE}/{DRIVE_FILES['nav.rnx']}"
 FILES = (
     "dual/mosaic_x2_99cm/base.nav",
     "kinematic/gsdc_pixel5_a/hour1180.21n",
@@ -29,6 +32,7 @@ FILES = (
     "static/ESBC_2020177/ESBC00DNK_R_20201770000_01D_MN.rnx.gz",
     "static/rtklib_geonet2005/07590920.05n",
     "static/rtklib_geonet2005/30400920.05n",
+    PUBLIC_NAVIGATION,
 )
 CODE = 22_345_678.9
 #: Every so many records of a file with more than this [pieces].
@@ -77,14 +81,14 @@ def compare(nav: Navigation, row: int, ephemeris: Any, *, of_glonass: bool) -> t
 @pytest.mark.requirement("A7")
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.every(3)
-def test_positions_and_clocks_of_rtklib(name: str, recordings: Path, tmp_path: Path) -> None:
+def test_positions_and_clocks_of_rtklib(name: str, recorded: Callable[[str], Path], tmp_path: Path) -> None:
     """RTKLIB reads the file and computes the states. Required: 1 mm and 1 mm; found: a micrometre."""
     rtk = pytest.importorskip("pyrtklib5")
     from pyrtklib_orbits import satellite_number
 
-    nav = ours(recordings / name)
+    nav = ours(recorded(name))
     theirs, observations, station = rtk.nav_t(), rtk.obs_t(), rtk.sta_t()
-    assert rtk.readrnx(str(plain(recordings / name, tmp_path)), 1, "", observations, theirs, station) == 1
+    assert rtk.readrnx(str(plain(recorded(name), tmp_path)), 1, "", observations, theirs, station) == 1
     by_content: dict[tuple[float, ...], Any] = {}
     for i in range(theirs.n):
         eph = theirs.eph[i]
@@ -115,10 +119,10 @@ def test_positions_and_clocks_of_rtklib(name: str, recordings: Path, tmp_path: P
 
 @pytest.mark.requirement("A7")
 @pytest.mark.parametrize("name", FILES)
-def test_positions_and_clocks_of_sidereon(name: str, recordings: Path, tmp_path: Path) -> None:
+def test_positions_and_clocks_of_sidereon(name: str, recorded: Callable[[str], Path], tmp_path: Path) -> None:
     sidereon = pytest.importorskip("sidereon")
-    kepler = ours(recordings / name).kepler
-    text = plain(recordings / name, tmp_path).read_text().replace("\r\n", "\n")
+    kepler = ours(recorded(name)).kepler
+    text = plain(recorded(name), tmp_path).read_text().replace("\r\n", "\n")
     if name == FILES[1]:
         # That program does not know "2" for a version.
         text = text.replace("     2              NAV", "     2.10           NAV", 1)

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import shutil
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import polars as pl
 import pytest
@@ -194,134 +196,18 @@ FAULTS: Final[dict[str, Fault]] = {
     "other_file": _bytes(lambda _: b"time,a,b\n1,2,3\n"),
 }
 
-_RUN: Final = f"run {_LOG} --track {{desk}}/line.csv --out {{out}}"
-#: Files that are written, a command with a mistake in it, its exit code, and words of its sentence.
-MISTAKES: Final[dict[str, tuple[dict[str, str], str, int, str]]] = {
-    "semicolons": (
-        {"s.csv": "latitude_deg;longitude_deg;height_m\n47,1,2;8,5;400\n47,1;8,5;400\n"}, "map check {desk}/s.csv", 3,
-        "s.csv, line 2: column latitude_deg: '47,1,2' is not a number",
-    ),
-    "height_sigma": (
-        {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --height-sigma 1e9 "
-        "--out {desk}/o", 4, "--height-sigma: Input should be less than or equal to 1000",
-    ),
-    "heights_in_millimetres": (
-        {"mm.csv": "latitude_deg,longitude_deg,height_m\n" + "".join(f"35.0{k},135.45,162000\n" for k in range(9))},
-        "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/mm.csv --out {desk}/o", 5,
-        "expected metres between -1,000 and 9,000: are they in millimetres?",
-    ),
-    "span_after_the_log": (
-        {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --start 2030-01-01 "
-        "--out {desk}/o", 5, "the log is of 2024-03-05T03:10:00 to 2024-03-05T03:10",
-    ),
-    "span_before_the_log": (
-        {}, "run --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --end 2020-01-01 "
-        "--out {desk}/o", 5, "the log begins at 2024-03-05T03:10:00 (GPS time)",
-    ),
-    "header_misspelt": (
-        {"s.csv": "# sigma_plan: 3\nlatitude_deg,longitude_deg,height_m\n47,8,400\n47.1,8,400\n"},
-        "map check {desk}/s.csv", 3, "the line '# sigma_plan: 3': is '# sigma_plan_m' meant?",
-    ),
-    "base_off_the_earth": (
-        {},
-        "which-track --front {desk}/front.obs --base {desk}/rear.obs --base-place 95,8,400 --nav {desk}/brdc.nav "
-        "--map {desk}/line.geojson", 4, "expected a latitude to 90",
-    ),
-    "rover_as_base": (
-        {},
-        "which-track --front {desk}/front.obs --base {desk}/front.obs --base-place 35,139,4 --nav {desk}/brdc.nav "
-        "--map {desk}/line.geojson", 4, "is the log of the train; give that of the base station",
-    ),
-    "alarm_limit_of_the_universe": ({}, _RUN + " --set alarm_limit_m=1e12", 4, "setting alarm_limit_m"),
-    "pulses_of_letters": (
-        {"s.csv": "time_gpst,pulse\n2024-03-05T03:10:00,abc\n2024-03-05T03:10:01,5\n"},
-        _RUN + " --tachometer {desk}/s.csv", 3, "s.csv: row 2: pulse is 'abc', a number was expected; correct the row",
-    ),
-    "pulse_missing": (
-        {"s.csv": "time_gpst,pulse,direction\n2024-03-05T03:10:00,1,1\n2024-03-05T03:10:01,,1\n"},
-        _RUN + " --tachometer {desk}/s.csv", 3, "s.csv: row 3: pulse is None, a number was expected",
-    ),
-    "speed_of_letters": (
-        {"s.csv": "time_gpst,speed_mps\n2024-03-05T03:10:00,fast\n"},
-        _RUN + " --radar {desk}/s.csv", 3, "s.csv: row 2: speed_mps is 'fast', a number was expected",
-    ),
-    "time_missing": (
-        {"s.csv": "time_gpst,speed_mps\n2024-03-05T03:10:00,1\n,1\n"},
-        _RUN + " --radar {desk}/s.csv", 3, "s.csv: row 3: time_gpst is empty; remove the row",
-    ),
-    "sensor_without_rows": (
-        {"s.csv": "time_gpst,pulse\n"},
-        _RUN + " --tachometer {desk}/s.csv", 3, "s.csv: has no rows; expected those of the tachometer",
-    ),
-    "sensor_of_another_day": (
-        {"s.csv": "time_gpst,pulse\n2020-01-01T00:00:00,1\n2020-01-01T00:00:01,2\n"},
-        _RUN + " --tachometer {desk}/s.csv", 5, "have no time in common; give those of that day",
-    ),
-    "units_without_ranges": (
-        {"s.csv": "unit,x_m,y_m,z_m\nA,1,2,3\n"},
-        _RUN + " --ranging-units {desk}/s.csv", 4, "--ranging-units is given without --ranging",
-    ),
-    "switch_for_a_number": (
-        {"s.toml": "[elevation]\nmask_deg = true\n"},
-        _RUN + " --config {desk}/s.toml", 4, "setting elevation.mask_deg: a number was expected, got True",
-    ),
-    "word_for_a_list": (
-        {"s.toml": 'systems = "GE"\n'},
-        _RUN + " --config {desk}/s.toml", 4, "setting systems: Input should be a list, got 'GE'",
-    ),
-    "setting_out_of_its_group": (
-        {"s.toml": "mask_deg = 5.0\n"},
-        _RUN + " --config {desk}/s.toml", 4, "is 'elevation.mask_deg' meant?",
-    ),
-    "track_as_vehicle": ({}, _RUN + " --vehicle {desk}/line.csv", 3, "; a vehicle file was expected"),
-    "log_as_navigation": (
-        {}, "run --front {desk}/front.obs --nav {desk}/rear.obs --track {desk}/line.csv --out {out}", 3,
-        "is a RINEX observation file (--front, --rear)",
-    ),
-    "reference_is_the_run_itself": (
-        {}, "evaluate {desk}/results --reference {desk}/results/positions.csv", 5,
-        "is a table of the run itself; give a reference that was measured otherwise",
-    ),
-    "reference_of_one_antenna": (
-        {}, "evaluate {desk}/results --reference {desk}/rtk.pos", 3, "give a CSV file with one (railfix reference",
-    ),
-    "table_misspelt": (
-        {}, "evaluate {desk}/results --reference {desk}/truth.csv --table trian", 4, "known are positions, train",
-    ),
-    "background_is_a_table": (
-        {}, "report {desk}/results --out {out}.html --background {desk}/line.csv", 3, "is not valid JSON (",
-    ),
-    "bins_of_letters": (
-        {}, "error-model {desk}/results --reference {desk}/truth.csv --elevations 10,five --out {out}", 4,
-        "--elevations: Input should be a valid number",
-    ),
-    "sectors_none": (
-        {}, "error-model {desk}/results --reference {desk}/truth.csv --sectors 0 --out {out}", 4,
-        "--sectors: Input should be greater",
-    ),
-    "bin_of_no_width": (
-        {}, "cn0-curve {desk}/front.obs --nav {desk}/brdc.nav --bin 0 --out {out}", 4,
-        "--bin: setting bin_deg: Input should be greater than or equal to 0.1, got 0.0",
-    ),
-    "map_of_two_antennas": (
-        {}, "map from-positions {desk}/truth.csv --out {out}.csv", 3,
-        "has positions of front and rear; give those of one antenna",
-    ),
-    "positions_far_from_the_map": (
-        {"s.csv": "latitude_deg,longitude_deg,height_m\n50.0,14.0,300\n50.1,14.0,300\n"},
-        "map match {desk}/line.geojson --log {desk}/s.csv --out {out}.csv", 5, "is it the map of that line",
-    ),
-    "heights_would_be_overwritten": (
-        {"s.csv": "chainage_m,height_m\n0,1\n"},
-        "map route {desk}/line.geojson --heights {desk}/s.csv --out {desk}/s.csv --overwrite", 8,
-        "is an input, which is never overwritten",
-    ),
-    "duration_negative": ({}, "simulate demo --seconds -5 --out {out}", 4, "--seconds: Input should be"),
-    "scenario_setting_misspelt": (
-        {}, "simulate demo --set receiver.code_sigma=1 --out {out}", 4,
-        "with the settings of the command line: unknown setting receiver.code_sigma",
-    ),
-}  # fmt: skip
+#: Mistakes by name: a command, its exit code, words of its sentence, and files that are written first.
+MISTAKES: Final[dict[str, Any]] = tomllib.loads(
+    (Path(__file__).parents[1] / "references" / "mistakes.toml").read_text(encoding="utf-8")
+)
+
+
+def edited(desk: Path, source: str, expression: str, replacement: str | Callable[[re.Match[str]], str]) -> str:
+    """Return the text of a file of the desk with an expression replaced, line by line; it has to be found."""
+    text, count = re.subn(expression, replacement, (desk / source).read_text(), flags=re.MULTILINE)
+    assert count, f"{source} has nothing like {expression}"
+    return text
+
 
 #: Every kind of file and every fault is in the third that is run at each change; the nightly run has them all.
 CASES: Final = [

@@ -35,41 +35,10 @@ def shifted_days(text: str, days: int) -> str:
 # --- observation files -------------------------------------------------------------------------
 
 
-@broken(INPUT, "absent.obs", "no such file")
-def observations_missing(bench: Bench) -> Options:
-    return {"front": bench.folder / "absent.obs"}
-
-
 @broken(INPUT, "folder")
 def observations_are_a_folder(bench: Bench) -> Options:
     (bench.folder / "logs").mkdir()
     return {"front": bench.folder / "logs"}
-
-
-@broken(INPUT, "dangling.obs", "no such file")
-def observations_are_a_dangling_link(bench: Bench) -> Options:
-    (bench.folder / "dangling.obs").symlink_to("nowhere.obs")
-    return {"front": bench.folder / "dangling.obs"}
-
-
-@broken(INPUT, "/proc/self/mem")
-def observations_cannot_be_read(_: Bench) -> Options:
-    return {"front": "/proc/self/mem"}
-
-
-@broken(INPUT, "/dev/null")
-def observations_are_a_device(_: Bench) -> Options:
-    return {"front": "/dev/null"}
-
-
-@broken(INPUT, "empty.obs", "empty")
-def observations_empty(bench: Bench) -> Options:
-    return {"front": bench.write("empty.obs", "")}
-
-
-@broken(INPUT, "blank.obs")
-def observations_blank(bench: Bench) -> Options:
-    return {"front": bench.write("blank.obs", " \n" * 40)}
 
 
 @broken(INPUT, "random.obs")
@@ -107,27 +76,6 @@ def observations_hatanaka_truncated(bench: Bench) -> Options:
     return {"front": bench.write("front.crx", packed[: len(packed) // 2])}
 
 
-@broken(INPUT, "brdc.nav", "navigation")
-def observations_are_navigation(bench: Bench) -> Options:
-    return {"front": bench.nav}
-
-
-@broken(INPUT, "line.csv")
-def observations_are_the_track(bench: Bench) -> Options:
-    return {"front": bench.track}
-
-
-@broken(INPUT, "train.toml")
-def observations_are_the_vehicle(bench: Bench) -> Options:
-    return {"front": bench.vehicle}
-
-
-@broken(INPUT, "rtk.pos")
-def observations_are_positions(bench: Bench) -> Options:
-    text = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns\n2026/05/12 03:00:00.000 35.0 135.0 100.0 1 9\n"
-    return {"front": bench.write("rtk.pos", text)}
-
-
 @broken(INPUT, "front.obs", "line 1")
 def observations_of_an_unknown_version(bench: Bench) -> Options:
     text = bench.front.read_text()
@@ -147,11 +95,6 @@ def observations_without_types(bench: Bench) -> Options:
 @broken(INPUT, "front.obs", "END OF HEADER")
 def observations_without_end_of_header(bench: Bench) -> Options:
     return {"front": without_line(bench.front, "END OF HEADER")}
-
-
-@broken(INPUT, "front.obs")
-def observations_cut_in_the_header(bench: Bench) -> Options:
-    return {"front": bench.write("front.obs", bench.front.read_text()[:400])}
 
 
 @broken(INPUT, "front.obs", "epoch")
@@ -184,16 +127,6 @@ def observations_with_a_wrong_count_of_satellites(bench: Bench) -> Options:
     return {"front": bench.write("front.obs", "".join(lines))}
 
 
-@broken(INPUT, "front.obs", "given twice")
-def observations_given_twice(bench: Bench) -> Options:
-    return {"front": [bench.front, bench.front]}
-
-
-@broken(INPUT, "front.obs", "given twice", "--rear")
-def observations_given_for_both_antennas(bench: Bench) -> Options:
-    return {"rear": bench.front}
-
-
 @broken(MISMATCH, "brdc.nav", "navigation file of that day")
 def observations_of_another_week(bench: Bench) -> Options:
     text = re.sub(r"(?m)^> (\d{4})", lambda m: f"> {int(m[1]) - 20}", bench.front.read_text())
@@ -208,42 +141,12 @@ def observations_of_antennas_at_different_hours(bench: Bench) -> Options:
     return {"rear": bench.write("rear.obs", text)}
 
 
-@broken(MISMATCH, "front.obs", "time span")
-def no_epoch_in_the_time_asked_for(_: Bench) -> Options:
-    return {"start": "2031-01-01T00:00:00"}
-
-
 # --- navigation files --------------------------------------------------------------------------
-
-
-@broken(INPUT, "absent.nav", "no such file")
-def navigation_missing(bench: Bench) -> Options:
-    return {"nav": bench.folder / "absent.nav"}
-
-
-@broken(INPUT, "folder")
-def navigation_is_a_folder(bench: Bench) -> Options:
-    return {"nav": bench.folder}
-
-
-@broken(INPUT, "empty.nav", "empty")
-def navigation_empty(bench: Bench) -> Options:
-    return {"nav": bench.write("empty.nav", "")}
 
 
 @broken(INPUT, "random.nav")
 def navigation_binary(bench: Bench) -> Options:
     return {"nav": bench.write("random.nav", random.Random(2).randbytes(5000))}
-
-
-@broken(INPUT, "front.obs", "observation")
-def navigation_is_observations(bench: Bench) -> Options:
-    return {"nav": bench.front}
-
-
-@broken(INPUT, "line.csv")
-def navigation_is_the_track(bench: Bench) -> Options:
-    return {"nav": bench.track}
 
 
 @broken(INPUT, "brdc.nav", "END OF HEADER")
@@ -286,13 +189,3 @@ def navigation_of_another_day(bench: Bench) -> Options:
 def observations_given_twice_by_another_name(bench: Bench) -> Options:
     (bench.folder / "same.obs").symlink_to(bench.front)
     return {"front": [bench.front, bench.folder / "same.obs"]}
-
-
-@broken(INPUT, "brdc.nav")
-def precise_orbits_are_navigation(bench: Bench) -> Options:
-    return {"sp3": bench.nav}
-
-
-@broken(INPUT, "empty.sp3", "empty")
-def precise_orbits_empty(bench: Bench) -> Options:
-    return {"sp3": bench.write("empty.sp3", "")}

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from railfix.core.files import file_sha256
-from railfix.core.settings import validate, write_toml
+from railfix.core.settings import validate
+from railfix.core.settings_files import write_toml
 from railfix.evaluate.cases import CASE_FILE, CaseFile
 
 

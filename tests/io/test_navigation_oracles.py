@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from railfix.evaluate.public_data import DRIVE, DRIVE_FILES
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex import read_navigation
 
@@ -25,6 +27,7 @@ FILES = {
     "static/ESBC_2020177/ESBC00DNK_R_20201770000_01D_MN.rnx.gz": (2231, 510),
     "static/rtklib_geonet2005/07590920.05n": (162, 0),
     "static/rtklib_geonet2005/30400920.05n": (164, 0),
+    f"public/{DRIVE}/{DRIVE_FILES['nav.rnx']}": (129, 44),
 }
 _SYSTEMS = {1: "G", 4: "R", 8: "E", 16: "J", 32: "C"}
 #: Fields of a record in RTKLIB's names and in ours.
@@ -36,14 +39,11 @@ _KEPLER = {
 
 
 @pytest.fixture(scope="module", params=FILES)
-def read(request: pytest.FixtureRequest, recordings: Path) -> tuple[Path, Navigation]:
-    path = recordings / request.param
-    return path, read_navigation(path)
-
-
-def test_counts(read: tuple[Path, Navigation], recordings: Path) -> None:
-    path, navigation = read
-    assert (len(navigation.kepler), len(navigation.glonass)) == FILES[str(path.relative_to(recordings))]
+def read(request: pytest.FixtureRequest, recorded: Callable[[str], Path]) -> tuple[Path, Navigation]:
+    path = recorded(request.param)
+    navigation = read_navigation(path)
+    assert (len(navigation.kepler), len(navigation.glonass)) == FILES[request.param]
+    return path, navigation
 
 
 def test_times_of_a_record_belong_together(read: tuple[Path, Navigation]) -> None:

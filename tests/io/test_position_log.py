@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.errors import InputFileError, RailfixError, SettingsError
+from railfix.core.errors import InputFileError, NoPositionError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.io.positions import read_positions
 from railfix.io.reference_log import read_reference
@@ -138,7 +138,7 @@ def test_csv_with_weeks_seconds_and_sigmas(tmp_path: Path) -> None:
     log = read_positions(path)
     np.testing.assert_array_equal(log.time, START + np.array([0, 1_200_000_000]).astype("timedelta64[ns]"))
     np.testing.assert_array_equal(log.sigma_m, [[0.1, 0.2, 0.3], [np.nan] * 3])
-    with pytest.raises(InputFileError, match="no position has quality 1; the log has 1 of quality 2, 1 of"):
+    with pytest.raises(NoPositionError, match="no position has quality 1; the log has 1 of quality 2, 1 of"):
         usable_rows(log)
     path.write_text(header + first.replace("282600", "700000"), encoding="utf-8")
     with pytest.raises(InputFileError, match="line 2: week 2176 and tow_s 700000 are no GPS week and seconds of it"):
@@ -331,7 +331,7 @@ def test_bends_between_two_points_are_kept() -> None:
 def test_a_log_without_enough_good_positions(tmp_path: Path, options: dict[str, object], said: str) -> None:
     path = tmp_path / "run.pos"
     path.write_text(pos("GPST", "week", "deg"), encoding="utf-8")
-    with pytest.raises(InputFileError, match=said):
+    with pytest.raises(NoPositionError, match=said):
         from_position_log(read_positions(path), **options)  # type: ignore[arg-type]
 
 

@@ -181,13 +181,13 @@ def test_a_sample_goes_to_the_first_epoch_after_it_and_to_none_that_a_restart_ha
         {"front": clean_trajectories()["front"]},
         navigation=read_navigation(demo_files()["nav"]),
     )
-    process, given = processor.process, []
+    screen, given = processor.screen, []
 
     def spied(*arguments: Any, sensors: SensorSamples, **options: Any) -> Any:
         given.append(sensors.radar.speed_mps.tolist())
-        return process(*arguments, sensors=sensors, **options)
+        return screen(*arguments, sensors=sensors, **options)
 
-    processor.process = spied  # type: ignore[method-assign]
+    processor.screen = spied  # type: ignore[method-assign]
     epochs = single_epochs(demo_observations()["front"][:8])
     tags = [int((epoch.time[0] - GPS_EPOCH).astype(np.int64)) for epoch in epochs]
     time = epochs[0].time[0] + np.arange(20) * np.timedelta64(50, "ms")

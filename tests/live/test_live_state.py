@@ -234,14 +234,14 @@ def test_a_receiver_that_comes_back_leaves_nothing_from_before() -> None:
     engine = LiveEngine(
         railfix.EpochProcessor(railfix.Config(filter="off"), paths, navigation=navigation), settings, ("radar",)
     )
-    process, given = engine.processor.process, []
+    screen, given = engine.processor.screen, []
 
     def spied(epochs: Any, *arguments: Any, sensors: SensorSamples, **options: Any) -> Any:
         first = next(iter(epochs))
         given.append((first, epochs[first].time[0], len(sensors.radar)))
-        return process(epochs, *arguments, sensors=sensors, **options)
+        return screen(epochs, *arguments, sensors=sensors, **options)
 
-    engine.processor.process = spied  # type: ignore[method-assign]
+    engine.processor.screen = spied  # type: ignore[method-assign]
     engine.push("front", logs["front"][9], now_ns=0)
     later = 6_000_000_000
     begin = logs["front"][0].time[0]

@@ -137,6 +137,50 @@ def test_the_bias_of_the_gyro_is_learnt_from_the_line() -> None:
 
 
 @pytest.mark.requirement("E1")
+def test_the_bias_of_the_gyro_is_learnt_while_standing_and_nothing_expires() -> None:
+    """Two minutes at rest, the gyro 2 mrad/s off, no map; then 0.5 m/s2 for 30 s."""
+    t, bias = np.arange(0.0, 150.0, 1.0 / RATE_HZ), 2e-3
+    speed = 0.5 * np.maximum(t - 120.0, 0.0)
+    wheel = np.where((t > 1.0) & (speed < 0.5), np.nan, speed)
+    acceleration = np.where(np.isnan(wheel) | (t < 1.0), 0.0, 0.5)
+    body = np.stack([np.zeros(len(t)), np.full(len(t), bias), np.zeros(len(t))], axis=1)
+    case = MotionSamples(t, wheel, acceleration, np.where(t < 120.0, 0.0, 0.5), np.full(len(t), np.nan), body)
+    found, _ = find_slips(case)
+    assert found.gyro_bias_radps[t > 115.0] == pytest.approx(bias, rel=0.01)
+    assert not (found.state[t > 2.0] == MotionState.EXPIRED).any()
+    assert (found.state[(t > 4.0) & (t < 120.0)] == MotionState.STANDING).all()
+    np.testing.assert_allclose(found.speed_mps[t > 125.0], speed[t > 125.0], atol=0.1)
+
+
+@pytest.mark.requirement("E1")
+def test_a_slide_that_ends_at_rest_is_a_standstill() -> None:
+    """The wheel locks at 5 m/s, the train stops after 5 s; it stands for a minute."""
+    t = np.arange(0.0, 75.0, 1.0 / RATE_HZ)
+    speed = np.clip(15.0 - t, 0.0, 5.0)
+    wheel = np.where(t < 10.5, np.where(t < 10.0, 5.0, 5.0 - 10.0 * (t - 10.0)), np.nan)
+    force = np.where((t >= 10.0) & (t < 15.0), -1.0, 0.0)
+    acceleration = np.where(np.isnan(wheel), np.nan, np.where(t < 10.0, 0.0, -10.0))
+    found, _ = find_slips(MotionSamples(t, wheel, acceleration, force, np.zeros(len(t))))
+    assert (found.state[(t > 10.5) & (t < 14.0)] == MotionState.INERTIAL_SLIDE).all()
+    assert (found.state[t > 16.0] == MotionState.STANDING).all()
+    true = float(np.trapezoid(speed, t))
+    assert found.distance_m[-1] == pytest.approx(true, abs=0.3)
+
+
+@pytest.mark.requirement("E1")
+def test_a_false_acceleration_at_the_first_pulse_leaves_the_speed_that_of_a_train() -> None:
+    """4 m/s2 too much in one sample, without a map: no pitch of a train, and no reference for the carry."""
+    case = motion(120.0, [(60.0, 4.0, 0.6)])
+    acceleration = np.gradient(case.wheel, case.time_s)
+    acceleration[0] += 4.0
+    body = np.zeros((len(case.time_s), 3))
+    found, _ = find_slips(
+        MotionSamples(case.time_s, case.wheel, acceleration, case.force, np.full(len(case.time_s), np.nan), body)
+    )
+    assert np.nanmax(np.abs(found.speed_mps)) < 1.5 * case.speed.max()
+
+
+@pytest.mark.requirement("E1")
 @pytest.mark.parametrize("rule", ["p2", "map"])
 @pytest.mark.every(2)
 def test_the_bias_of_the_gyro_is_learnt_without_a_line_and_a_slip_is_carried_by_it(rule: str) -> None:

@@ -29,11 +29,13 @@ from pipeline_cases import (
     with_code,
 )
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
 from railfix.core.reasons import POSITIONED, Reason, Status
 from railfix.core.timescale import timedelta
 from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.received import no_navigation
 from railfix.run.processor_setup import make_processor
 
 #: Epochs a chunk, and epochs of the log.
@@ -291,6 +293,8 @@ def test_a_chunk_before_the_last_one_and_a_processor_without_navigation_are_name
     _, state = one.process({name: part[10:] for name, part in parts.items()})
     with pytest.raises(ValueError, match=r"front: the chunk begins at .*, not after .* as the state before it ended"):
         one.process({name: part[:10] for name, part in parts.items()}, state)
-    result, _ = EpochProcessor(one.config, one.trajectories).process(parts)
+    with pytest.raises(SettingsError, match="no navigation records: EpochProcessor"):
+        EpochProcessor(one.config, one.trajectories).process(parts)
+    result, _ = EpochProcessor(one.config, one.trajectories, navigation=no_navigation()).process(parts)
     assert result.notes[0].startswith("no navigation record is known; give navigation to EpochProcessor")
     assert not any("no navigation" in note for note in one.process(parts)[0].notes)

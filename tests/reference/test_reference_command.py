@@ -218,11 +218,11 @@ def test_mean_acceleration_between_instants(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
-        (["time,count", f"{T}0,1", f"{T}1,2"], "there is no column time_gpst"),
-        (["time_gpst,count", f"{T}1,1", f"{T}0,2"], "line 3: the time does not rise"),
-        (["time_gpst,count", f"{T}0,1", ",2"], "line 3: there is no time"),
-        (["time_gpst,count", f"{T}0,1", f"{T}1,x"], "line 3: column count: 'x' is not a number"),
-        (["time_gpst,direction", f"{T}0,1", f"{T}1,0"], "line 3: direction is 0"),
+        (["time,count", f"{T}0,1", f"{T}1,2"], "has no column time_gpst"),
+        (["time_gpst,count", f"{T}1,1", f"{T}0,2"], "row 3: time_gpst falls"),
+        (["time_gpst,count", f"{T}0,1", ",2"], "row 3: time_gpst is empty"),
+        (["time_gpst,count", f"{T}0,1", f"{T}1,x"], "row 3: count is 'x', a number was expected"),
+        (["time_gpst,direction", f"{T}0,1", f"{T}1,0"], "row 3: direction is 0"),
         (["time_gpst,count", f"{T}0,1"], "fewer than two rows"),
     ],
 )

@@ -25,6 +25,7 @@ from railfix.report.charts_page import pack_array, script_json
 from railfix.report.figures import NO_LEVELS, NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
+from railfix.run.verdict import judge_run
 from railfix.simulate.demonstration import demo_files, demo_inputs, demo_truth
 from report_page import Page, fetched
 
@@ -283,36 +284,40 @@ def test_levels_without_a_reference_and_runs_without_levels(folder: Path, unjudg
     assert not {"levels", "stanford"} & {figure["data-name"] for figure in Page(bare).figures}
 
 
-def test_the_top_of_the_page_compares_like_with_like(document: str, folder: Path, tmp_path: Path) -> None:
-    """Both kinds of position at the same epochs, the conventional ones of unscreened ranges."""
+def cards_of(page: str) -> dict[str, tuple[str, str, str]]:
+    """Key figures of the first run by name: the value, that of single epochs below it, and the remark."""
+    keys = page[page.index('<dl class="keys">') : page.index("</dl>")]
+    each = r"<dt>(.*?)</dt><dd>(.*?)</dd>(?:<dd class=.single.>single epochs (.*?)</dd>)?<dd class=.beside.>(.*?)</dd>"
+    return {name: (value, single, beside) for name, value, single, beside in re.findall(each, keys)}
+
+
+def test_every_card_has_the_figure_of_the_evaluation_and_of_the_verdict(folder: Path, tmp_path: Path) -> None:
+    """Conventional positions are those of unscreened ranges where such a run is given."""
     first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
-    options = RunOptions(end=first + timedelta(seconds=20))
-    run_files(
-        demo_inputs(),
-        parse_config({"filter": "off", "screens": ["elevation"]}),
-        out=tmp_path / "unscreened",
-        options=options,
-    )
-    runs, evaluation = read_runs([folder], [demo_truth()], conventional=[tmp_path / "unscreened"])
-    assert evaluation is not None
-    top = report_page(runs, evaluation).split('<section class="overview"')[1].split("</section>")[0]
-    assert top.count("<dt>") == 5
-    assert "unscreened ranges, as in P1" in top
-    truth = pl.read_csv(demo_truth(), schema_overrides={"time_gpst": pl.Datetime("ns")}).filter(antenna="front")
-    keys = ["time_gpst", "antenna"]
-    screened, unscreened = (
-        pl.read_parquet(path / "positions.parquet").select(*keys, "chainage_m", "conventional_chainage_m", "status")
-        for path in (folder, tmp_path / "unscreened")
-    )
-    both = truth.select(*keys, true_m="chainage_m").join(screened.drop("conventional_chainage_m"), on=keys)
-    both = both.join(unscreened.drop("chainage_m", "status"), on=keys).drop_nulls()
-    both = both.filter(pl.col("status").cast(pl.String) == "ok")
-    for column in ("chainage_m", "conventional_chainage_m"):
-        size = (both[column] - both["true_m"]).abs()
-        assert f"{size.max():.2f} m" in top
-        assert f"{size.quantile(0.95, 'linear'):.2f} m" in top
-    assert "unscreened" not in document
-    assert "the same screened ranges" in document
+    config = parse_config({"filter": "off", "screens": ["elevation"]})
+    run_files(demo_inputs(), config, out=tmp_path / "unscreened", options=RunOptions(end=first + timedelta(seconds=20)))
+    run_files(demo_inputs(), out=tmp_path / "run", options=RunOptions(end=first + timedelta(seconds=20)))
+    for mine in (folder, tmp_path / "run"):
+        runs, evaluation = read_runs([mine], [demo_truth()], conventional=[tmp_path / "unscreened"])
+        assert evaluation is not None
+        page = report_page(runs, evaluation)
+        assert "unscreened ranges, as in P1" in page
+        cards = cards_of(page)
+        assert len(cards) == 5
+        name, train = (runs[0].name_in(evaluation, table) for table in ("positions", "train"))
+        assert bool(train) == (mine != folder)
+        own = {"run": name, "antenna": "front"}
+        leading = {**own, "run": train, "position": "constrained"} if train else {**own, "position": "constrained_ok"}
+        for name, key in (("median error", "p50_m"), ("95 % of errors within", "p95_m"), ("largest error", "max_m")):
+            value = evaluation.figure(key, **leading)
+            single = evaluation.figure(key, **own, position="constrained_ok")
+            other = evaluation.figure(key, **own, position="conventional")
+            expected = f"{value:.2f} m", f"{single:.2f} m" if train else "", f"conventional {other:.2f} m"
+            assert cards.pop(name) == expected
+        verdict = judge_run(runs[0].record).antennas[0]
+        figures = {name: (value, single) for name, value, single in verdict.figures()}
+        assert {name: figures[name] for name in cards} == {name: card[:2] for name, card in cards.items()}
+        assert len(cards) == 2
 
 
 def test_a_larger_error_on_the_map_is_explained(folder: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Cases of ``railfix benchmark`` from the recordings beside the checkout, and the page of their results.
 
 ``python tests/studies/benchmark_cases.py CASES`` makes a folder of each recording: log, navigation, ground truth, and
-the map made from it (5 m, standing still removed). ``python tests/studies/public_recording.py CASES/town`` adds the
+the map made from it (5 m, standing still removed). ``railfix demo --real --out CASES`` adds the
 held-out case. ``python tests/studies/benchmark_cases.py CASES --page OUT`` runs the benchmark into OUT and writes
 ``docs/benchmarks.md``.
 """
@@ -20,7 +20,7 @@ from typing import Any, Final
 import paths
 import belief_campaign
 import recordings_truth
-from case_files import write_case
+from railfix.evaluate.cases import write_case
 from railfix.track import from_positions
 from railfix.track.point_files import write_track_csv
 
@@ -95,7 +95,7 @@ the map made from the ground truth, every setting at its default. [How to](how-t
   integrity (over level), continuity (15 s), TTFF (first).
 - *RTKLIB* is the single point of `rnx2rtkp` with the same mask and constellations, moved to the nearest point of the
   line; *3-D* is railfix's conventional position. OUT/benchmark.md has straight distances too.
-- *Held out*: used by no test and in no choice of settings (`python tests/studies/public_recording.py CASES/town`);
+- *Held out*: used by no test and in no choice of settings (`railfix demo --real --out CASES`);
   the other recordings were seen during development.
 
 {table}{notes}"""

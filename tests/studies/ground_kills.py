@@ -30,7 +30,7 @@ import numpy as np
 
 from ground_load import BEARERS_OF, centre_file
 from postgresql_server import Server
-from railfix.cli import main as main_of_railfix
+from railfix.__main__ import main as main_of_railfix
 from railfix.ground.authority import Authority
 from railfix.ground.layout import overlap
 from railfix.ground.links import TrainLinks

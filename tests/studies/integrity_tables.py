@@ -1,8 +1,7 @@
 """Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
 
 ``python tests/studies/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
-``docs/level-results.md``: faults, maps, sigmas, starts, priors, together, sides, ahead, late, ionosphere,
-coefficients.
+``docs/level-results.md``: faults, maps, sigmas, priors, sides, ahead.
 """
 
 from __future__ import annotations
@@ -11,42 +10,32 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
 
 import paths
 import recordings_truth
-from integrity_recordings import ranges_of
 from railfix.core.arrays import Floats, Masks
-from railfix.core.constants import FREQUENCY_L1
-from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Status
 from railfix.core.timescale import seconds
 from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection import LevelStatus, RiskBudget
-from railfix.integrity.protection.risk import set_sums
-from railfix.integrity.raim import linear_model
 from railfix.io import read_navigation, read_observations
 from railfix.kernels.tracking.constants import AHEAD
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning.normal_equations import normal_equations
-from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import map_information
-from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m
 from railfix.simulate.demonstration import demo_files
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
-from railfix.tracking.limits import Tails
-from recordings_score import smartloc, trajectory_of
+from recordings_score import trajectory_of
 
 DATA: Final = paths.ROOT.parent / "shared" / "data" / "kinematic"
 SETTINGS: Final = parse_config({"filter": "off", "elevation": {"mask_deg": 15.0}})
@@ -55,38 +44,6 @@ SIZES_M: Final = (20.0, 50.0, 100.0)
 OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 0), (0, 10), (0, 20), (0, 37))
 #: Priors of local faults that cities ask for (docs/level-results.md).
 LOCAL_PRIORS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4)
-#: Navigation files with Klobuchar coefficients of other days, beside `DATA`.
-COEFFICIENT_FILES: Final = (
-    "static/rtklib_geonet2005/07590920.05n",
-    "static/ESBC_2020177/ESBC00DNK_R_20201770000_01D_MN.rnx.gz",
-    "kinematic/gsdc_pixel5_a/hour1180.21n",
-    "kinematic/japan_mosaic_2021265_with_GEONET3034/SEPT2650.21P",
-    "dual/mosaic_x2_99cm/base.nav",
-)
-_NORMAL_MEDIAN: Final = 0.6745
-
-
-class Reweighting(NamedTuple):
-    """Student's t in single epochs: degrees of freedom; least redundancy; of satellites up to an elevation."""
-
-    tails: Tails
-    redundancy: int = 1
-    elevation_deg: float = 90.0
-
-    @property
-    def text(self) -> str:
-        return f"{self.tails.usual:g}, {self.tails.late:g} {self.redundancy:11d} {self.elevation_deg:10.0f}"
-
-
-#: As of late codes for both sides; heavier for late codes, 4 and 1 as in the filter; with redundancy that tells late
-#: codes from early ones; of satellites up to 45 deg, which walls as high as they are away reflect; both.
-REWEIGHTINGS: Final = (
-    None,
-    *(Reweighting(Tails(4.0, late)) for late in (4.0, 3.0, 2.0, 1.0)),
-    *(Reweighting(Tails(4.0, 1.0), redundancy) for redundancy in (5, 8)),
-    Reweighting(Tails(4.0, 1.0), 1, 45.0),
-    Reweighting(Tails(4.0, 1.0), 5, 45.0),
-)
 
 
 @dataclass(frozen=True)
@@ -249,92 +206,6 @@ def sigma_rows() -> Iterator[str]:
         )
 
 
-def start_rows() -> Iterator[str]:
-    """Estimators of the scale of one epoch against each other."""
-    yield "demonstration, line fit of single epochs; scale with one satellite in turn too long, over that without"
-    yield f"{'estimator':24s}     clean" + "".join(f"{f'{size} m: median':>17s}   worst" for size in (10, 20, 100))
-    case = cases()["demo"]
-    clean = case.solved(parse_config({"filter": "off", "screens": ["elevation"]}))
-    has = np.flatnonzero(np.isfinite(clean.fix.constrained.arc_m))[::20]
-    columns = clean.columns
-    used = (clean.reason[has][:, columns] == 0) & np.isfinite(clean.sigma_m[has][:, columns])
-    ranges = Ranges(
-        sat_ecef_m=np.where(used[..., None], clean.corrected.satellites.position_ecef_m[has], 2.6e7),
-        code_m=np.where(used, clean.corrected_code_m[has][:, columns], 0.0),
-        weight=np.where(used, 1.0 / np.where(used, clean.sigma_m[has][:, columns], 1.0) ** 2, 0.0),
-        groups=(slice(0, len(columns)),),
-    )
-    # One clock: the offsets between constellations are taken out as the run knows them.
-    systems = np.array([name[0] for name in clean.satellite[columns].tolist()])
-    offset = np.zeros(used.shape)
-    for g, letter in enumerate(clean.corrected.channels.clocks):
-        mine = np.isin(systems, ["G", "J"] if letter == "G" else [letter])
-        offset[:, mine] = clean.ties.offset_m[has][:, g, None]
-    ranges = replace(ranges, code_m=np.where(used, ranges.code_m - offset, 0.0))
-    arc = clean.fix.constrained.arc_m[has]
-    place = case.trajectory.at_arc(arc)
-    prior = map_information(case.trajectory, np.maximum(clean.fix.constrained.section[has], 0))
-    for name, estimate in ESTIMATORS.items():
-        base = estimate(ranges, place, prior)
-        known = base > 0.0  # not where too few ranges are left to agree
-        cells = [f"{np.median(base[known]):9.2f}"]
-        for size in (10.0, 20.0, 100.0):
-            ratios = []
-            for channel in np.flatnonzero(used.mean(axis=0) > 0.2).tolist():
-                code = ranges.code_m.copy()
-                code[:, channel] += np.where(used[:, channel], size, 0.0)
-                raised = estimate(replace(ranges, code_m=code), place, prior)
-                ratios.append(float(np.median(raised[known] / base[known])))
-            cells.append(f"{np.median(ratios):16.2f} {max(ratios):7.2f}")
-        yield f"{name:24s} {' '.join(cells)}"
-
-
-def _scale(ranges: Ranges, place: Floats, prior: Floats, weight: Callable[[Floats], Floats] | None) -> Floats:
-    """Scale of each epoch: the median of the residuals without reweighting, else of what keeps its weight."""
-    used = ranges.weight > 0
-    factor, freedom = used.astype(float), np.maximum(ranges.n_used - 2, 1)
-    distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
-    for _ in range(1 if weight is None else 5):
-        equations = normal_equations(replace(ranges, weight=ranges.weight * factor), place)
-        step = np.einsum("tij,tj->ti", np.linalg.inv(equations.matrix + prior), equations.vector)
-        clock = equations.clock_m[:, 0] - np.einsum("ti,ti->t", step, equations.clock_slope[:, :, 0])
-        residual = ranges.code_m - distance + np.einsum("tmi,ti->tm", los, step) - clock[:, None]
-        size = np.where(used, np.abs(residual) * np.sqrt(ranges.weight), np.nan)
-        scale = np.nanmedian(size, axis=1) / _NORMAL_MEDIAN * np.sqrt(ranges.n_used / freedom)
-        if weight is None:
-            return np.asarray(scale)
-        factor = np.where(used, weight(np.nan_to_num(size / np.maximum(scale, 0.05)[:, None])), 0.0)
-    kept = factor > 0
-    squares = np.where(kept, np.nan_to_num(size) ** 2 * np.minimum(factor, 1.0), 0.0).sum(axis=1)
-    return np.asarray(np.sqrt(squares / np.maximum(factor.sum(axis=1) - 2.0, 1.0)))
-
-
-def _igg3(keep: float, reject: float) -> Callable[[Floats], Floats]:
-    def weight(size: Floats) -> Floats:
-        decline = keep / np.maximum(size, 1e-9) * ((reject - size) / (reject - keep)) ** 2
-        return np.where(size <= keep, 1.0, np.where(size < reject, decline, 0.0))
-
-    return weight
-
-
-#: Estimators of the scale of one epoch, by the name of their row.
-ESTIMATORS: Final[dict[str, Callable[[Ranges, Floats, Floats], Floats]]] = {
-    "root mean square": lambda r, p, m: _root_mean_square(r, p, m),
-    "median (MAD)": lambda r, p, m: _scale(r, p, m, None),
-    "Huber 1.5": lambda r, p, m: _scale(r, p, m, lambda u: np.where(u <= 1.5, 1.0, 1.5 / np.maximum(u, 1e-9))),
-    "IGG-III 1.5, 4": lambda r, p, m: _scale(r, p, m, _igg3(1.5, 4.0)),
-    "IGG-III 1, 3": lambda r, p, m: _scale(r, p, m, _igg3(1.0, 3.0)),
-    "IGG-III 2, 8.5": lambda r, p, m: _scale(r, p, m, _igg3(2.0, 8.5)),
-}
-
-
-def _root_mean_square(ranges: Ranges, place: Floats, prior: Floats) -> Floats:
-    equations = normal_equations(ranges, place)
-    step = np.einsum("tij,tj->ti", np.linalg.inv(equations.matrix + prior), equations.vector)
-    least = equations.wsse - np.einsum("ti,ti->t", step, equations.vector)
-    return np.asarray(np.sqrt(np.maximum(least, 0.0) / np.maximum(ranges.n_used - 2, 1)))
-
-
 def prior_settings() -> dict[str, dict[str, Any]]:
     """Settings of the risk: priors of local faults, and of a fault of a constellation other than GPS."""
     settings: dict[str, dict[str, Any]] = {f"local {p:g}": {"local_prior": p} for p in LOCAL_PRIORS}
@@ -362,19 +233,6 @@ def prior_rows() -> Iterator[str]:
                 f"{name:6s} {prior:20s} {100.0 * len(finite) / len(of_all):9.1f} {median:12.2f} {within[0]:15.1f}"
                 f" {within[1]:8.1f} {1e6 * spent / len(of_all):13.0f} {over:6d}"
             )
-
-
-def class_rows() -> Iterator[str]:
-    """Probability of faults together over the risk of a sample, of ten satellites each of G and E, by their priors."""
-    kinds = ("three", "four", "map, two", "side, two", "map, side, one", "const., map", "const., two", "const., side")
-    yield f"{'prior':20s}" + "".join(f"{kind:>15s}" for kind in kinds)
-    for name, settings in prior_settings().items():
-        risk = RiskBudget(**settings)
-        sums = set_sums(risk.prior(["G"] * 10 + ["E"] * 10)[None], 4)[0]
-        one, side, shared = risk.map_prior, 2.0 * risk.side_prior, risk.constellation_prior.get("E", 0.0)
-        of_kinds = (sums[3], sums[4], one * sums[2], side * sums[2], one * side * sums[1])
-        of_kinds += (shared * one, shared * sums[2], shared * side)
-        yield f"{name:20s}" + "".join(f"{value / risk.risk_per_sample:15.2g}" for value in of_kinds)
 
 
 def side_rows() -> Iterator[str]:
@@ -422,119 +280,13 @@ def late_ahead_rows() -> Iterator[str]:
                 )
 
 
-def ionosphere_rows() -> Iterator[str]:
-    """Positions and levels with and without Klobuchar's coefficients, and without them under delays twice as large."""
-    yield "log    coefficients, delays   vertical [m]   straight p50     p95    max   ratio p95   level median   over"
-    for name, case in cases().items():
-        bare = replace(case, navigation=replace(case.navigation, klobuchar={}))
-        known, place = case.solved(), geodetic_from_ecef(case.trajectory.at_arc(np.zeros(1)))
-        latitude, longitude = (np.repeat(value, len(known)) for value in place[:2])
-        delay = partial(klobuchar_delay_m, known.time, latitude, longitude)
-        coefficients = case.navigation.klobuchar.get("G", TYPICAL_KLOBUCHAR)
-        carrier = np.array([FREQUENCY_L1])
-        twice = np.nan_to_num(delay(known.elevation_deg, known.azimuth_deg, coefficients, carrier))
-        overhead = np.full((len(known), 1), 90.0)
-        vertical = float(np.median(delay(overhead, np.zeros_like(overhead), coefficients, carrier)))
-        for label, result in (
-            ("received, as they were", known),
-            ("none, as they were", bare.solved()),
-            ("none, twice", bare.solved(bias_m=twice)),
-        ):
-            straight, along = case.errors(result)
-            level, calm = bounds(result)
-            sizes = np.percentile(straight[np.isfinite(straight)], (50.0, 95.0, 100.0))
-            ratio = along / result.along_sigma_m
-            yield (
-                f"{name:6s} {label:24s} {vertical:10.1f} {sizes[0]:14.2f} {sizes[1]:7.2f} {sizes[2]:6.1f}"
-                f" {np.percentile(ratio[np.isfinite(ratio)], 95.0):11.2f} {np.median(level[np.isfinite(level)]):14.1f}"
-                f" {int((calm & (along > level)).sum()):6d}"
-            )
-
-
-def coefficient_rows() -> Iterator[str]:
-    """Vertical delay of the typical coefficients, and of others less that, over latitudes, longitudes and hours."""
-    grid = np.meshgrid(np.arange(-60.0, 61.0, 10.0), np.arange(-180.0, 180.0, 30.0), np.arange(24.0))
-    latitude, longitude, hour = (axis.ravel() for axis in grid)
-    tags = np.datetime64("2020-01-05", "ns") + (hour * 3.6e12).astype("timedelta64[ns]")
-    overhead = np.full((len(tags), 1), 90.0)
-
-    def vertical(coefficients: Floats) -> Floats:
-        model = partial(klobuchar_delay_m, tags, latitude, longitude, overhead, np.zeros_like(overhead))
-        return model(coefficients, np.array([FREQUENCY_L1]))[:, 0]
-
-    typical = vertical(TYPICAL_KLOBUCHAR)
-    yield "day          RMS of the delay [m]   RMS less the typical   largest"
-    yield f"2004-01-01 {np.sqrt(np.mean(typical**2)):22.2f}"
-    for file in COEFFICIENT_FILES:
-        navigation = read_navigation([DATA.parent / file])
-        delay = vertical(navigation.klobuchar["G"])
-        yield (
-            f"{navigation.kepler.toe.min().astype('datetime64[D]')} {np.sqrt(np.mean(delay**2)):22.2f}"
-            f" {np.sqrt(np.mean((delay - typical) ** 2)):22.2f} {np.abs(delay - typical).max():9.1f}"
-        )
-
-
-def reweighted(
-    ranges: Ranges, line: Trajectory, arc: Floats, section: Floats, scale: Floats, how: Reweighting
-) -> Floats:
-    """Movement along the line by Student's t weights of the residuals, in sigmas of the level, shape (T,) [m]."""
-    section = np.maximum(section, 0)
-    residual = np.nan_to_num(
-        linear_model(ranges, line, arc, section=section).residual / np.maximum(scale, 1.0)[:, None]
-    )
-    elevation, _ = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(np.nan_to_num(arc)))
-    weighed = (elevation <= how.elevation_deg) & (ranges.n_used - ranges.n_clocks - 1 >= how.redundancy)[:, None]
-    factor = np.where(weighed, how.tails.weight(residual, residual**2, residual.shape[1]), 1.0)
-    weight = ranges.weight * factor
-    return np.nan_to_num(linear_model(replace(ranges, weight=weight), line, arc, section=section).step_m[:, 0])
-
-
-def late_rows() -> Iterator[str]:
-    """Single epochs reweighted once with heavier tails for late codes; levels take the movement whole."""
-    yield "            degrees of   redundancy  elevation   straight distance [m]     error over sigma  level  over"
-    yield "log      freedom, late     at least    up to      p50     p95    max            68 %   95 %  median"
-    for name, case in cases().items():
-        result = case.solved()
-        assert result.protection is not None
-        for how in REWEIGHTINGS:
-            fixed, movement = result.fix.constrained, np.zeros(len(result))
-            if how is not None:
-                arc = np.where(np.isfinite(result.arc_m), fixed.arc_m, np.nan)
-                movement = reweighted(ranges_of(result), case.trajectory, arc, fixed.section, result.noise_scale, how)
-            moved = replace(result, arc_m=np.clip(result.arc_m + movement, 0.0, case.trajectory.arc_m[-1]))
-            straight, along = case.errors(moved)
-            level = np.where(result.protection.level.consistent, result.protection.level.level_m, np.inf)
-            level, known = level + np.abs(movement), np.isfinite(along) & np.isfinite(level)
-            ratio = along / result.along_sigma_m
-            sizes = np.percentile(straight[np.isfinite(straight)], (50.0, 95.0, 100.0))
-            yield (
-                _late_row(name, how, sizes)
-                + f" {np.percentile(ratio[np.isfinite(ratio)], 68.0):15.2f}"
-                + f" {np.percentile(ratio[np.isfinite(ratio)], 95.0):6.2f} {np.median(level[known]):7.1f}"
-                + f" {int((along[known] > level[known]).sum()):5d}"
-            )
-    for how in REWEIGHTINGS:
-        found = smartloc(DATA.parent, SETTINGS, None if how is None else partial(reweighted, how=how))
-        assert found.straight is not None
-        yield _late_row("smartLoc", how, np.array([found.straight.p50_m, found.straight.p95_m, found.straight.max_m]))
-
-
-def _late_row(name: str, how: Reweighting | None, sizes: Floats) -> str:
-    return f"{name:9s}{'-' if how is None else how.text:>36s} {sizes[0]:7.3f} {sizes[1]:7.3f} {sizes[2]:6.1f}"
-
-
 PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "faults": fault_rows,
     "maps": map_rows,
     "sigmas": sigma_rows,
-    "starts": start_rows,
     "priors": prior_rows,
-    "together": class_rows,
     "sides": side_rows,
     "ahead": late_ahead_rows,
-    "late": late_rows,
-    "ionosphere": ionosphere_rows,
-    "coefficients": coefficient_rows,
 }
 
 

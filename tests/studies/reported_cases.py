@@ -117,6 +117,10 @@ def _position_rows() -> Iterator[Row]:
         yield Row(name, "from-positions", made, 3 if backward else 0, text)
         along = f"map route {line} --positions reports/{name} --out {{out}}/r.csv --overwrite"
         yield Row(name, "route", along, 0, f"route: T1.*{note}")
+        fixed = f"reference --rtk reports/{name} --track {line} --out {{out}}/reference --overwrite"
+        # heights that lack the geoid's 50 m are off the line
+        good, of_12 = (7, "12 off_height") if name.startswith("sep") else (0, r"\d+ positions, (8|11) good fixes")
+        yield Row(name, "reference", fixed, good, f"{of_12}.*{note.replace('1 of 12 fixes have no height', '')}")
 
 
 def _map_rows() -> Iterator[Row]:
@@ -127,23 +131,42 @@ def _map_rows() -> Iterator[Row]:
         "easting-first.xml": (heights, "points, 890", "easting before northing"),
         "wgs84-egm96.fgb": ("", "12 points", "EGM96"),
     }
+    elsewhere = {
+        "match": (5, "the map lies 8,?[68]49 km from where"),
+        "run": (5, "the track lies 8,?[68][45]. km from"),
+    }
     for name, (given, text, note) in read.items():
         words = {"{map}": "reports/" + name, "{heights}": given}
-        yield _map_row(name, "check", words, 0, f"{text}.*{note}")
-        yield _map_row(name, "network", words, 0, "1 tracks")
-        yield _map_row(name, "doctor", words, 5, f"{text}.*{note}")
+        found = {
+            "check": (0, f"{text}.*{note}"), "network": (0, f"1 tracks.*{note}"), "doctor": (5, f"{text}.*{note}"),
+            "route": (0, f"{text}.*{note}"), **elsewhere,
+        }  # fmt: skip
+        for command, (code, expected) in found.items():
+            yield _map_row(name, command, words, code, expected)
+    flat, grid = (3, "the coordinates have no height"), (4, "nl_nsgi_nlgeo2018.tif, not installed .projsync")
+    without = {
+        "check": flat, "network": (0, "1 tracks"), "doctor": (5, "without heights"), "route": flat, "run": flat,
+        "match": elsewhere["match"],
+    }  # fmt: skip
     refused = {
-        "zero-heights.geojson": (heights, 3, "the coordinates have no height", "without heights"),
-        "rd-nap.fgb": ("", 4, "nl_nsgi_nlgeo2018.tif, not installed .projsync", "nl_nsgi_nlgeo2018.tif"),
-    }
-    for name, (given, code, text, found) in refused.items():
-        words = {"{map}": "reports/" + name, "{heights}": given}
-        yield _map_row(name, "check", words, code, text)
-        yield _map_row(name, "doctor", words, 5, found)
-    yield Row("way-of-one-node.osm", "network", "map network reports/way-of-one-node.osm", 0, "2 tracks.*way/3")
-    yield Row("way-of-one-node.osm", "doctor", "doctor reports/way-of-one-node.osm", 5, "8 points, 708 m.*way/3")
+        "zero-heights.geojson": (heights, without),
+        "easting-first-no-profile.xml": (heights, without),
+        "rd-nap.fgb": ("", dict.fromkeys(without, grid) | {"doctor": (5, "nl_nsgi_nlgeo2018.tif")}),
+        "way-of-one-node.osm": (
+            "",
+            without | {
+                "network": (0, "2 tracks.*way/3"), "doctor": (5, "8 points, 708 m.*way/3"),
+                "route": (4, "the map has 2 tracks; give --tracks, --via or --positions"),
+            },
+        ),
+    }  # fmt: skip
+    for name, (given, rows) in refused.items():
+        for command, (code, text) in rows.items():
+            yield _map_row(name, command, {"{map}": "reports/" + name, "{heights}": given}, code, text)
     route = "map route reports/easting-first-no-profile.xml --tracks A --heights reports/heights-by-chainage.csv"
-    yield Row("easting-first-no-profile.xml", "route", f"{route} {heights} --out {{out}}/e.csv", 0, r"890\.1 m")
+    yield Row("heights-by-chainage.csv", "route", f"{route} {heights} --out {{out}}/e.csv", 0, r"890\.1 m")
+    made = "map from-positions reports/heights-by-chainage.csv --out {out}/h.csv"
+    yield Row("heights-by-chainage.csv", "from-positions", made, 3, "no columns latitude_deg, longitude_deg, height_m")
     yield from _newcomer_rows()
 
 
@@ -178,6 +201,36 @@ def _map_row(name: str, command: str, words: dict[str, str], code: int, text: st
     return Row(name, command, line, code, text)
 
 
+def _frame_and_network_rows() -> Iterator[Row]:
+    """Older datums by a named operation; the same rows as CSV and .pos; heights, cant, topology and features."""
+    heights = "--height-datum ellipsoidal"
+    datums = {
+        "ed50_bergen": "ED50 to WGS 84 .7.' .accuracy 7 m", "ed50_rome": "ED50 to WGS 84 .1.' .accuracy 10 m",
+        "s42_83_prague": r"1942.83. to WGS 84 .5.' .accuracy 5 m", "agd66_nsw": "AGD66 to WGS 84 .13.' .accuracy 3 m",
+        "s42_83_budapest": "1942.83. to WGS 84 .3.' .accuracy 4 m",
+    }  # fmt: skip
+    for name, operation in datums.items():
+        for command, code in (("check", 0), ("network", 0), ("doctor", 5)):
+            words = {"{map}": f"maps/{name}.geojson", "{heights}": heights}
+            yield _map_row(f"{name}.geojson", command, words, code, operation)
+    matches = {
+        ("ed50_two_lines", "ed50_log.csv"): "0 with a probability below 0.9.*accuracy 10 m.*10.0 m is taken",
+        **dict.fromkeys([("par", "s8.csv"), ("par", "s8.pos")], "200 with a probability below 0.9"),
+        **dict.fromkeys([("lev", f"{log}.{kind}") for log in ("h0", "h4") for kind in ("csv", "pos")],
+                        "200 on a track.* 0 with a probability below 0.9"),
+    }  # fmt: skip
+    for (name, log), text in matches.items():
+        words = f"map match maps/{name}.geojson {heights} --log maps/{log} --out {{out}}/m.csv --overwrite"
+        yield Row(log, "match", words, 0, text)
+    yield Row("signedcant.csv", "check", "map check maps/signedcant.csv", 6, "cant")
+    yield Row(
+        "osm_layer.osm", "network", "map network maps/osm_layer.osm", 0, "2 tracks.* 0 switches.*2 separate parts"
+    )
+    yield Row("slip.osm", "network", "map network maps/slip.osm", 0, "4 tracks.* 4 switches.*1 separate part")
+    for name in ("features_5m.csv", "features_20m.csv"):  # radii of 1,500 m, no change of curvature by 1/1000 m
+        yield Row(name, "features", f"map features maps/{name} --out {{out}}/f.csv --overwrite", 0, r"\b0 features")
+
+
 def _receiver_rows() -> Iterator[Row]:
     log = "reports/three-epochs.rtcm3"
     words = f"convert {log} --out {{out}}/q.rnx --nav-out {{out}}/q.nav --overwrite"
@@ -187,11 +240,22 @@ def _receiver_rows() -> Iterator[Row]:
     located = f"locate --log {log} --out {{out}}/r.pos --overwrite"
     yield Row("three-epochs.rtcm3", "locate", located, 7, "2 no valid and healthy navigation record")
     yield Row("three-epochs.rtcm3", "doctor", f"doctor {log}", 5, "2024-08-18 21:14:25.*8 ephemerides inside")
+    which = f"which-track --front {log} --nav {log} --map {{line}}"
+    yield Row("three-epochs.rtcm3", "which-track", which, 7, "the log has no position")
+    ran = f"run --front {log} --track {{line}} --out {{out}}/run --overwrite"
+    yield Row("three-epochs.rtcm3", "run", ran, 7, "a position in 0 of 4 epochs")
 
 
 def list_rows() -> list[Row]:
     """Return all rows."""
-    return [*_log_rows(), *_navigation_rows(), *_position_rows(), *_map_rows(), *_receiver_rows()]
+    return [
+        *_log_rows(),
+        *_navigation_rows(),
+        *_position_rows(),
+        *_map_rows(),
+        *_frame_and_network_rows(),
+        *_receiver_rows(),
+    ]
 
 
 def write_line(path: Path) -> Path:
@@ -209,7 +273,7 @@ def run_row(row: Row, cases: Path, out: Path) -> tuple[bool, int, str]:
     for word in row.words.replace("{nav}", "reports/base.nav").split():
         word = word.replace("{out}", str(out)).replace("{line}", str(line))
         folder = cases.parent if word.startswith("kinematic/") else cases
-        words.append(str(folder / word) if re.match("(reports|newcomer|kinematic)/", word) else word)
+        words.append(str(folder / word) if re.match("(reports|newcomer|maps|kinematic)/", word) else word)
     result = CliRunner(env={"COLUMNS": "500"}).invoke(app, words)
     text = " ".join(f"{result.stdout} {result.stderr}".split())
     codes = (row.exit_code,) if isinstance(row.exit_code, int) else row.exit_code

@@ -11,8 +11,8 @@ import pytest
 import belief_campaign
 import recordings_truth
 from belief_campaign import Case, joined, over, run
-from case_files import write_case
 from railfix.core.timescale import seconds
+from railfix.evaluate.cases import write_case
 from railfix.track import Track
 from railfix.track.point_files import write_track_csv
 from railfix.track.trajectory import Trajectory

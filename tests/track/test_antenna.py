@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from railfix.core.errors import RailfixWarning
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Track
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory, project_on_segments
@@ -32,9 +31,6 @@ def test_track_taken_as_the_antennas_path_says_so() -> None:
     np.testing.assert_allclose(line.arc_m, [0.0, 100.0, 150.0], atol=1e-6)
     np.testing.assert_allclose(line.chainage_m, line.arc_m, atol=1e-6)
     assert (line.sigma_plan_m, line.sigma_height_m) == (0.30, 0.60)
-    track = Track.from_ecef(ecef(np.array([[0, 0, 0], [0, 100, 0]], dtype=np.float64)))
-    with pytest.warns(RailfixWarning, match="no vehicle file"):
-        assert len(Trajectory.from_track(track)) == 2
 
 
 def test_axes_of_a_line_to_the_north() -> None:

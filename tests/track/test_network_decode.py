@@ -12,11 +12,11 @@ from scipy.special import binom
 from network_around import SHAPES
 from network_around_recordings import recorded_errors, stated
 from network_around_recordings import recordings as recorded
-from network_made import made_network, made_run, segment, to_degrees
+from network_made import log_at, made_network, made_run, segment, to_degrees
 from railfix.track import network_decode
 from railfix.track.network import Candidates, Network
 from railfix.track.network_decode import COMMON_S, Residuals, Transitions, decode
-from railfix.track.network_match import PlanLog, match
+from railfix.track.network_match import match
 from railfix.track.network_read import links_of_ends
 from railfix.track.route import Segment
 
@@ -135,13 +135,7 @@ def test_an_error_of_all_positions_is_no_new_evidence_each_second() -> None:
     for seconds in (200, 2000):
         east = 10.0 * np.arange(seconds)
         latitude, longitude = to_degrees(east, np.full(seconds, 1.0))
-        log = PlanLog(
-            path="made",
-            time=np.datetime64("2024-01-01", "ns") + np.arange(seconds) * np.timedelta64(1, "s"),
-            latitude_deg=latitude,
-            longitude_deg=longitude,
-            sigma_m=np.full(seconds, 2.0),
-        )
+        log = log_at(latitude, longitude, 2.0)
         certain.append(float(match(net, log).probabilities.max(axis=1).mean()))
     assert 0.6 < certain[0] < certain[1] < 0.99
 
@@ -167,15 +161,7 @@ def test_height_tells_a_viaduct_from_the_line_below() -> None:
     tracks = [replace(segment(name, *plan), height_m=h) for name, h in (("below", 0.0 * x), ("viaduct", ramp))]
     net = Network(tracks=tuple(tracks), links=())
     latitude, longitude = to_degrees(np.arange(0.0, 4000.0, 10.0), np.zeros(400))
-    log = PlanLog(
-        path="made",
-        time=np.datetime64("2024-01-01", "ns") + np.arange(400) * np.timedelta64(1, "s"),
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        sigma_m=np.full(400, 2.0),
-        height_m=np.full(400, 3.0),
-        sigma_up_m=np.full(400, 4.0),
-    )
+    log = log_at(latitude, longitude, 2.0, height_m=np.full(400, 3.0), sigma_up_m=np.full(400, 4.0))
     for above, name in ((3.0, "below"), (11.0, "viaduct")):
         height = np.where(np.arange(0.0, 4000.0, 10.0) < 1000.0, 3.0, above)
         matched = match(net, replace(log, height_m=height))
@@ -193,13 +179,7 @@ def test_a_track_that_the_map_lacks_is_possible(missing_m: float, unmapped: tupl
     x = np.linspace(0.0, 8000.0, 161)
     net = Network(tracks=(segment("M", *to_degrees(x, 0.0 * x)),), links=())
     latitude, longitude = to_degrees(np.arange(1000.0, 7000.0, 10.0), np.full(600, max(missing_m - 0.8, 0.0)))
-    log = PlanLog(
-        path="made",
-        time=np.datetime64("2024-01-01", "ns") + np.arange(600) * np.timedelta64(1, "s"),
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        sigma_m=np.full(600, 1.5),
-    )
+    log = log_at(latitude, longitude, 1.5)
     for reverse in (False, True):
         turned = replace(net, tracks=(net.tracks[0].reverse(),)) if reverse else net
         matched = match(turned, log)
@@ -216,16 +196,23 @@ def test_a_track_that_the_map_lacks_stays_where_the_nearest_track_changes() -> N
     net = Network(tracks=tracks, links=())
     north = -7.2 + np.random.default_rng(2).normal(0.0, 1.0, 600)
     latitude, longitude = to_degrees(np.arange(1000.0, 7000.0, 10.0), north)
-    log = PlanLog(
-        path="made",
-        time=np.datetime64("2024-01-01", "ns") + np.arange(600) * np.timedelta64(1, "s"),
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        sigma_m=np.full(600, 1.5),
-    )
+    log = log_at(latitude, longitude, 1.5)
     matched = match(net, log)
     assert set(matched.candidates.track[:, 0].tolist()) == {0, 1}
     assert (1.0 - matched.probabilities.sum(axis=1)).min() > 0.99
+
+
+@pytest.mark.parametrize(("aside_m", "error_m"), [(3.6, 0.9), (3.6, 1.2), (7.2, 1.2)])
+def test_a_train_that_passes_an_open_end_was_on_its_track_until_there(aside_m: float, error_m: float) -> None:
+    """The map ends at 4 km, and has another track beside from there on: the train is on none of it, and was on M."""
+    x = np.linspace(0.0, 4000.0, 81)
+    tracks = (segment("M", *to_degrees(x, 0.0 * x)), segment("R", *to_degrees(x + 4000.0, np.full(81, -aside_m))))
+    net = Network(tracks=tracks, links=())
+    for along in (np.arange(1000.0, 5000.0, 10.0), np.arange(1000.0, 5000.0, 10.0)[::-1]):
+        matched = match(net, log_at(*to_degrees(along, np.full(400, -error_m)), 1.7))
+        assert (matched.track[along < 4000.0] == 0).mean() > 0.98
+        assert (matched.track[along > 4020.0] == -1).mean() > 0.95
+        assert matched.probability[along < 3900.0].min() > 0.6
 
 
 def test_a_few_positions_far_off_move_no_train_to_the_track_beside() -> None:
@@ -268,13 +255,7 @@ def test_a_short_track_of_a_switch_is_not_passed_over(begin: float) -> None:
     net = replace(net, links=links_of_ends(net))
     x = np.arange(begin, 900.0, 12.2)
     latitude, longitude = to_degrees(x, np.full(len(x), 1.7))
-    log = PlanLog(
-        path="log",
-        time=np.datetime64("2024-01-01", "ns") + np.arange(len(x)) * np.timedelta64(400, "ms"),
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        sigma_m=np.full(len(x), 2.0),
-    )
+    log = log_at(latitude, longitude, 2.0, step_s=0.4)
     matched = match(net, log)
     on_it = (x > 500.0) & (x < 521.0)
     assert on_it.sum() == 2

@@ -13,11 +13,11 @@ pytest.importorskip("shapely")
 from pyproj import Transformer
 
 from helpers import odd_maps as odd
+from network_made import log_at
 from railfix.core.errors import MismatchError, RailfixError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track import Track, check_track, read_track
 from railfix.track.network import Network
-from railfix.track.network_match import PlanLog
 from railfix.track.read import read_segments
 from railfix.track.route import MapReading
 from railfix.track.trajectory import NearestOnPolyline
@@ -68,23 +68,13 @@ def test_an_odd_map_is_right_or_says_what_is_wrong(case: odd.Odd, tmp_path: Path
         assert any(re.search(case.words, sentence) for sentence in findings), findings
     elif case.outcome == "elsewhere":
         with pytest.raises(MismatchError, match=case.words or "is it the map of that line"):
-            _log().transform_to(Network(tracks=tuple(read_segments(path, MapReading(**asked))), links=()))
+            log_at(odd.LINE[:, 1], odd.LINE[:, 0]).transform_to(
+                Network(tracks=tuple(read_segments(path, MapReading(**asked))), links=())
+            )
     else:
         assert _apart_m(track, _design_m() if path.suffix == ".xml" else of_line) < 0.05
         assert findings == []
         assert any(re.search(case.words or "^$", note) for note in track.provenance.notes) == (case.outcome == "noted")
-
-
-def _log() -> PlanLog:
-    """Positions on the line."""
-    empty = np.full(odd.N, np.nan)
-    return PlanLog(
-        path="log",
-        time=np.datetime64("2026-01-01", "ns") + np.arange(odd.N) * np.timedelta64(1, "s"),
-        latitude_deg=odd.LINE[:, 1],
-        longitude_deg=odd.LINE[:, 0],
-        sigma_m=empty,
-    )
 
 
 def test_a_grid_in_feet_is_read_in_feet(tmp_path: Path) -> None:

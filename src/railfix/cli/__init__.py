@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar
 import typer
 
 from railfix import __version__
-from railfix.cli.command import LazyCommands, command_group, run_program
+from railfix.cli.command import LazyCommands, command_group
 from railfix.core.files import source_commit
 
 # Threads of linear algebra spin while they wait for the next product. It must be set before numpy is imported.
@@ -106,7 +106,7 @@ def railfix(
     - 4: a setting is misspelt, out of range, or contradicts another
     - 5: the inputs are readable but do not match each other (other day, other place)
     - 6: the track map was checked and has errors
-    - 7: the run ended without a single position
+    - 7: not a single position: none in the results, or none in the inputs that can be used
     - 8: the output cannot be written
     - 9: two channels of a live session gave different answers to the same input
 
@@ -116,8 +116,3 @@ def railfix(
     An error is one sentence on the standard error output; it leaves no results behind. Files that exist are
     replaced only with `--overwrite`, and an input is never replaced.
     """
-
-
-def main() -> None:
-    """Entry point of the program ``railfix``."""
-    run_program(app)

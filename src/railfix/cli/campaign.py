@@ -14,7 +14,7 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
-from railfix.cli.command import raise_exit
+from railfix.cli.command import SIGNALLED
 from railfix.cli.console import (
     TableConsole,
     prepare_kernels,
@@ -26,11 +26,12 @@ from railfix.cli.console import (
     show_verdict,
 )
 from railfix.cli.options import Choices, JsonOption, OutOption, Without, from_models, resolve_settings
-from railfix.core.errors import MismatchError, NoPositionError, SettingsError
+from railfix.core.errors import MismatchError, NoPositionError, SettingsError, needs_extra
 from railfix.core.tables import number, percent, plain_table
 from railfix.evaluate import Score
 from railfix.evaluate.ablation import Ablation, Effect, ablate_files
 from railfix.evaluate.benchmark import heads, run_benchmark, shown_rows
+from railfix.pipeline.config import Config
 from railfix.report.campaign import report_campaign, write_campaign_page
 from railfix.run import RunInputs, RunOptions
 from railfix.run.campaign import run_campaign
@@ -125,11 +126,11 @@ def _prepare_worker() -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
 
 
-def _end(number_of_signal: int, frame: object) -> None:
+def _end(number_of_signal: int, _frame: object) -> None:
     """End by an exception, which a second signal does not interrupt."""
     for each in _ENDING:
         signal.signal(each, signal.SIG_IGN)
-    raise_exit(number_of_signal, frame)
+    raise SystemExit(SIGNALLED + number_of_signal)
 
 
 @contextmanager
@@ -150,10 +151,8 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
         return
-    try:
+    with needs_extra("--scheduler"):
         from distributed import Client, KilledWorker
-    except ModuleNotFoundError:
-        raise SettingsError("--scheduler needs distributed; install railfix[cluster]") from None
     try:
         client = Client(scheduler, timeout="10s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
@@ -205,6 +204,11 @@ def benchmark(
     Exit codes are those of `railfix --help`; 5 where some cases have failed, 7 where all have failed.
     """
     config, _ = resolve_settings(choices)
+    show_benchmark(folder, config, out=out, workers=workers)
+
+
+def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> None:
+    """Run the cases of a folder, and print the table, notes and files; errors as `benchmark`."""
     with open_executor(workers, None) as (executor, lost):
         prepare_kernels()
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)

@@ -9,6 +9,7 @@ import re
 import select
 import signal
 import sys
+import warnings
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
@@ -19,25 +20,10 @@ from typing import Any, ClassVar, Final, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from railfix.core.errors import InputFileError, OutputError, RailfixError, SettingsError
+from railfix.core.errors import InputFileError, OutputError, RailfixError, RailfixWarning, SettingsError, needs_extra
 
 #: Words that users mistakenly give to switches.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: Packages that commands import when they are called, and the extra of railfix that installs each.
-EXTRAS: Final = {
-    "cbor2": "live",
-    "serial": "live",
-    "paho": "mqtt",
-    "aioquic": "ground",
-    "cryptography": "ground",
-    "starlette": "ground",
-    "uvicorn": "ground",
-    "sqlalchemy": "ground",
-    "distributed": "cluster",
-    "mcap_ros2": "mcap",
-    "pyogrio": "maps",
-    "shapely": "maps",
-}
 #: A signal ends the program with this exit code plus its number, as in a shell.
 SIGNALLED: Final = 128
 #: Message of `pathlib` for a link that leads to itself.
@@ -93,17 +79,11 @@ class Commands(TyperGroup):
         """Run the command; an error that the user can mend is reported in one sentence."""
         try:
             _check_surroundings()
-            return super().invoke(ctx)
+            with needs_extra(), warnings.catch_warnings():
+                warnings.simplefilter("ignore", RailfixWarning)  # commands print them as notes
+                return super().invoke(ctx)
         except RailfixError as error:
             _end(error)
-        except ModuleNotFoundError as error:
-            extra = EXTRAS.get(str(error.name).partition(".")[0])
-            if extra is None:
-                raise
-            _end(SettingsError(f"this needs {error.name}, which is not installed; pip install 'railfix[{extra}]'"))
-        except KeyboardInterrupt:
-            typer.echo("railfix: interrupted; what was unfinished is removed, finished files are kept", err=True)
-            raise typer.Exit(SIGNALLED + signal.SIGINT) from None
         except MemoryError:
             _end(SettingsError("this needs more memory than there is; give a shorter time or fewer epochs at a time"))
         except RuntimeError as error:
@@ -166,10 +146,9 @@ def load_command(name: str, module_name: str | None = None) -> Any:
 
 
 def run_program(app: typer.Typer) -> NoReturn:
-    """Run the program: signals that end it clean up first, and a reader that stops reading is no error."""
-    for name, handler in (("SIGTERM", raise_exit), ("SIGHUP", raise_exit), ("SIGPIPE", _end_at_closed_pipe)):
-        if number := getattr(signal, name, None):
-            signal.signal(number, handler)
+    """Run the program; a reader of its output that stops reading is no error."""
+    if number := getattr(signal, "SIGPIPE", None):
+        signal.signal(number, _end_at_closed_pipe)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         try:
@@ -185,11 +164,6 @@ def run_program(app: typer.Typer) -> NoReturn:
         code = OutputError.exit_code
     _discard_output()
     sys.exit(code)
-
-
-def raise_exit(number: int, _frame: object) -> None:
-    """End by an exception, so that staging folders are removed."""
-    raise SystemExit(SIGNALLED + number)
 
 
 def _end_at_closed_pipe(number: int, _frame: object) -> None:

@@ -14,15 +14,16 @@ from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_ta
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.arrays import Floats
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
-from railfix.core.files import write_whole
+from railfix.core.notebook import plural
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import plain_table, plural
+from railfix.core.staged_files import write_whole
+from railfix.core.tables import plain_table
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions
-from railfix.track.network_read import TOLERANCE_M, check_network, read_network
-from railfix.track.network_route import Filled, Rows, fill_gaps, find_route
+from railfix.track.network_read import FAULTS, TOLERANCE_M, check_network, read_network
+from railfix.track.network_route import Filled, Rows, fill_gaps, find_route, left_out_note
 from railfix.track.quality import error_note
 from railfix.track.read import track_of_segments
 
@@ -145,7 +146,7 @@ def network(
 
         write_network_page(tracks, quality, page)
         console.print(f"page: {page}")
-    faults = [f for f in quality.findings if f.kind in ("gap", "joint", "kink")]
+    faults = [f for f in quality.findings if f.kind in FAULTS]
     if faults:
         raise MapQualityError(f"the network has {plural(faults, 'fault')}, the first: {faults[0].sentence}")
 
@@ -204,13 +205,8 @@ def _route_tracks(
             return [0], []
         raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
     log, notes = _in_frame_of(net, log, connecting, reading)
-    passed, left_out = find_route(net, match(net, log))
-    if not passed:
-        raise MismatchError(f"{choice.positions}: no position lies near a track of the network")
-    if left_out:
-        beside = ", ".join(net.names[k] for k in left_out)
-        notes.append(f"no route joins these tracks to {beside}: the run turned back there, or the map has a gap")
-    return passed, notes
+    passed, left_out = find_route(net, match(net, log), log.path)
+    return passed, [*notes, *([left_out_note(net, left_out)] if left_out else [])]
 
 
 def _in_frame_of(
@@ -220,12 +216,7 @@ def _in_frame_of(
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)
-    size = float(np.hypot(shift.east_m, shift.north_m))
-    note = (
-        f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
-        f"{shift.used}, the frame of the positions (--same-frame: they are in that of the map)"
-    )
-    return moved, [*log.notes, *shift.notes, *([note] if size > 0.0 else [])]
+    return moved, [*log.notes, *shift.sentences]
 
 
 def _track_at(net: Network, text: str) -> int:

@@ -20,6 +20,7 @@ from railfix.cli.options import (
     resolve_settings,
     set_value,
 )
+from railfix.core.errors import needs_extra
 from railfix.core.settings import validate
 from railfix.live.settings import LiveInputs, LiveSettings
 from railfix.run import RunInputs, RunOptions, run_files
@@ -113,7 +114,8 @@ def live(
     from railfix.live.command import run_live
 
     if inputs.channels == "2" or any(text.startswith("cbor@") for text in inputs.send):
-        import cbor2  # noqa: F401  a missing one is reported before anything is opened
+        with needs_extra():
+            import cbor2  # noqa: F401  a missing one is reported before anything is opened
 
     settings, _ = resolve_settings(choices)
     values: dict[str, Any] = {}

@@ -13,7 +13,7 @@ code meaning
 4    a setting is misspelt, out of range, or contradicts another
 5    the inputs are readable but do not match each other (other day, other place)
 6    the track map was checked and has errors
-7    the run ended without a single position
+7    not a single position: none in the results, or none in the inputs that can be used
 8    the output cannot be written
 9    two channels of a live session gave different answers to the same input
 ==== =====================================================================
@@ -21,8 +21,11 @@ code meaning
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from os import PathLike
-from typing import ClassVar
+from typing import ClassVar, Final
 
 
 class RailfixError(Exception):
@@ -33,6 +36,12 @@ class RailfixError(Exception):
 
 class RailfixWarning(UserWarning):
     """A limitation of a result that the caller may not know: the command line prints it as a note."""
+
+
+def warn_of(notes: Iterable[str]) -> None:
+    """Issue each note once as a `RailfixWarning` at the line that called the caller of this function."""
+    for note in dict.fromkeys(notes):
+        warnings.warn(note, RailfixWarning, stacklevel=3)
 
 
 class InputFileError(RailfixError):
@@ -58,11 +67,49 @@ class SettingsError(RailfixError):
     exit_code = 4
 
 
-def check_type(value: object, expected: type, *, what: str, hint: str = "") -> None:
-    """Raise SettingsError where an argument is not of the type that is expected; `hint` says how to obtain one."""
+#: Functions that return an object of a type, by its name.
+_MAKERS: Final = {
+    "Track": "read_track",
+    "Trajectory": "antenna_trajectory",
+    "Vehicle": "read_vehicle",
+    "Navigation": "read_navigation",
+    "Observations": "read_observations",
+    "SbasMessages": "read_sbas",
+    "Result": "EpochProcessor.process",
+    "State": "EpochProcessor.process",
+    "Scenario": "load_scenario",
+}
+
+
+def check_type(value: object, expected: type, what: str) -> None:
+    """Raise SettingsError where an argument is not of the expected type; it names the function that returns one."""
     if not isinstance(value, expected):
-        made = f"; {hint}" if hint else ""
-        raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{made}")
+        maker = f"; {_MAKERS[expected.__name__]} returns one" if expected.__name__ in _MAKERS else ""
+        raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{maker}")
+
+
+#: Optional packages, and the extra of railfix that installs each.
+_EXTRAS: Final = {
+    **dict.fromkeys(("cbor2", "serial", "h11"), "live"),
+    "paho": "mqtt",
+    **dict.fromkeys(("aioquic", "cryptography", "starlette", "uvicorn", "sqlalchemy"), "ground"),
+    "distributed": "cluster",
+    "mcap_ros2": "mcap",
+    **dict.fromkeys(("pyogrio", "shapely", "rasterio", "jgdtrans", "rdflib"), "maps"),
+}
+
+
+@contextmanager
+def needs_extra(what: object = "this") -> Iterator[None]:
+    """Raise SettingsError where a package imported inside is not installed; it names `what` needs it, and the extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get(str(error.name).partition(".")[0])
+        if extra is None:
+            raise
+        needed = f"{what} needs {error.name}, which is not installed; pip install 'railfix[{extra}]'"
+        raise SettingsError(needed) from None
 
 
 class MismatchError(RailfixError):
@@ -78,7 +125,7 @@ class MapQualityError(RailfixError):
 
 
 class NoPositionError(RailfixError):
-    """A run ended without a single position."""
+    """Inputs are readable, but not a single position of them can be used."""
 
     exit_code = 7
 

@@ -92,7 +92,7 @@ class Status(IntEnum):
     ANTENNAS_DISAGREE = 8
     #: A position, but its single-epoch sigma exceeds `Config.largest_sigma_m`.
     UNCERTAIN = 9
-    #: A position, but the 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or the
+    #: A position, but the 3-D positions of the last minutes lie off the line: the map is wrong here, or the
     #: train is on another track.
     MAP_OFFSET = 10
     #: A position that passed every check, but interference with the signals is suspected: jamming.

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args, get_origin
 
-import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
-from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import FilePath, write_whole
+from railfix.core.errors import SettingsError
+from railfix.core.notebook import html_table
 
 
 def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
@@ -53,6 +51,9 @@ class Settings(BaseModel):
                 f"{type(self).__name__} cannot be changed; make another one: settings.replaced({name}={value!r})"
             )
 
+        def __delattr__(self, name: str) -> None:
+            raise SettingsError(f"{type(self).__name__} cannot be changed; Config().replaced() keeps all settings")
+
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Yield the settings that differ from their defaults, of which some are computed from the settings before."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
@@ -60,6 +61,11 @@ class Settings(BaseModel):
             value = values[name]
             if field.is_required() or value != field.get_default(call_default_factory=True, validated_data=values):
                 yield name, value
+
+    def _repr_html_(self) -> str:
+        rows = [{"setting": str(name), "value": repr(value)} for name, value in self.__repr_args__()]
+        of = f"{len(rows)} of {len(type(self).model_fields)} settings are not the defaults"
+        return html_table(rows, caption=f"{type(self).__name__}: {of}")
 
     @field_validator("*", mode="before")
     @classmethod
@@ -75,9 +81,11 @@ class Settings(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _one_word_for_a_list(cls, value: Any, info: ValidationInfo) -> Any:
-        """Take words with commas between them for a list: ``systems=G``."""
-        if isinstance(value, str) and get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
-            return tuple(word.strip() for word in value.split(",") if word.strip())
+        """Take words with commas between them, or one path, for a list: ``systems=G``."""
+        if get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
+            if isinstance(value, str):
+                return tuple(word.strip() for word in value.split(",") if word.strip())
+            return (value,) if isinstance(value, Path) else value
         return value
 
     def replaced(self, **changes: Any) -> Self:
@@ -161,53 +169,3 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[s
         if NoneType in get_args(kind) and len(present) == 1:
             kind = present[0]
     return set(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else set()
-
-
-def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Read the values of a TOML file; `what` names the expected kind of file with its article ("a vehicle file").
-
-    InputFileError: the file is missing, unreadable, not UTF-8, or not TOML.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read as {what} ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputFileError(path, f"is not a text file; {what} is TOML in UTF-8") from None
-    try:
-        return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputFileError(path, f"is not valid TOML ({error}); {what} was expected") from None
-
-
-def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:
-    """Read settings from a TOML file; InputFileError as `read_toml`, SettingsError as `validate`."""
-    return validate(model, read_toml(path, what=what), source=str(path))
-
-
-def write_toml(path: FilePath, values: Mapping[str, Any], *, what: str = "file", comment: str = "") -> None:
-    """Write values as TOML below an optional comment; OutputError, and no file, where it cannot be written."""
-    head = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
-    write_whole(path, head + tomli_w.dumps(dict(values)), what=what)
-
-
-ModelFile = TypeVar("ModelFile", bound=Settings)
-
-
-def read_model_file(model: type[ModelFile], path: FilePath, *, what: str, format_name: str, command: str) -> ModelFile:
-    """Read a model file as a `Settings` type with the field `format`; `what` and `command` are used in messages."""
-    values = read_toml(path, what=what)
-    written = values.get("format")
-    if written != format_name:
-        name = format_name.rsplit(" ", 1)[0]
-        if isinstance(written, str) and written.startswith(f"{name} "):
-            problem = (
-                f"is {what} of format '{written}', this version reads '{format_name}'; make it again with {command}"
-            )
-        else:
-            problem = f"is not {what}: format = '{format_name}' was expected; make one with {command}"
-        raise InputFileError(path, problem)
-    try:
-        return validate(model, values, source=str(path))
-    except SettingsError as error:
-        raise InputFileError(path, str(error).removeprefix(f"{path}: ").replace("setting ", "entry ", 1)) from None

@@ -11,8 +11,9 @@ from typing import Any, Final
 import polars as pl
 import polars.selectors as cs
 
-from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError, check_type
 from railfix.core.files import fingerprint
+from railfix.core.notebook import NotebookTable
 from railfix.evaluate.accuracy import ALL, KEYS, USED, figures_by
 from railfix.evaluate.epoch_table import antenna_epochs, below
 from railfix.evaluate.evaluation_inputs import (
@@ -75,8 +76,8 @@ class EvaluatedRun:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Evaluation:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Evaluation(NotebookTable):
     """Evaluation of runs against reference trajectories."""
 
     runs: tuple[EvaluatedRun, ...]
@@ -92,9 +93,7 @@ class Evaluation:
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return one figure of the row with these values, by default of "all", own, constrained; otherwise
-        LookupError.
-        """
+        """Return one figure of the row with these values, by default "all", own, constrained; otherwise LookupError."""
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:
@@ -138,6 +137,8 @@ def evaluate_runs(
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
         raise SettingsError("no run to evaluate; name the folders that railfix run wrote")
+    for item in runs:
+        check_type(item, RunAndReference, "run to evaluate")
     counts = Counter((item.run.resolve(), item.table) for item in runs)
     twice = [path for (path, _), count in counts.items() if count > 1]
     if twice:

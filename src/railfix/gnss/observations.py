@@ -18,7 +18,8 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, copy_with, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
-from railfix.core.tables import NotebookTable, plural, time_span_text
+from railfix.core.errors import check_type
+from railfix.core.notebook import NotebookTable, plural, time_span_text
 from railfix.core.timescale import gps_time
 
 
@@ -233,6 +234,9 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     ValueError
         A part begins before the end of the preceding part, or there are no parts.
     """
+    check_type(parts, Sequence, "parts of a log")
+    for part in parts:
+        check_type(part, Observations, "part of a log")
     with_epochs = [(k, part.time) for k, part in enumerate(parts) if len(part)]
     for (one, before), (other, time) in pairwise(with_epochs):
         if time[0] <= before[-1]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import Field
 
+from railfix.core.errors import needs_extra
 from railfix.core.settings import Settings
 from railfix.ground.layout import MOST_PARTS
 from railfix.io.train_message import MessageError, validate_message
@@ -36,7 +37,7 @@ class Authority(Settings):
     stopped: bool  #: The train is ordered to stop.
     #: The end is one that the train is asked to accept instead of a farther one, if it can stop before it.
     shortens: bool = False
-    session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Start on board that `report` is of.
+    session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Identifier of the on-board start that `report` belongs to.
     overlap_cm: Number = 0  #: Way beyond the end that is kept for a train that passes it at release speed.
     #: Chainages, lower first, and highest speed [cm/s] of each speed restriction in the interval.
     restrictions: Annotated[tuple[SpeedPart, ...], Field(max_length=MOST_PARTS)] = ()
@@ -45,7 +46,8 @@ class Authority(Settings):
 
     def encode(self) -> bytes:
         """Return the bytes of the message."""
-        import cbor2
+        with needs_extra():
+            import cbor2
 
         return cbor2.dumps([self.kind, VERSION, *self.model_dump().values()], canonical=True)
 
@@ -58,7 +60,8 @@ class Authority(Settings):
         MessageError
             The bytes are not an authority of this version.
         """
-        import cbor2
+        with needs_extra():
+            import cbor2
 
         try:
             kind, version, *values = cbor2.loads(data)

@@ -95,7 +95,7 @@ class ReferenceCurve:
 
 
 class TrainState(Enum):
-    """State of a train as the centre knows it."""
+    """State of a train in the centre."""
 
     #: No report with a position since the centre was started.
     UNKNOWN = "unknown"

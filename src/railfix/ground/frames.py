@@ -103,7 +103,7 @@ class ReceiverLimits(Settings):
     delay_s: float = Field(default=5.0, gt=0)  #: Largest delay above the shortest observed one.
     #: Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: A sequence number may be further ahead of the newest by so many, and by so many a second since then.
+    #: Largest lead of a sequence number over the newest one, and its growth per second since then.
     jump: int = Field(default=1000, ge=1)
     rate: float = Field(default=100.0, gt=0)
 
@@ -181,9 +181,7 @@ class FrameReceiver:
         return frame, frame
 
     def _begin(self, session: int) -> None:
-        """Begin with a new start of the sender, whose numbers and clock have another origin; late frames
-        are rejected.
-        """
+        """Begin a new start of the sender, with other origins of numbers and clock; late frames are rejected."""
         if self._session is not None:
             self._retired.append(self._session)
         self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None

@@ -12,11 +12,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
+from railfix.core.errors import InputFileError, OutputError, needs_extra
 
-from railfix.core.errors import InputFileError, OutputError
+with needs_extra():
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
 
 #: Validity of the certificates, of the authority's own, and the time before the end at which it is an alarm [days].
 VALID_DAYS: Final = 365

@@ -144,7 +144,7 @@ class OnBoard:
         late lasts until the next authority.
         """
         if isinstance(authority, BrakeOrder):
-            # also of a centre whose database is an older copy, and knows no numbers as high as the train's
+            # also from a centre whose database is an older copy, with smaller numbers than the train's
             if self.order is None or authority.number >= self.order.number:
                 self.order = authority
             return True
@@ -176,9 +176,7 @@ class OnBoard:
         return False
 
     def _answers(self, authority: Authority) -> bool:
-        """Return whether an authority answers a report of this start on board, since the last change of ends, that is
-        not older than `LONGEST_FRESH_S`.
-        """
+        """Return whether an authority answers a report of this start and end, at most `LONGEST_FRESH_S` old."""
         if authority.session != self.session or authority.report <= self.before_turn:
             return False
         if len(self._sent) == REMEMBERED and authority.report < next(iter(self._sent)):

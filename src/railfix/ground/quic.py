@@ -16,15 +16,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, cast
 
-from aioquic.asyncio.protocol import QuicConnectionProtocol
-from aioquic.asyncio.server import QuicServer, serve
-from aioquic.quic.configuration import QuicConfiguration
-from aioquic.quic.connection import QuicConnection
-from aioquic.quic.events import ConnectionTerminated, DatagramFrameReceived, HandshakeCompleted, QuicEvent
-from aioquic.tls import Alert, Epoch, verify_certificate
-from cryptography.x509 import Certificate
-
+from railfix.core.errors import needs_extra
 from railfix.ground.keys import name_of
+
+with needs_extra():
+    from aioquic.asyncio.protocol import QuicConnectionProtocol
+    from aioquic.asyncio.server import QuicServer, serve
+    from aioquic.quic.configuration import QuicConfiguration
+    from aioquic.quic.connection import QuicConnection
+    from aioquic.quic.events import ConnectionTerminated, DatagramFrameReceived, HandshakeCompleted, QuicEvent
+    from aioquic.tls import Alert, Epoch, verify_certificate
+    from cryptography.x509 import Certificate
 
 #: Name of the protocol in the handshake.
 PROTOCOL: Final = "railfix-link/1"
@@ -154,9 +156,7 @@ class LinkProtocol(QuicConnectionProtocol):
         return self.certificate is not None and datetime.now(UTC) > self.certificate.not_valid_after_utc
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
-        """Process a packet; acknowledgements to a verified peer are delayed where possible, which halves packets and
-        work.
-        """
+        """Process a packet; delayed acknowledgements to a verified peer halve packets and work."""
         if self._handshakes is not None and not self._begun:
             self._begun = True
             self._handshakes.begin(self, str(addr[0]))

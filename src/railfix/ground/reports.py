@@ -19,7 +19,7 @@ from railfix.ground.layout import Layout
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
-#: Difference of a reported length from the configured one that is rounding [m].
+#: Largest rounding difference between a reported and the configured length [m].
 LENGTH_ROUNDING_M: Final = 0.02
 #: Largest speed of a standing train; and against the facing, beyond which a train rolls back [m/s].
 STANDING_MPS: Final = 0.5
@@ -126,7 +126,7 @@ def wide_bounds(report: PlacedReport) -> str | None:
 
 
 def off_line(report: PlacedReport) -> str | None:
-    """Return the reason of a place off the line."""
+    """Return the reason for rejecting a position off the line."""
     first, last = report.layout.stations[0].begin_m, report.layout.stations[-1].end_m
     on_line = first - report.over_m <= report.front_m <= last + report.under_m
     return None if on_line else f"the position is not on the line: {report.front_m:.0f} m"
@@ -139,7 +139,7 @@ def moving_standstill(report: PlacedReport) -> str | None:
 
 
 def unknown_authority(report: PlacedReport) -> str | None:
-    """Return the reason of an authority that the centre has not given, as far as its database knows."""
+    """Return the reason for an authority that is not in the centre's database."""
     held, (last, first) = report.message.authority or 0, report.skipped
     if held <= report.granted and not last < held < first:
         return None
@@ -283,9 +283,7 @@ def _runs_by(report: PlacedReport) -> int | None:
 
 
 def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:
-    """Return a train that is stopped, its interval extended to the reported position and to the authority
-    that it has.
-    """
+    """Return a train that is stopped, its interval extended to the reported position and to its authority."""
     (rear, front), d, noted = covered_m(report), report.known.direction, _noted(report)
     held = noted.end_m if report.held_m is None else report.held_m
     end, rear = d * max(d * noted.end_m, d * held), d * min(d * rear, d * held) if report.turns else rear
@@ -367,9 +365,7 @@ def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
 
 
 def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
-    """Return a train that has changed ends: no new authority; its earlier position and its authority remain
-    occupied.
-    """
+    """Return a train that has changed ends: no new authority; its earlier position and authority remain occupied."""
     held = ahead if known.held_end_m is None else known.held_end_m
     covered = facing * max(facing * ahead, facing * known.rear_m)
     back = facing * min(facing * rear, facing * known.front_m, facing * held)

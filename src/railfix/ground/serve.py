@@ -20,7 +20,8 @@ from pydantic import BeforeValidator, Field, model_validator
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.settings import Settings, load_settings
+from railfix.core.settings import Settings
+from railfix.core.settings_files import load_settings
 from railfix.core.timescale import utc_to_gpst
 from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
@@ -101,7 +102,7 @@ class CentreFile(Settings):
     #: ``detect-section`` at least every `InterlockingLimits.detection_s`: unknown without.
     detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
-    #: Where they are at the first start; afterwards the database knows.
+    #: Initial stations of the trains; later starts read them from the database.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"  #: File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
     log_lines: int = Field(default=MOST_LINES, ge=1000)  #: Newest lines of the log that the database keeps.

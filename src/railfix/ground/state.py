@@ -101,13 +101,13 @@ class TrainInterval:
         return max(beyond, behind, 0.0) if max(beyond, behind) > ROUNDING_M else 0.0
 
 
-#: Difference of two ends that is rounding [m].
+#: Largest rounding difference between two ends [m].
 ROUNDING_M: Final = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointState:
-    """Points as the interlocking knows them."""
+    """Positions of the points in the interlocking."""
 
     wanted: int = 1  #: Track they are commanded to.
     detected: int | None = 1  #: Track they are detected at; None while they move, or before the field has answered.

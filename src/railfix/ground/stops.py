@@ -158,7 +158,7 @@ def ask_route_back(
 
 
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state after a report that may answer: the route goes where the train agrees, and stays where not.
+    """Return the state after a report that may answer: the route is released where the train agrees, else kept.
 
     For a stopped train, whose report may be wrong, no answer counts until it is released.
     """

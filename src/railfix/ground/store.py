@@ -12,12 +12,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
-import sqlalchemy as sql
-from sqlalchemy import event
-
-from railfix.core.errors import InputFileError, OutputError
+from railfix.core.errors import InputFileError, OutputError, needs_extra
 from railfix.ground.centre import TrainRecord
 from railfix.io.train_message import decode, encode
+
+with needs_extra():
+    import sqlalchemy as sql
+    from sqlalchemy import event
 
 _META: Final = sql.MetaData()
 #: Lines of the log that are kept while the database fails, and in the database.
@@ -211,9 +212,7 @@ class Store:
 
 
 def _time_outs(url: str) -> dict[str, Any]:
-    """Return options with which a connection fails rather than hangs: times to connect, for a statement, and for a dead
-    network.
-    """
+    """Return time-outs of a connection: to connect, for a statement, and for a dead network."""
     if url.startswith("postgresql"):
         return {"connect_timeout": 2, "tcp_user_timeout": 5000, "options": "-c statement_timeout=5000"}
     if url.startswith(("mysql", "mariadb")):

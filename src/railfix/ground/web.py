@@ -18,14 +18,16 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-import uvicorn
-from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
-from starlette.routing import Route
-from uvicorn.protocols.http.h11_impl import H11Protocol
-
+from railfix.core.errors import needs_extra
 from railfix.ground.quic import address_errors
+
+with needs_extra():
+    import uvicorn
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
+    from starlette.routing import Route
+    from uvicorn.protocols.http.h11_impl import H11Protocol
 
 #: Time between two events of the page [s].
 EVENT_S: Final = 0.5
@@ -195,7 +197,7 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 async def _values(request: Request) -> dict[str, Any] | None:
     """Return the JSON object of a request; None where it has none.
 
-    Another site cannot send this content type unless the browser asks first, which is refused.
+    Another site cannot send this content type without a preflight request, which is refused.
     """
     if request.headers.get("content-type") != "application/json":
         return None

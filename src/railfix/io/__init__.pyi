@@ -1,8 +1,6 @@
 # The names of `railfix.io`, imported at their first use (lazy-loader).
 
 from .georinex_layout import (
-    navigation_from_xarray,
-    navigation_to_xarray,
     observations_from_xarray,
     observations_to_xarray,
 )
@@ -17,8 +15,6 @@ from .sp3 import read_sp3
 __all__ = [
     "AntennaReference",
     "PositionLog",
-    "navigation_from_xarray",
-    "navigation_to_xarray",
     "observations_from_xarray",
     "observations_to_xarray",
     "read_navigation",

@@ -1,63 +1,23 @@
-"""Observations and navigation records in the xarray layout of georinex, in both directions.
-
-A second record of a satellite at the same time (Galileo I/NAV and F/NAV) is named "E01_1".
-"""
+"""Observations in the xarray layout of georinex, in both directions."""
 
 from __future__ import annotations
 
 import re
-from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.errors import check_type
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
-from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
-from railfix.io.rinex.navigation_records import (
-    FIELDS,
-    RawRecord,
-    first_fault,
-    glonass_records,
-    kepler_records,
-)
 from railfix.io.rinex.observations_lines import KINDS, find_signal
-from railfix.io.rinex.write_navigation import check_messages, glonass_numbers, kepler_numbers
 
 if TYPE_CHECKING:
     import xarray as xr
 
 _DIMENSIONS: Final = ("time", "sv")
 _TYPE: Final = re.compile(r"[CPLDS][1-9ABCD][A-Z]?")
-#: Names that georinex gives the numbers of a record, in the order of the file (RINEX 3.04, tables A6 to A14).
-_KEPLER: Final = (
-    "SVclockBias SVclockDrift SVclockDriftRate IODE Crs DeltaN M0 Cuc Eccentricity Cus sqrtA Toe Cic Omega0 Cis Io Crc "
-    "omega OmegaDot IDOT CodesL2 GPSWeek L2Pflag SVacc health TGD IODC TransTime FitIntvl"
-)
-_GLONASS: Final = (
-    "SVclockBias SVrelFreqBias MessageFrameTime X dX dX2 health Y dY dY2 FreqNum Z dZ dZ2 AgeOpInfo".split()
-)
-_OTHER_NAMES: Final = {
-    "G": {},
-    "J": {},
-    "E": {
-        "IODE": "IODnav", "CodesL2": "DataSrc", "GPSWeek": "GALWeek", "L2Pflag": "spare0", "SVacc": "SISA",
-        "TGD": "BGDe5a", "IODC": "BGDe5b", "FitIntvl": "spare1",
-    },
-    "C": {
-        "IODE": "AODE", "CodesL2": "spare0", "GPSWeek": "BDTWeek", "L2Pflag": "spare1", "health": "SatH1",
-        "TGD": "TGD1", "IODC": "TGD2", "FitIntvl": "AODC",
-    },
-}  # fmt: skip
-_NAMES: Final = {
-    **{letter: [other.get(name, name) for name in _KEPLER.split()] for letter, other in _OTHER_NAMES.items()},
-    "R": _GLONASS,
-}
-#: Numbers in kilometres in RINEX and in metres in georinex.
-_KILOMETRES: Final = frozenset("X dX dX2 Y dY dY2 Z dZ dZ2".split())
-_KLOBUCHAR: Final = {"G": "ionospheric_corr_GPS", "C": "ionospheric_corr_BDS", "J": "ionospheric_corr_QZS"}
-_UNKNOWN: Final = 0.99e9  #: RINEX writes 0.9999E9 for a number that is not known.
 
 
 def observations_to_xarray(observations: Observations) -> xr.Dataset:
@@ -75,6 +35,7 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
     """
     import xarray as xr
 
+    check_type(observations, Observations, "observations")
     satellites, row = np.unique(observations.satellite, return_inverse=True)
     shape = (len(observations), len(satellites))
     variables: dict[str, Any] = {}
@@ -130,6 +91,9 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
         The dataset has no observation types over ``time`` and ``sv``, an unknown time system, or times
         that do not rise.
     """
+    import xarray as xr
+
+    check_type(data, xr.Dataset, "data")
     types = [str(name) for name in data.data_vars if _TYPE.fullmatch(str(name))]
     if not types:
         raise ValueError("the dataset has no observation types such as C1C; georinex.load of an observation file has")
@@ -206,115 +170,3 @@ def _observation_header(data: xr.Dataset, satellite: Strings, signal: Strings, v
         signals=signals_by_system(satellite, signal),
         receiver_clock_applied=bool(attributes.get("receiver_clock_offset_applied", 0)),
     )
-
-
-def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
-    """Return the navigation records as a dataset in the layout of georinex.
-
-    Parameters
-    ----------
-    navigation : Navigation
-        `precise` is left out.
-
-    Returns
-    -------
-    xarray.Dataset
-        Variables over ``time`` and ``sv`` by the names of georinex; NaN where a satellite has no record
-        at a time. Klobuchar coefficients are attributes.
-    """
-    import xarray as xr
-
-    kepler, glonass = navigation.kepler, navigation.glonass
-    check_messages(kepler, "3.04")
-    copies: Counter[tuple[str, np.datetime64]] = Counter()
-    rows = []
-    for satellite, time, numbers in (
-        *zip(kepler.satellite.tolist(), *kepler_numbers(kepler, FIELDS["G"]), strict=True),
-        *zip(glonass.satellite.tolist(), *glonass_numbers(glonass), strict=True),
-    ):
-        copy = copies[satellite, time]
-        copies[satellite, time] += 1
-        rows.append((f"{satellite}_{copy}" if copy else satellite, time, numbers))
-    names = sorted({name for name, _, _ in rows})
-    times = np.unique(np.array([time for _, time, _ in rows], dtype="datetime64[ns]"))
-    column, row = {name: i for i, name in enumerate(names)}, {time: i for i, time in enumerate(times)}
-    variables: dict[str, Any] = {}
-    for name, time, numbers in rows:
-        for variable, number in zip(_NAMES[name[0]], numbers, strict=True):
-            grid = variables.setdefault(variable, (_DIMENSIONS, np.full((len(times), len(names)), np.nan)))[1]
-            grid[row[time], column[name]] = number * (1e3 if variable in _KILOMETRES else 1.0)
-    attributes = {_KLOBUCHAR[letter]: values.tolist() for letter, values in navigation.klobuchar.items()}
-    if navigation.leap_seconds is not None:
-        attributes["leap_seconds"] = navigation.leap_seconds
-    return xr.Dataset(
-        variables,
-        coords={"time": times, "sv": names},
-        attrs={
-            **attributes,
-            "version": 3.04,
-            "svtype": sorted({name[0] for name in names}),
-            "rinextype": "nav",
-            "filename": " ".join(navigation.sources),
-        },
-    )
-
-
-def navigation_from_xarray(data: xr.Dataset) -> Navigation:
-    """Return the navigation records of a dataset in the layout of georinex.
-
-    Parameters
-    ----------
-    data : xarray.Dataset
-        As ``georinex.load`` gives it for a RINEX 3 navigation file.
-
-    Returns
-    -------
-    Navigation
-        Records in order of satellite, then time. Records of constellations that railfix does not use are
-        counted in `skipped`.
-
-    Raises
-    ------
-    ValueError
-        The dataset has no navigation records, or a number of a record is not possible.
-    """
-    if "SVclockBias" not in data:
-        raise ValueError("the dataset has no SVclockBias; georinex.load of a RINEX 3 navigation file has")
-    values = {
-        str(name): np.asarray(data[name].transpose(*_DIMENSIONS).values, dtype=np.float64) for name in data.data_vars
-    }
-    times = np.asarray(data["time"].values, dtype="datetime64[ns]")
-    satellites: Strings = np.array([str(name) for name in data["sv"].values], dtype=np.str_)
-    raw: list[RawRecord] = []
-    skipped: Counter[str] = Counter()
-    for k, i in zip(*np.nonzero(np.isfinite(values["SVclockBias"]).T), strict=True):
-        name = str(satellites[k])[:3]
-        if name[0] not in _NAMES:
-            skipped[name[0]] += 1
-            continue
-        numbers = [_number(values, variable, i, k) for variable in _NAMES[name[0]]]
-        record = RawRecord(name[0], name, "", times[i], numbers, float(data.attrs.get("version", 3.0)))
-        fault = first_fault(record)
-        if fault is not None:
-            raise ValueError(f"record of {name} at {times[i]}: {fault[1]}")
-        raw.append(record)
-    leap = data.attrs.get("leap_seconds")
-    return Navigation(
-        kepler=kepler_records([record for record in raw if record.system != "R"]),
-        glonass=glonass_records([record for record in raw if record.system == "R"]),
-        klobuchar={
-            letter: np.array(data.attrs[name], dtype=np.float64)
-            for letter, name in _KLOBUCHAR.items()
-            if np.any(data.attrs.get(name, 0.0))
-        },
-        leap_seconds=None if leap is None else int(leap),
-        skipped=dict(skipped),
-        sources=(str(data.attrs.get("filename", "")),),
-    )
-
-
-def _number(values: dict[str, Floats], name: str, row: int, column: int) -> float:
-    """Return one number of a record in the unit of the file; NaN where absent or written as unknown."""
-    value = float(values[name][row, column]) if name in values else np.nan
-    value = np.nan if _UNKNOWN < abs(value) < 1.01e9 else value
-    return value / 1e3 if name in _KILOMETRES else value

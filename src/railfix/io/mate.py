@@ -79,9 +79,12 @@ def mate_table(path: FilePath) -> str:
     return name.upper() if name.upper() in READ and kind.lower() in ("parquet", "csv", "csv.gz") else ""
 
 
-def read_mate(path: FilePath, needed: tuple[str, ...]) -> pl.DataFrame:
-    """Read a table, CSV (also .gz) or Parquet, with upper-case names; columns not in the file are empty."""
-    name, file = mate_table(path), Path(path)
+def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> pl.DataFrame:
+    """Read a table, CSV (also .gz) or Parquet, with upper-case names; columns not in the file are empty.
+
+    Without `table_name` the name of the file says which table it is.
+    """
+    name, file = table_name or mate_table(path), Path(path)
     with reading_table(path, f"cannot be read as the table {name} of EGNSS MATE ({{}})"):
         if file.suffix.lower() == ".parquet":
             table = pl.read_parquet(file)

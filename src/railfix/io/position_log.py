@@ -14,6 +14,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import LENIENT, BrokenLines, FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import misspelt
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, gpst_to_utc, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
@@ -32,8 +33,8 @@ _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
 
-@dataclass(frozen=True, kw_only=True)
-class PositionLog:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PositionLog(NotebookTable):
     """Positions of one antenna in the order of the file, n rows."""
 
     path: str

@@ -9,10 +9,11 @@ from typing import Final, Literal
 import numpy as np
 
 from railfix.core.arrays import take_rows
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError, NoPositionError, SettingsError
 from railfix.core.files import BrokenLines, FilePath
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.tables import plural
+from railfix.core.notebook import plural
+from railfix.core.staged_files import check_path
 from railfix.core.timescale import from_week, utc_to_gpst
 from railfix.gnss.observations import first_problems
 from railfix.io.file_kind import FileKind, find_kind, wrong_kind
@@ -133,9 +134,12 @@ def read_positions(
     ------
     InputFileError
         The file is not a log of positions, or a line of it is broken.
+    NoPositionError
+        No row has a position.
     SettingsError
         `columns` names a column that railfix does not know, or the file is no table.
     """
+    check_path(path)
     kind = find_kind(path)
     if columns and kind != "table":
         raise SettingsError(f"{path}: columns can be renamed in a table with named columns only")
@@ -159,6 +163,8 @@ def read_positions(
         )
     if antennas == "one" and len(log.antennas) > 1:
         raise InputFileError(path, f"has positions of {' and '.join(log.antennas)}; give those of one antenna")
+    if np.isnan(log.geodetic[0]).all():
+        raise NoPositionError(f"{path}: {plural(len(log), 'row')}, none with a position")
     if heights == "needed" and log.plan_deg is not None and np.isnan(log.ecef_m).all():
         raise InputFileError(path, "its positions have no height; expected heights above the ellipsoid (height_m)")
     return _in_order(log)

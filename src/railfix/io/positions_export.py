@@ -19,8 +19,8 @@ import polars as pl
 import polars.selectors as cs
 from pyproj import CRS
 
-from railfix.core.errors import NoPositionError
-from railfix.core.files import stage_file
+from railfix.core.errors import NoPositionError, needs_extra
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 
 #: Columns of the tables of positions that become attributes, where a table has them.
@@ -105,7 +105,8 @@ def _content(points: pl.DataFrame, path: Path, description: str) -> bytes:
 
 def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) -> bytes:
     """Return a file that GDAL writes."""
-    import pyogrio
+    with needs_extra():
+        import pyogrio
 
     fields = [column for column in points if column.name not in COORDINATES]
     values = [column.to_numpy() for column in fields]
@@ -144,7 +145,8 @@ def _geoparquet(points: pl.DataFrame, description: str) -> bytes:
 
 def _wkb(points: pl.DataFrame, flavor: str) -> Any:
     """Return the points as well-known binary, "iso" or "extended", array of bytes, shape (n,)."""
-    import shapely
+    with needs_extra():
+        import shapely
 
     return shapely.to_wkb(shapely.points(points.select(COORDINATES).to_numpy()), flavor=flavor)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -19,11 +18,12 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath
-from railfix.core.tables import reading_table
+from railfix.core.notebook import NotebookTable
 from railfix.core.timescale import seconds
-from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
-from railfix.io.position_log import PositionLog, numbers_or_nan, positions_times, qualities_in_words
+from railfix.io.named_columns import NamedColumns
+from railfix.io.position_log import PositionLog, numbers_or_nan, qualities_in_words
 from railfix.io.positions import read_positions
+from railfix.io.sensor_tables import get_column, get_times, read_sensor_table
 
 #: Columns of the file, in this order.
 COLUMNS: Final = (
@@ -35,8 +35,8 @@ _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
 _FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
 
 
-@dataclass(frozen=True, kw_only=True)
-class AntennaReference:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class AntennaReference(NotebookTable):
     """Reference positions of one antenna, R epochs."""
 
     time: Datetimes  #: Rising, GPS time; shape (R,).
@@ -175,8 +175,6 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
     )
 
 
-_ISO: Final = "%Y-%m-%dT%H:%M:%S%.9f"  #: Format of times.
-
 LONGEST_STEP_S = 1.0  #: Rows farther apart than this are a gap, within which values are unknown [s].
 
 
@@ -235,21 +233,19 @@ def read_pulses(path: FilePath) -> Pulses:
     ``direction`` of 1 and -1 gives the sign. InputFileError: no such table, times that do not rise, a direction other
     than 1 and -1.
     """
-    table = _sensor_table(path)
-    time = _rising_times(table)
+    table = read_sensor_table(path, "pulses")
     names = {"count": "count", "pulse": "pulse", "distance_m": "distance"}
-    name = next((name for name in names if name in table), "")
-    kind = names.get(name, "pulse")
-    count = table.numbers(name) if name else np.arange(len(table), dtype=np.float64)
-    if "direction" in table:
-        direction = table.numbers("direction")
-        wrong = ~np.isin(direction, (-1.0, 1.0))
+    name = next((name for name in names if name in table.columns), "")
+    count = get_column(table, name).astype(np.float64) if name else np.arange(len(table), dtype=np.float64)
+    if signed := "direction" in table.columns:
+        direction = get_column(table, "direction")
+        wrong = ~np.isin(direction, (-1, 1))
         if wrong.any():
             row = int(np.argmax(wrong))
-            raise table.error(row, f"direction is {direction[row]:g}; 1 or -1 was expected")
+            raise InputFileError(path, f"row {row + 2}: direction is {direction[row]}; 1 or -1 was expected")
         count = np.cumsum(np.diff(count, prepend=count[0]) * direction)
-    falling = bool((np.diff(count) < 0).any())
-    return Pulses(path=str(path), time=time, count=count, kind=kind, signed=falling or "direction" in table)
+    signed |= bool((np.diff(count) < 0).any())
+    return Pulses(path=str(path), time=get_times(table), count=count, kind=names.get(name, "pulse"), signed=signed)
 
 
 def read_acceleration(path: FilePath) -> Acceleration:
@@ -259,38 +255,16 @@ def read_acceleration(path: FilePath) -> Acceleration:
     include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the acceleration of the
     motion. InputFileError: none or several of the columns, or times that do not rise.
     """
-    table = _sensor_table(path)
+    table = read_sensor_table(path, "acceleration")
     kinds = {
         "specific_force_mps2": "specific_force",
         "force_forward_mps2": "specific_force",
         "acceleration_mps2": "motion",
     }
-    present = [name for name in kinds if name in table]
+    present = [name for name in kinds if name in table.columns]
     if len(present) != 1:
-        there = ", ".join(table.cells)
-        raise table.header_error(f"one column of {', '.join(kinds)} was expected; the columns are {there}")
+        there = ", ".join(table.columns)
+        raise InputFileError(path, f"one column of {', '.join(kinds)} was expected; the columns are {there}")
     return Acceleration(
-        path=str(path), time=_rising_times(table), acceleration_mps2=table.numbers(present[0]), kind=kinds[present[0]]
+        path=str(path), time=get_times(table), acceleration_mps2=get_column(table, present[0]), kind=kinds[present[0]]
     )
-
-
-def _sensor_table(path: FilePath) -> NamedColumns:
-    if Path(path).suffix == ".parquet":
-        with reading_table(path, "cannot be read as a Parquet table ({})"):
-            return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO).splitlines(), path)
-    return read_named_columns(path)
-
-
-def _rising_times(table: NamedColumns) -> Datetimes:
-    if "time_gpst" not in table:
-        raise table.header_error(f"there is no column time_gpst; the columns are {', '.join(table.cells)}")
-    time = positions_times(table)
-    if len(time) < 2:
-        raise InputFileError(table.path, "fewer than two rows")
-    bad = np.isnat(time)
-    if bad.any():
-        raise table.error(int(np.argmax(bad)), "there is no time")
-    bad[1:] = np.diff(time) <= np.timedelta64(0, "ns")
-    if bad.any():
-        raise table.error(int(np.argmax(bad)), "the time does not rise; sort the table and remove duplicates")
-    return time

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, needs_extra
 from railfix.core.settings import Model, Settings
 
 VERSION: Final = 1  #: Version of the schema; a receiver rejects other major versions.
@@ -131,7 +131,8 @@ class MessageError(InputFileError):
 
 def encode(message: TrainMessage) -> bytes:
     """Return CBOR of a message, always the same bytes for the same message; absent fields are left out."""
-    import cbor2
+    with needs_extra():
+        import cbor2
 
     values = {KEYS[name]: value for name, value in message.model_dump(mode="json").items() if value is not None}
     return cbor2.dumps({_VERSION_KEY: VERSION, **values}, canonical=True)
@@ -139,7 +140,8 @@ def encode(message: TrainMessage) -> bytes:
 
 def decode(data: bytes) -> TrainMessage:
     """Decode CBOR, skipping unknown keys; MessageError where it is not a message of this version."""
-    import cbor2
+    with needs_extra():
+        import cbor2
 
     if len(data) > LONGEST:
         raise MessageError(f"has {len(data)} bytes, at most {LONGEST} were expected")

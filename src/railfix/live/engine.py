@@ -111,8 +111,7 @@ class LiveEngine:
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log on what happened: what is used in place of what was requested, and when that ends,
-        restarts, what became of a saved state.
+        Sentences for the log: replacements of requested data and their end, restarts, outcome of a saved state.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
@@ -386,7 +385,7 @@ class LiveEngine:
             news = news.with_later(self._from_satellites.popleft())
         epochs = {name: head.epoch for name, head in heads.items()}
         self._done_ns = max(head.tag_ns for head in heads.values())
-        result, self._state = self.processor.process(
+        screened = self.processor.screen(
             epochs,
             self._state,
             navigation=news.navigation,
@@ -394,6 +393,7 @@ class LiveEngine:
             base=news.base,
             sensors=self._samples_until(self._done_ns) if self._heard_to else None,
         )
+        result, self._state = self.processor.along_track(*self.processor.position(*screened))
         self._tell_changes((self._state.received or self.processor.received).notes)
         self._check_order(result)
         return self._locate(result)

@@ -50,7 +50,7 @@ class TrainPlace:
     """Position of the train's reference point at the last epoch of a result."""
 
     antenna: str  #: Antenna that it is from.
-    #: Chainage of the reference point; NaN without a place.
+    #: Chainage of the reference point; NaN without a position.
     chainage_m: float
     sigma_m: float
     #: Bound of its error, and the protection level under it; infinite where no bound exists.
@@ -58,7 +58,7 @@ class TrainPlace:
     level_m: float
     status: MessageStatus
     moving: int  #: Direction of the speed against chainage, 0 where the speed is too small.
-    #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna there; None without a place.
+    #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna there; None without a position.
     geodetic: tuple[float, float, float] | None
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import IO, Any, Final, Generic, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
 
-from railfix.core.errors import OutputError, SettingsError
+from railfix.core.errors import OutputError, SettingsError, needs_extra
 from railfix.live.engine import LiveOutput
 from railfix.live.forms import Form, forms, wants, whole_message
 from railfix.live.settings import LiveSettings
@@ -161,10 +161,8 @@ class MqttTarget:
     """Messages published under a topic of an MQTT broker, at most once; a broken connection is opened again."""
 
     def __init__(self, form: Form, url: str, *, waiting: int) -> None:
-        try:
+        with needs_extra("mqtt://"):
             from paho.mqtt import client, enums
-        except ModuleNotFoundError:
-            raise SettingsError("mqtt:// needs paho-mqtt; install railfix[mqtt]") from None
         parts = urlsplit(url)
         self.form, self.topic, self._waiting = form, parts.path.strip("/") or "railfix", waiting
         self._sent: deque[Any] = deque()

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError, SettingsError, needs_extra
 from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
 
@@ -117,9 +117,7 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield bytes of a connection, which is opened again after growing waits when it breaks; empty bytes report that it
-    is open.
-    """
+    """Yield bytes of a connection, reopened after growing waits; empty bytes report that it is open."""
     broken, wait_s, ever_open = 0, settings.reconnect_first_s, False
     while True:
         reason = "the other end has closed the connection"
@@ -242,10 +240,8 @@ class _Answer:
     """
 
     def __init__(self, source: str) -> None:
-        try:
+        with needs_extra(f"source {hidden(source)!r}: NTRIP"):
             import h11
-        except ModuleNotFoundError:
-            raise SettingsError(f"source {hidden(source)!r}: NTRIP needs h11; install railfix[live]") from None
         self._h11, self._source = h11, source
         self._client: Any = h11.Connection(our_role=h11.CLIENT, max_incomplete_event_size=_HEADER_BYTES)
         self._first: bytes | None = b""  # up to the end of the first line; None once that is known
@@ -374,10 +370,8 @@ def _baud(source: str) -> int:
 
 async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
     """Yield empty bytes once the line is open, then received bytes; a thread reads, so that no byte overflows."""
-    try:
+    with needs_extra(f"source {source!r}: a serial line"):
         import serial
-    except ModuleNotFoundError:
-        raise SettingsError(f"source {source!r}: serial lines need pyserial; install railfix[live]") from None
     try:
         port = serial.Serial(urlsplit(source).path, _baud(source), timeout=_SERIAL_S)
     except (OSError, ValueError) as error:

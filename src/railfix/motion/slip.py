@@ -1,12 +1,12 @@
 r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
 
-``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch where the wheel rolls; otherwise it
-becomes one that no line has. Two rules:
+``sin(theta_T) = (f_x - a_T) / g``, by accelerometer and tachometer, is the pitch while the wheel rolls; with slip it
+takes values that no line has. Two rules:
 
 * ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It detects the acceleration of a
-slip, not its speed: at constant slip speed the rule is silent. * ``"map"``: against the gradient of the line at the
-present position, with a latch: a slip ends only when the wheel has returned to the speed carried by inertia and the
-pitch fits.
+  slip, not its speed. It is silent at constant slip speed, so that most of a long slide stays in the distance.
+* ``"map"``: against the gradient of the line at the present position, with a latch: a slip ends only when the wheel has
+  returned to the speed carried by inertia and the pitch fits, or when wheel and train stand.
 
 During a slip, speed and distance come from the accelerometer less the pitch and its offset, estimated while the wheel
 rolls, from `LOOK_BACK_S` before the detection. The pitch is that of the line where the position is known; with a gyro
@@ -60,7 +60,10 @@ _LONGEST_CARRY_S: Final = 30.0
 #: Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
 SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle counts as standing.
+_STANDING_MPS: Final = 0.5  #: A carried speed below this agrees with a wheel that stands.
 _PITCH_S: Final = 20.0
+_STEEPEST: Final = 0.1  #: Sine beyond which a pitch is none of a train: 35 permille of line, body and mounting [1].
+_FASTEST_MPS: Final = 100.0  #: A carried speed beyond this has expired.
 #: Time for which the body swings after a stop; its pitch afterwards is that of standstill.
 _SETTLING_S: Final = 2.0
 #: Change of the pitch at standstill, duration and speed that mean rolling away.
@@ -189,7 +192,7 @@ class _Automaton:
         self.speed, self.distance, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
         self.pitch, self.bias = float("nan"), 0.0
         self._smooth, self._limit, self._square = 0.0, _MAP_LIMIT, 0.0
-        self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = 0.0
+        self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = self._stood = 0.0
         self._rest = float("nan")
         #: Time, speed and acceleration by inertia of past samples, to which a detection looks back.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
@@ -214,9 +217,11 @@ class _Automaton:
         if since == since:
             self._silent = since
         measured = heard and acceleration == acceleration
-        by_wheel = (force - acceleration - self.offset) / GRAVITY_MPS2 if measured else float("nan")
-        rolls = self.state == MotionState.NORMAL and self._over == 0.0
-        self._follow(dt, sine, by_wheel if rolls or self.pitch != self.pitch else float("nan"), rate)
+        rests = self.state == MotionState.STANDING and self._stood >= _SETTLING_S
+        own = 0.0 if rests else acceleration if measured else float("nan")
+        by_wheel = (force - own - self.offset) / GRAVITY_MPS2
+        known = rests or self.pitch != self.pitch or (self.state == MotionState.NORMAL and self._over == 0.0)
+        self._follow(dt, sine, by_wheel if known and abs(by_wheel) <= _STEEPEST else float("nan"), rate, rests=rests)
         reference = self.pitch
         inertial = force - GRAVITY_MPS2 * reference - self.offset
         self.metric = (force - acceleration) / GRAVITY_MPS2 - reference if measured else float("nan")
@@ -228,7 +233,7 @@ class _Automaton:
         self._limit = max(least, _NOISE_SIGMAS * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
             self._carry(dt, inertial)
-            self._release(dt, wheel, heard=heard)
+            self._release(dt, wheel, force, heard=heard)
         elif heard:
             self._roll(dt, wheel, acceleration, inertial, sine)
         else:
@@ -244,15 +249,20 @@ class _Automaton:
         lean = min(max(((speed if speed == speed else 0.0) * yawing - right) / GRAVITY_MPS2, -0.5), 0.5)
         return float(pitching * (1.0 - lean * lean) ** 0.5 - yawing * lean)
 
-    def _follow(self, dt: float, sine: float, by_wheel: float, rate: float) -> None:
-        """Reference pitch: from the line, with a gyro its fast part; without a line from the wheel, slowly."""
+    def _follow(self, dt: float, sine: float, by_wheel: float, rate: float, *, rests: bool) -> None:
+        """Reference pitch: from the line, with a gyro its fast part; without a line from the wheel, slowly.
+
+        A body at rest does not turn: the rate is the bias of the gyro.
+        """
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel
         if self.pitch != self.pitch:
             self.pitch = target
             return
         turning = rate == rate
-        if turning:
+        if turning and rests:
+            self.bias += min(dt / _PITCH_S, 1.0) * (rate - self.bias)
+        elif turning:
             self.pitch += (rate - self.bias) * dt
         elif known:
             self.pitch = sine
@@ -260,18 +270,26 @@ class _Automaton:
         if target == target:
             gap = target - self.pitch
             self.pitch += min(dt / _PITCH_S, 1.0) * gap
-            if turning:
+            if turning and not rests:
                 self.bias -= gap * dt / (_PITCH_S * limits.bias_s)
 
     def _carry(self, dt: float, inertial: float) -> None:
         self.speed += inertial * dt
         self._carried += dt
-        if self._carried > _LONGEST_CARRY_S:
+        if self._carried > _LONGEST_CARRY_S or abs(self.speed) > _FASTEST_MPS:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
-    def _release(self, dt: float, wheel: float, *, heard: bool) -> None:
-        """Latch: the wheel must return to the carried speed, with a pitch that fits."""
+    def _stand(self, force: float) -> None:
+        """Begin a standstill with the force at rest."""
+        self.state, self.speed, self._rest = MotionState.STANDING, 0.0, force
+        self._apart = self._carried = self._stood = 0.0
+
+    def _release(self, dt: float, wheel: float, force: float, *, heard: bool) -> None:
+        """Latch: the wheel must return to the carried speed, with a pitch that fits, or stand with the train."""
         limits = self.limits
+        if self._silent >= _STANDING_S and abs(self.speed) < _STANDING_MPS:
+            self._stand(force)
+            return
         if limits.rule == "p2":
             back = heard and abs(self.metric) <= limits.p2_limit
             if back:
@@ -335,17 +353,16 @@ class _Automaton:
             self._watch(dt, force)
         elif self.state == MotionState.INIT:
             return  # a sensor that never sent a sample may be dead
-        elif self._silent >= _STANDING_S and not abs(self.speed) > 0.5:
-            self.state, self.speed, self._rest, self._apart, self._carried = MotionState.STANDING, 0.0, force, 0.0, 0.0
+        elif self._silent >= _STANDING_S and not abs(self.speed) > _STANDING_MPS:
+            self._stand(force)
         elif self._carried > _LONGEST_CARRY_S:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """At rest the force is the component of gravity; when released it falls toward zero, and the change is the
-        motion.
-        """
+        """At rest the force is the component of gravity; its fall toward zero at release is the motion."""
         limits = self.limits
-        if self.state == MotionState.STANDING and self._silent < _STANDING_S + _SETTLING_S:
+        self._stood += dt
+        if self.state == MotionState.STANDING and self._stood < _SETTLING_S:
             self._rest = force
         change = force - self._rest
         moved = abs(change) > _ROLLING_LIMIT * GRAVITY_MPS2

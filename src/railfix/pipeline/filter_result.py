@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Masks
-from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
+from railfix.core.notebook import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState
 from railfix.kernels.tracking import index as ix
@@ -95,7 +95,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
     tracked: Tracked  #: Output of the filter; channels as those of `AntennaResult.corrected`.
     trajectory: Trajectory  #: Of the antenna.
     arc_m: Floats  #: Positions on the trajectory, those just beyond an end on it; NaN further out; shape (T,).
-    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed does not tell; shape (T,).
+    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
     standstill: Masks  #: Shape (T,).
     sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
     #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape
@@ -122,9 +122,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
         return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return the number of epochs that have a position with a bound: ``1,890 of 2,000 epochs tracking or
-        coasting``.
-        """
+        """Return the number of epochs with a bounded position: ``1,890 of 2,000 epochs tracking or coasting``."""
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, copy_with
 from railfix.core.epoch_rows import take_epochs
-from railfix.core.errors import check_type
+from railfix.core.errors import SettingsError, check_type, warn_of
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.motion.samples import SensorSamples
@@ -54,7 +54,7 @@ from railfix.screens import (
     ScreenSetup,
     in_order,
 )
-from railfix.screens.base import pair_antennas
+from railfix.screens.pairs import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
@@ -70,15 +70,16 @@ class EpochProcessor:
     trajectories : mapping of str to Trajectory
         The trajectory of each antenna, one or two ("front", "rear").
     navigation : Navigation, optional
-        Navigation records known from the start; others may come with each chunk.
+        Navigation records known from the start; others may come with each chunk. Without any, the first chunk brings
+        some: `process` raises otherwise.
     messages : SbasMessages, optional
         SBAS messages known from the start. SBAS corrections are used once messages are given, here or with a chunk.
     models : Models, optional
     track : Track, optional
-        The line itself, for places by its changes of gradient and curvature in the filter along the track.
+        The line itself, for positions from its changes of gradient and curvature in the filter along the track.
     stations : Stations, optional
     screens : sequence of Screen, optional
-        Screens of one's own, used with their limits beside those of `config`; their verdicts are in
+        User-defined screens, used with their limits in addition to those of `config`; their verdicts are in
         `AntennaResult.screens`, without columns of the tables (those of installed packages have them).
 
     Attributes
@@ -113,13 +114,20 @@ class EpochProcessor:
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not (isinstance(trajectories, Mapping) and trajectories):
-            raise ValueError("trajectories are one for each antenna, at least one: {'front': trajectory}")
-        check_type(config, Config, what="config")
+            raise SettingsError("trajectories are one for each antenna, at least one: {'front': trajectory}")
+        if unknown := sorted(set(trajectories) - {"front", "rear"}, key=str):
+            raise SettingsError(f"trajectories: unknown antenna {unknown[0]!r}; the antennas are front and rear")
+        models, stations = models or Models(), stations or Stations()
+        check_type(config, Config, "config")
         for name, trajectory in trajectories.items():
-            hint = "railfix.track.vehicle.antenna_trajectory or Trajectory.from_track makes one of a Track"
-            check_type(trajectory, Trajectory, what=f"trajectory of antenna {name}", hint=hint)
-        if navigation is not None:
-            check_type(navigation, Navigation, what="navigation", hint="read_navigation reads a file")
+            check_type(trajectory, Trajectory, f"trajectory of antenna {name}")
+        check_type(models, Models, "models")
+        check_type(stations, Stations, "stations")
+        if track is not None:
+            check_type(track, Track, "track")
+        for screen in screens:
+            check_type(screen, Screen, "screens")
+        _check_received(navigation, messages)
         if len({(t.sigma_plan_m, t.sigma_height_m) for t in trajectories.values()}) > 1:
             raise ValueError("the trajectories of the antennas have different sigmas of the map; they are of one map")
         self.config = config
@@ -133,9 +141,9 @@ class EpochProcessor:
             for name, trajectory in trajectories.items()
         }
         self.received = known_from_start(config, navigation=navigation, messages=messages)
+        self._navigation_given = navigation is not None
         self._channels = ChannelBook(config)
         self.indices = {name: SearchIndex(t) for name, t in self.trajectories.items()}
-        models, stations = models or Models(), stations or Stations()
         self._error_model, self._support = models.error_model, models.support
         self._base = None if stations.base_ecef_m is None else BaseStation(config, stations.base_ecef_m)
         if taken := [s.name for s in screens if s.name in SCREEN_NAMES]:
@@ -152,6 +160,7 @@ class EpochProcessor:
         )
         self._track, self.units, self.balises = track, stations.units, stations.balises
         self._features: dict[str, LineFeatures] = {}
+        self._unasked: list[str] = []
         self._lacking = self._inactive_notes()
 
     def __repr__(self) -> str:
@@ -178,7 +187,13 @@ class EpochProcessor:
 
     def _inactive_notes(self) -> tuple[str, ...]:
         """Return one sentence for each part of the settings that cannot be satisfied."""
-        notes = [note for screen, limits in self.screens for note in screen.notes(limits, self.setup)]
+        asked = self.config.model_fields_set
+        notes = []
+        for screen, limits in self.screens:
+            inactive = list(screen.notes(limits, self.setup))
+            notes += inactive
+            if "screens" not in asked and screen.name not in asked:
+                self._unasked += inactive
         check_base(self.config, self._base)
         conditions = None if self._error_model is None else self._error_model.conditions
         if conditions and (differences := condition_differences(conditions, collect_conditions(self.config))):
@@ -194,9 +209,7 @@ class EpochProcessor:
         return tuple(notes)
 
     def antenna_order(self) -> AntennaOrder | None:
-        """Return a test, without positions as yet, of the order of two antennas; None without two antennas of one
-        vehicle.
-        """
+        """Return a new test of the order of two antennas; None without two antennas of one vehicle."""
         if len(self.trajectories) < 2 or not self.setup.spacing_known:
             return None
         tolerance = self.config.antenna_pair.tag_tolerance_s
@@ -213,6 +226,9 @@ class EpochProcessor:
         base: Observations | None = None,
     ) -> tuple[Result, State]:
         """Return the positions of one chunk, and the state for the next one.
+
+        Each note of the result and each doubt about it is a `RailfixWarning`, but for screens that are on by default
+        and lack their input.
 
         Parameters
         ----------
@@ -234,14 +250,19 @@ class EpochProcessor:
         Raises
         ------
         ValueError
-            An antenna has no trajectory, or its epochs do not rise in time, from those of `state` on.
+            The epochs of an antenna do not rise in time, from those of `state` on.
         SettingsError
-            As the class.
+            As the class; an antenna has no trajectory; no navigation records were given.
         """
+        if navigation is None and state is None and not self._navigation_given:
+            raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")
         chunk, state = self.screen(
             observations, state, navigation=navigation, messages=messages, sensors=sensors, base=base
         )
-        return self.along_track(*self.position(chunk, state))
+        result, after = self.along_track(*self.position(chunk, state))
+        notes = (note for trajectory in self.trajectories.values() for note in trajectory.notes)
+        warn_of((*notes, *(note for note in result.notes if note not in self._unasked), *result.doubts()))
+        return result, after
 
     def screen(
         self,
@@ -259,15 +280,18 @@ class EpochProcessor:
         at the same time, each with its own state.
         """
         if not (isinstance(observations, Mapping) and observations):
-            raise ValueError("observations are one log for each antenna, at least one: {'front': log}")
+            raise SettingsError("observations are one log for each antenna, at least one: {'front': log}")
         if unknown := sorted(set(observations) - set(self.trajectories)):
-            raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
-        state = state or State()
+            raise SettingsError(f"no trajectory for antenna {', '.join(unknown)}")
+        state = State() if state is None else state
+        check_type(state, State, "state")
+        _check_received(navigation, messages)
+        for value, expected, what in ((sensors, SensorSamples, "sensors"), (base, Observations, "base")):
+            if value is not None:
+                check_type(value, expected, what)
         for name, part in observations.items():
-            check_type(
-                part, Observations, what=f"observations of antenna {name}", hint="read_observations reads a file"
-            )
-            _check_rising(name, part, state.antennas.get(name))
+            check_type(part, Observations, f"observations of antenna {name}")
+            _check_rising(name, part.time, state.antennas.get(name))
         began = min((part.time[0] for part in observations.values() if len(part)), default=np.datetime64("NaT", "ns"))
         received = receive(
             state.received or self.received, self.config, began, navigation=navigation, messages=messages
@@ -309,9 +333,11 @@ class EpochProcessor:
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
         status = with_statuses(solution.status, [own.suspicion for own in interference if own is not None])
-        araim = compute_araim(corrected, solution, antennas, self._support, self.config)
-        solution = copy_with(solution, status=status, araim=araim)
-        status, judged = screen_positions(chunk, solution, self._of_positions, self.config)
+        if self._support is not None:
+            araim = compute_araim(corrected, solution, antennas, self._support, self.config)
+            solution = copy_with(solution, araim=araim)
+        solution = copy_with(solution, status=status)
+        status, judged = screen_positions(chunk.pair, chunk.rows, antennas, solution, self._of_positions, self.config)
         chunk = copy_with(
             chunk, corrected=corrected, solution=copy_with(solution, status=status), interference=interference,
             judged=judged,
@@ -356,12 +382,15 @@ class EpochProcessor:
 
         Two antennas are filtered in two threads.
         """
+        assert chunk.solution is not None, "single epochs are positioned before the filter"
+        interference = dict(zip(chunk.names, chunk.interference, strict=True))
 
         def one_antenna(name: str) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
             rows, sensors = chunk.rows[name], chunk.sensors
             return along_track(
                 take_epochs(chunk.corrected, rows), take_epochs(chunk.slips, rows),
-                single_epochs(chunk, name, self.config), self.lines[name], self.config,
+                single_epochs(take_epochs(chunk.solution, rows), interference[name], self.config), self.lines[name],
+                self.config,
                 state.fusion.get(name) or FilterState(), samples=sensors,
                 references=self._line_references(name, sensors),
             )  # fmt: skip
@@ -393,9 +422,15 @@ class EpochProcessor:
         )  # fmt: skip
 
 
-def _check_rising(name: str, observations: Observations, before: AntennaState | None) -> None:
+def _check_received(navigation: Navigation | None, messages: SbasMessages | None) -> None:
+    """Raise SettingsError where navigation records or SBAS messages are of another type."""
+    for value, expected, what in ((navigation, Navigation, "navigation"), (messages, SbasMessages, "messages")):
+        if value is not None:
+            check_type(value, expected, what)
+
+
+def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> None:
     """Raise ValueError where an epoch is not after the preceding one, of the chunk `before` or its own."""
-    time = observations.time
     if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")

@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats, Strings
+from railfix.core.errors import check_type
 from railfix.core.reasons import Reason, reason_text
 from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import on_line_m
@@ -56,6 +57,7 @@ def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 def positions_table(result: Result) -> pl.DataFrame:
     """Return one row per epoch and antenna, in order of time, then of the antennas as given: `POSITION_COLUMNS`."""
+    check_type(result, Result, "result")
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
@@ -82,6 +84,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 def observations_table(result: Result) -> pl.DataFrame:
     """Return `OBSERVATION_COLUMNS`: a row per epoch, antenna and channel that was observed, in the order of these."""
+    check_type(result, Result, "result")
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
 
@@ -114,6 +117,8 @@ def to_xarray(
         ``satellite`` and ``signal`` are coordinates of ``channel``.
     """
     import xarray as xr
+
+    check_type(result, AntennaResult, "result")
 
     def variables(columns: Mapping[str, Column[Any]], source: Any, axes: tuple[str, ...]) -> dict[str, Any]:
         shape = result.reason.shape[: len(axes)]
@@ -322,6 +327,7 @@ def train_table(result: Result) -> pl.DataFrame:
 
     Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
     """
+    check_type(result, Result, "result")
     parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
     return in_time_order(parts) if parts else pl.DataFrame()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Strings, copy_with
 from railfix.core.epoch_rows import take_epochs
+from railfix.core.notebook import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.core.reasons import Reason, Status
-from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.integrity.interference import Sign, WheelSigns
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
@@ -217,6 +217,18 @@ class Result(NotebookTable):
     def __getitem__(self, antenna: str) -> AntennaResult:
         """Return the single-epoch results of an antenna; KeyError where no antenna has that name."""
         return self.antennas[antenna]
+
+    def doubts(self) -> Iterator[str]:
+        """Yield a sentence for each antenna without positions, or whose positions contradict the map."""
+        for name, result in self.antennas.items():
+            observed = result.status != Status.NO_OBSERVATION
+            off = np.isin(result.status, (Status.OFF_MAP, Status.MAP_OFFSET))
+            if observed.any() and not np.isfinite(result.point.ecef_m).any():
+                lost = (result.reason & (Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD)) != 0
+                cause = "no navigation record is valid then; is it of another day?" if lost.any() else "see its reasons"
+                yield f"{name}: no epoch has a position: {cause}"
+            elif 2 * np.count_nonzero(off) > np.count_nonzero(observed):
+                yield f"{name}: most positions contradict the map; is this the track of the log?"
 
     def __repr__(self) -> str:
         parts = (

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, join_rows
+from railfix.core.notebook import NotebookTable
 from railfix.tracking import (
     BackwardInformation,
     GnssEpochs,
@@ -34,8 +35,8 @@ class Replay:
     before: TrackState | None  #: State before them.
 
 
-@dataclass(frozen=True, kw_only=True)
-class SmoothedTrack:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SmoothedTrack(NotebookTable):
     """Positions of T epochs from all measurements before and after them."""
 
     time: Datetimes  #: Shape (T,).

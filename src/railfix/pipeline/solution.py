@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Masks, read_only
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.integrity.fault_exclusion import RaimResult
 from railfix.integrity.protection import ProtectionLevel
@@ -19,8 +20,8 @@ from railfix.positioning.normal_equations import SinglePoint
 from railfix.positioning.range_arrays import InterSystemBiases
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProtectionResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ProtectionResult(NotebookTable):
     """Protection levels of T epochs."""
 
     #: NaN without a position, and where RAIM has left a fault in it. Channels are those of the ranges.
@@ -30,8 +31,8 @@ class ProtectionResult:
     basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
 
 
-@dataclass(frozen=True, kw_only=True)
-class Solution:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Solution(NotebookTable):
     """Outputs of the stages of positioning, T epochs."""
 
     point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
@@ -53,8 +54,8 @@ class Solution:
     #: Position along the antenna's trajectory: from the codes, or from code and phase; shape (T,).
     arc_m: Floats
     #: Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
-    #: itself; satellites and atmosphere; the map error; and the distance to an open other place, by its probability;
-    #: shape (T,).
+    #: itself; satellites and atmosphere; the map error; and the distance to an unresolved alternative position,
+    #: weighted by its probability; shape (T,).
     along_sigma_m: Floats
     #: Positions from code and phase, where ``Config.carrier`` is "float" or "fixed"; they are what `arc_m` is.
     phase: PhasePositions | None

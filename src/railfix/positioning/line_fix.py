@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Indices, patch_rows
+from railfix.core.notebook import NotebookTable
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.normal_equations import (
     Constrained,
@@ -30,8 +31,8 @@ class FixLimits(NamedTuple):
     constrained: ConstrainedLimits = ConstrainedLimits()
 
 
-@dataclass(frozen=True, kw_only=True)
-class LineFix:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class LineFix(NotebookTable):
     """Positions of T epochs from common ranges."""
 
     point: SinglePoint  #: 3-D position without the map.

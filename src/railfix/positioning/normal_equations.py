@@ -22,6 +22,7 @@ from pydantic import Field
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, RowArrays, kernel_array
 from railfix.core.epoch_rows import EVERY
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.range_arrays import Ranges
@@ -70,8 +71,8 @@ class ConstrainedLimits(Settings):
     max_iterations: int = Field(default=40, ge=1)  #: Steps, walks into a neighbouring section included.
 
 
-@dataclass(frozen=True, kw_only=True)
-class Constrained:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Constrained(NotebookTable):
     """Positions along the line, T epochs."""
 
     arc_m: Floats  #: Along the trajectory; NaN where the iteration did not settle or was not started; shape (T,).
@@ -109,7 +110,7 @@ def position_on_line(
     """
     limits = limits or ConstrainedLimits()
     lines = ((line, EVERY),) if isinstance(line, Trajectory) else AntennaRows.on(line).lines
-    enough = ranges.n_used - ranges.n_clocks >= 1
+    enough = ranges.redundancy >= 0
     parts = []
     for trajectory, rows in lines:
         start = np.full(len(vertex), -1, dtype=np.intp)
@@ -181,8 +182,8 @@ class SinglePointLimits(Settings):
     dilution_limit: float = Field(default=30.0, gt=0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SinglePoint(RowArrays):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SinglePoint(RowArrays, NotebookTable):
     """3-D positions, T epochs."""
 
     ecef_m: Floats  #: NaN with too few satellites, singular geometry, or no convergence; shape (T, 3).
@@ -207,7 +208,7 @@ def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePoin
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterate_points(
         ranges.arrays, kernel_array(np.broadcast_to(near_ecef_m, (len(ranges), 3))),
-        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        ranges.space_redundancy >= 0,
         limits.tolerance_m, limits.max_iterations,
     )  # fmt: skip
     return SinglePoint(

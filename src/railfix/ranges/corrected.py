@@ -10,22 +10,22 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.epoch_rows import OnDemand
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates
 from railfix.ranges.atmosphere import SeenFrom
-from railfix.ranges.base_station import BaseDifferences
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.second_codes import SecondCodes, second_codes
-from railfix.ranges.sources import CorrectionSource, SourceSatellites
+from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSatellites
 
 #: Distances from the centre of the Earth at which navigation satellites are [m].
 ORBITS_M: Final = (2e7, 6e7)
 
 
-@dataclass(frozen=True, kw_only=True)
-class AntennaRanges:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class AntennaRanges(NotebookTable):
     """Corrected ranges of one antenna as input of the screens: T epochs by K channels."""
 
     time: Datetimes  #: Shape (T,).
@@ -49,7 +49,7 @@ class AntennaRanges:
     reason: Bits  #: `reasons.Reason` bits so far, 0 = usable; shape (T, K).
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class CorrectedRanges(AntennaRanges, OnDemand):
     """Corrected pseudoranges before positioning: T epochs by the K channels of `select_channels`."""
 

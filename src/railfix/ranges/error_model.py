@@ -16,8 +16,9 @@ from pydantic import Field, field_validator
 
 from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath
-from railfix.core.settings import Settings, option, read_model_file, write_toml
+from railfix.core.settings import Settings, option
+from railfix.core.settings_files import read_model_file, write_toml
+from railfix.core.staged_files import FilePath
 
 __all__ = [
     "LARGEST_PRIOR",
@@ -198,7 +199,8 @@ class ErrorModel:
     #: effect of the screens.
     before: BinStatistics
     after: BinStatistics
-    #: "local": multipath and receiver noise alone (a reference station took the rest away). "satellite_and_atmosphere":
+    #: "local": multipath and receiver noise alone (a reference station removed the other errors).
+    #: "satellite_and_atmosphere":
     #: these, too, as they were on those days.
     covers: Literal["local", "satellite_and_atmosphere"]
     #: Settings under which the model is valid; None: unknown, compared with nothing.

@@ -231,18 +231,14 @@ class _ReferenceBuilder:
         if len(good) < 2:
             rejected = ", ".join(f"{count} {what}" for what, count in fixes.counts().items() if count)
             rejected = f" ({rejected})" if rejected else ""
-            lacks = (
-                "; without a vehicle file the track itself is taken as the antenna's path"
-                if TRACK_AS_PATH in self.trajectory.notes
-                else ""
-            )
-            raise NoPositionError(f"{self.name}: fewer than two good fixes{rejected}; no reference can be made{lacks}")
+            path = "without a vehicle file the track itself is taken as the antenna's path"
+            causes = [path] if TRACK_AS_PATH in self.trajectory.notes else []
+            message = f"{self.name}: fewer than two good fixes{rejected}; no reference can be made"
+            raise NoPositionError("; ".join([message, *causes, *self.data.logs[self.name].notes]))
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:
-        """Dopplers that can be projected on this antenna's path: its own, and those of the other antenna where a
-        vehicle links the two.
-        """
+        """Dopplers that project on this antenna's path: its own, and the other antenna's on one vehicle."""
         tied = self.trajectory.body_chainage_m is not None
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 

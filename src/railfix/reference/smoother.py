@@ -104,7 +104,7 @@ class _States:
 
 
 def smooth(evidence: Evidence, settings: ReferenceSettings) -> SmoothedReference:
-    """Estimate position and speed at every instant from all measurements, at least one fix among them.
+    """Estimate position and speed at every instant from all measurements, which include at least one fix.
 
     A Kalman filter forward and the smoother of Rauch, Tung and Striebel back (`filterpy.kalman.KalmanFilter`); Doppler
     speeds are weighed by Huber's function of their residuals, in `_ROUNDS` rounds.
@@ -281,9 +281,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the random error of the wheel from the closing errors, without its scale error [m per square
-    root of m].
-    """
+    """Return the wheel's random error from the closing errors, without its scale error [m per square root of m]."""
     moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
@@ -334,9 +332,7 @@ def assemble_reference(
     settings: ReferenceSettings,
     facts: dict[str, Any],
 ) -> Built:
-    """Return the reference trajectory of one antenna: positions of fixes, smoothed between them; `excess` (G - 1,) in
-    sigmas.
-    """
+    """Return one antenna's reference trajectory: fixes, smoothed between them; `excess` (G - 1,) in sigmas."""
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
     is_fix = np.zeros(len(time), dtype=np.bool_)

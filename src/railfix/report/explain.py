@@ -19,9 +19,9 @@ import polars as pl
 from railfix.core.arrays import Floats, Strings
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
-from railfix.core.tables import reading_table
+from railfix.core.staged_files import write_whole
+from railfix.core.tables import number, reading_table
 from railfix.core.timescale import gps_time
 from railfix.evaluate.evaluation_inputs import RunFolder, read_run
 from railfix.report.charts_page import page_style, read_template
@@ -231,7 +231,8 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
     weighty = satellites.filter(pl.col(WITHOUT[0]).is_not_null()).sort(pl.col(WITHOUT[0]).abs(), descending=True)
     if len(weighty):
         name, shift, sigma = (weighty[column][0] for column in ("satellite", *WITHOUT))
-        lines.append(f"most weight: without {name} the single position moves by {shift:+.2f} m, sigma {sigma:.2f} m")
+        moved = number(shift, 2, " m", sign="+")
+        lines.append(f"most weight: without {name} the single position moves by {moved}, sigma {sigma:.2f} m")
     return lines
 
 

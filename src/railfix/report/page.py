@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from railfix.core.arrays import Floats
-from railfix.core.files import write_whole
+from railfix.core.files import path_names
+from railfix.core.staged_files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.evaluate.evaluation_inputs import flat_settings
@@ -194,7 +195,9 @@ def write_report(
     `references`, `conventional` and the errors are as for `railfix.report.read_runs`; `background` is a GeoJSON file
     with lines to draw below the plan. OutputError: the page cannot be written.
     """
-    folders, others, unscreened = ([Path(name) for name in names] for names in (runs, references, conventional))
+    folders, others, unscreened = (
+        [Path(name) for name in path_names(names)] if names else [] for names in (runs, references, conventional)
+    )
     reported, evaluation = read_runs(folders, others, conventional=unscreened, options=options)
     lines = () if background is None else read_background(Path(background))
     return write_page(reported, evaluation, Path(out), background=lines, title=title)

@@ -24,7 +24,8 @@ from railfix.evaluate.evaluation_inputs import (
 )
 from railfix.evaluate.place import read_run_track
 from railfix.pipeline.config import Config
-from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
+from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.cn0_curve_file import read_cn0_curve
 from railfix.screens import SCREENS
 from railfix.track import Track
 
@@ -90,11 +91,12 @@ class ReportedRun:
         return None if self.train is None else self.train.filter(antenna=antenna)
 
 
-def get_figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
+def get_figures(
+    evaluation: Evaluation, run: ReportedRun, antenna: str, position: str, table: str = POSITIONS_TABLE
+) -> dict[str, Any]:
     """Return the figures of merit of one antenna and kind of position; empty where none exist."""
-    rows = evaluation.figures.filter(
-        grouping="all", epochs_of="own", run=run.name_in(evaluation), antenna=antenna, position=position
-    )
+    name = run.name_in(evaluation, table)
+    rows = evaluation.figures.filter(grouping="all", epochs_of="own", run=name, antenna=antenna, position=position)
     return rows.row(0, named=True) if len(rows) == 1 else {}
 
 

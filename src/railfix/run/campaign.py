@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import signal
 import time as clock
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass, replace
@@ -18,9 +19,10 @@ from typing import Any, Final, Protocol
 
 import polars as pl
 
-from railfix.core.errors import InputFileError, MismatchError, OutputError, RailfixError, SettingsError
-from railfix.core.files import write_whole
-from railfix.core.settings import Settings, load_settings
+from railfix.core.errors import InputFileError, MismatchError, OutputError, RailfixError, RailfixWarning, SettingsError
+from railfix.core.settings import Settings
+from railfix.core.settings_files import load_settings
+from railfix.core.staged_files import write_whole
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
 from railfix.run.inputs import LogReading, RunInputs, RunOptions
@@ -214,7 +216,9 @@ def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:
         check_folder(run.out, overwrite="replace")
         if not (kept := run.done):
             options = run.options.replaced(overwrite="replace")
-            run_files(run.inputs, run.config, out=run.out, options=options)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RailfixWarning)  # the report of the campaign has the notes
+                run_files(run.inputs, run.config, out=run.out, options=options)
         record = read_record(run.out).record
     except RailfixError as error:
         return _row(run, status="failed", error=" ".join(str(error).split())), False

@@ -18,12 +18,12 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix import __version__
-from railfix.core.errors import InputFileError, NoPositionError, OutputError
-from railfix.core.files import stage_file
-from railfix.core.timescale import gpst_to_utc, utc_to_gpst
+from railfix.core.errors import NoPositionError, OutputError, needs_extra
+from railfix.core.staged_files import stage_file
+from railfix.core.timescale import gpst_to_utc
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
-from railfix.io.mate import WRITTEN, mate_table, only_device, read_mate
+from railfix.io.mate import WRITTEN, mate_table
 from railfix.io.positions_export import COORDINATES
 from railfix.io.rinex import write_navigation, write_observations
 from railfix.io.rinex.write_navigation import with_written_messages
@@ -120,9 +120,10 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
     ``/ANTENNA/fix`` is sensor_msgs/NavSatFix, ``/ANTENNA/row`` has every column, and ``/ANTENNA/track``, of the filter
     alone, is emate_msgs/FusionResultTrack. Stamps are UTC. Absent numbers are NaN, absent texts empty. The file
     contains the `description`: the kind of positions, and the frame of the coordinates. NoPositionError: no row has
-    coordinates. ModuleNotFoundError: mcap-ros2-support is not installed.
+    coordinates. SettingsError: mcap-ros2-support is not installed.
     """
-    from mcap_ros2.writer import Writer
+    with needs_extra():
+        from mcap_ros2.writer import Writer
 
     known = rows.drop_nulls(COORDINATES)
     if known.is_empty():
@@ -187,64 +188,6 @@ def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
         "speed_ci": {"overestimation": nan, "underestimation": nan},
         "cross_track_dist": nan,
     }
-
-
-#: Columns of a table of sensors by those of the schema.
-_COLUMNS: Final[dict[str, dict[str, str]]] = {
-    "S_IMU": {
-        "SPEC_FORCE_X": "force_forward_mps2", "SPEC_FORCE_Y": "force_right_mps2", "SPEC_FORCE_Z": "force_down_mps2",
-        "ANG_RATE_X": "roll_rate_radps", "ANG_RATE_Y": "pitch_rate_radps", "ANG_RATE_Z": "yaw_rate_radps",
-    },
-    "S_SPEEDOMETER": {"SPEED": "speed_mps"},
-}  # fmt: skip
-
-
-def sensor_table(path: Path, kind: str) -> pl.DataFrame:
-    """Return a table of the schema with the columns of the tables of sensors (`railfix.run.sensors.COLUMNS`).
-
-    InputFileError: the table is not one of that kind of sensor, or has rows of several devices.
-    """
-    name = mate_table(path)
-    expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
-    if name != expected.get(kind, "S_DM_BALISE" if kind == "list of balises" else ""):
-        raise InputFileError(path, f"is the table {name} of EGNSS MATE, which is no table of the {kind}")
-    if name == "S_DM_BALISE":
-        table = read_mate(path, ("NID_C", "NID_BG", "N_PIG", "TRACK_EDGE_ID", "POSITION"))
-        rows = _first_of_group(table).unique(("NID_C", "NID_BG"), keep="last", maintain_order=True)
-        track = pl.col("TRACK_EDGE_ID").cast(pl.String)
-        return rows.select(_group(), chainage_m=pl.col("POSITION").cast(pl.Float64), track=track)
-    if name == "S_BALISEREADER":
-        table = only_device(path, read_mate(path, ("TIMESTAMP_UTC", "NID_C", "NID_BG", "N_PIG")))
-        return _in_gps_time(path, _first_of_group(table)).select("time_gpst", _group())
-    columns = _COLUMNS[name]
-    table = only_device(path, read_mate(path, ("TIMESTAMP_UTC", *columns)))
-    if name == "S_IMU" and table["COMPENSATED"].cast(pl.Boolean).fill_null(False).any():
-        raise InputFileError(path, "has compensated forces, without gravity; give specific forces, or leave it out")
-    codes = [column for column in table.columns if column.endswith("ERROR_CODE")]
-    good = table.filter(pl.all_horizontal(pl.col(column).cast(pl.Int64).fill_null(0) == 0 for column in codes))
-    values = [pl.col(column).cast(pl.Float64).alias(to) for column, to in columns.items()]
-    return _in_gps_time(path, good).select("time_gpst", *values)
-
-
-def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of the balise whose position represents each group."""
-    return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
-
-
-def _group() -> pl.Expr:
-    """Identity of a balise group: country and group."""
-    parts = [pl.col(name).cast(pl.Int64).cast(pl.String) for name in ("NID_C", "NID_BG")]
-    return pl.concat_str(parts, separator="-").alias("balise")
-
-
-def _in_gps_time(path: Path, table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows in order of time, with the time of the schema as GPS time."""
-    column = table["TIMESTAMP_UTC"]
-    utc = column.str.to_datetime(time_unit="ns", strict=False) if column.dtype == pl.String else column
-    if not utc.dtype.is_temporal() or utc.is_null().any():
-        raise InputFileError(path, "TIMESTAMP_UTC has a value that is no time; correct the row")
-    gps = utc_to_gpst(utc.cast(pl.Datetime("ns")).to_numpy())
-    return table.with_columns(time_gpst=pl.Series(gps, dtype=pl.Datetime("ns"))).sort("time_gpst", maintain_order=True)
 
 
 def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Track) -> dict[str, pl.DataFrame]:
@@ -322,5 +265,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """Return the columns of a table of the schema in their order; those that railfix has not are empty."""
+    """Return the columns of a table of the schema in their order; those without a value in railfix are empty."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

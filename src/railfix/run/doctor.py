@@ -40,9 +40,7 @@ Kind = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class FileFinding:
-    """Properties of one file: kind, facts in words, span in GPS time and position (ECEF, shape (3,) [m])
-    where known.
-    """
+    """Properties of one file: kind, facts, span in GPS time and position (ECEF, shape (3,) [m]) where known."""
 
     path: Path
     kind: Kind
@@ -82,9 +80,7 @@ class Diagnosis:
 
 
 def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
-    """Read each file as every kind until one fits, and compare them with each other; InputFileError where one is
-    missing.
-    """
+    """Read each file as every kind until one fits, and compare them; InputFileError where one is missing."""
     for path in paths:
         if path.is_dir():
             raise InputFileError(path, "is a folder; name the files in it")
@@ -98,9 +94,7 @@ def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -
 
 
 def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
-    """Return the properties of a file: its content determines the kind, and the reader of that kind reports
-    its faults.
-    """
+    """Return the properties of a file: its content determines the kind, whose reader reports its faults."""
     errors: list[str] = []
     kinds = _find_kinds(path)
     for kind in kinds:
@@ -210,16 +204,20 @@ def _track(path: Path) -> FileFinding:
     """Return the kind of a track map: one route, or a network in which a run finds the route; also without heights."""
     options: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
+    datum = ""
     try:
         segments = read_segments(path, MapReading())
     except (InputFileError, SettingsError) as error:
         if "--height-datum" not in str(error) and "height datum" not in str(error):
             raise
-        segments = read_segments(path, MapReading(height_datum="ellipsoidal"))
-        options = ("--height-datum", "ellipsoidal")
+        # OGC KML 2.3, 13.9: absolute altitudes are above EGM96
+        kml = path.suffix.lower() in (".kml", ".kmz")
+        datum = "orthometric" if kml else "ellipsoidal"
+        segments = read_segments(path, MapReading(height_datum="ellipsoidal"))  # its checks need no geoid
+        options = ("--height-datum", datum, *(("--geoid", "egm96") if kml else ()))
         problems = (
-            f"{path}: does not say above what its heights are; give --height-datum ellipsoidal, as in the command, "
-            "or orthometric with --geoid",
+            f"{path}: does not say above what its heights are; the command takes them as {datum}"
+            f"{', as KML defines them' if kml else ''}; --height-datum and --geoid change that",
         )
     facts = []
     if any(segment.height_datum == NO_HEIGHTS for segment in segments):
@@ -228,8 +226,8 @@ def _track(path: Path) -> FileFinding:
         segments = [replace(segment, height_m=np.zeros(len(segment.height_m))) for segment in segments]
     else:
         heights = np.concatenate([segment.height_m for segment in segments])
-        datum = ", ".join(dict.fromkeys(segment.height_datum for segment in segments))
-        facts.append(f"ellipsoidal heights from {heights.min():.1f} to {heights.max():.1f} m, given as {datum}")
+        datum = datum or ", ".join(dict.fromkeys(segment.height_datum for segment in segments))
+        facts.append(f"{datum} heights from {heights.min():.1f} to {heights.max():.1f} m")
     try:
         check_order(segments)
     except InputFileError as error:

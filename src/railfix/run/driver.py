@@ -15,7 +15,8 @@ import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
-from railfix.core.errors import NoPositionError
+from railfix.core.errors import NoPositionError, check_type, warn_of
+from railfix.core.notebook import html_list
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation
@@ -59,6 +60,12 @@ class RunSummary:
     files: Mapping[str, Path]
     wall_s: float
 
+    def __repr__(self) -> str:
+        return f"<RunSummary: {'; '.join(self.verdict.lines())}>"
+
+    def _repr_html_(self) -> str:
+        return html_list([*self.verdict.lines(), *self.notes])
+
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes of the run, one sentence each."""
@@ -80,8 +87,10 @@ def run_files(
     `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
-    options = options or RunOptions()
-    inputs, config = inputs.prepare(config or Config())
+    config, options = config or Config(), options or RunOptions()
+    for value, expected in ((inputs, RunInputs), (config, Config), (options, RunOptions)):
+        check_type(value, expected, expected.__name__)
+    inputs, config = inputs.prepare(config)
     needing = [name for name in SENSORS if getattr(inputs, name) is not None]
     check_filter(config, [*needing, *options.of_filter])
     with (
@@ -136,6 +145,7 @@ def run_files(
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
+    warn_of(notes)
     return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
 
 
@@ -202,8 +212,7 @@ def _position(
 ) -> Tally:
     """Position chunk by chunk: counts and rows.
 
-    Five chunks are processed at a time: one is read, one is screened, one has its single epochs positioned, one is
-    filtered, and the rows of one are written by `beside`.
+    Five chunks are in work at a time: reading, screens, single epochs, filter, and writing by `beside`.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     state = State()

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import BrokenLines, Reader, fingerprint
+from railfix.core.files import BrokenLines, Reader, fingerprint, path_names
 from railfix.core.settings import INPUTS, Settings, option
 from railfix.io.file_kind import find_kind
 from railfix.io.position_log import column_names
@@ -70,10 +70,10 @@ class InputFiles(Settings):
         """Return the inputs with the receiver logs as navigation files where none is given."""
         if not cls.own_navigation or not isinstance(values, dict) or values.get("nav"):
             return values
-        logs = [Path(path) for name in cls.own_navigation for path in values.get(name) or ()]
+        logs = [Path(path) for name in cls.own_navigation if values.get(name) for path in path_names(values[name])]
         own = tuple(path for path in logs if path.is_file() and find_kind(path) == "receiver")
         if logs and not own:
-            raise ValueError("--nav is missing; name the navigation file, which RINEX observations need")
+            raise ValueError("nav (--nav) is missing; name the navigation file, which RINEX observations need")
         return {**values, "nav": own}
 
     def files_by_name(self) -> Iterator[tuple[str, Path]]:
@@ -179,7 +179,7 @@ class RunInputs(InputFiles):
     def _complete(self) -> Self:
         missing = [name for name in ("front", "track") if not getattr(self, name)]
         if missing:
-            raise ValueError(f"--{missing[0]} is missing; name its file, or a folder with --mate")
+            raise ValueError(f"{missing[0]} (--{missing[0]}) is missing; name its file, or a folder with mate (--mate)")
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:

@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
 from railfix.core.errors import OutputError
-from railfix.core.files import write_error
+from railfix.core.staged_files import write_error
 
 if TYPE_CHECKING:
     import polars as pl
@@ -66,7 +66,7 @@ def make_staging(folder: Path) -> Staging:
             if _try_lock(lock) and Path(lock.name).exists():
                 name.mkdir()
                 return staging
-        except BaseException as error:  # a signal that ends the program among them, also while the file is opened
+        except BaseException as error:  # including a signal that ends the program, also while the file is opened
             if staging is not None:
                 staging.remove()
             elif not isinstance(error, FileExistsError):
@@ -370,7 +370,7 @@ class OutputFolder:
             ready.mkdir()
             for name in self._staged:
                 self.stage(name).replace(ready / name)
-            # From this rename on, a killed process has finished: the next one moves the files to their folder.
+            # After this rename a killed process counts as finished: the next process moves the files to their folder.
             return move_in_place(ready.replace(staging / READY), self.path)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings, join_rows, take_rows
-from railfix.core.errors import MismatchError
+from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import nearest_rows
 from railfix.gnss.navigation import Navigation
@@ -30,7 +30,7 @@ from railfix.track import Track
 from railfix.track.frames import in_map_frame
 from railfix.track.network import UNMAPPED_PRIOR, Network
 from railfix.track.network_match import Matched, PlanLog, match, plan_log
-from railfix.track.network_route import find_route
+from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the positions that are matched [s].
 _INTERVAL_S: Final = 1.0
@@ -45,7 +45,7 @@ _LEAST_NAMED: Final = 0.01
 _NAMED: Final = 8
 #: Epochs of an alternative nearer than this belong together [s].
 _TOGETHER_S: Final = 60.0
-#: Probability of a track that the map lacks beyond which the log speaks for one: twice what it has before the log.
+#: Probability of a track that the map lacks, above which the log indicates one: twice the prior.
 _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
 #: Name of a track that the map does not have.
 NONE: Final = "none"
@@ -216,8 +216,7 @@ class RouteOfLog:
             f"{self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv has all nearby tracks)"
         )
         if self.left_out:
-            beside = ", ".join(self.network.names[k] for k in self.left_out)
-            first += f"; no route joins these to {beside}: the train turned back there, or the map has a gap"
+            first += f"; {left_out_note(self.network, self.left_out)}"
         more = len(self.alternatives) - _NAMED
         rest = (f"route: {more} more stretches with alternatives are in run.json",) if more > 0 else ()
         return (*self.network.notes, first, *(a.sentence for a in self.alternatives[:_NAMED]), *rest)
@@ -315,7 +314,7 @@ class LogPositions:
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions of quality 5, single; MismatchError where the log has none."""
+        """Positions of quality 5, single; NoPositionError where the log has none."""
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
         located = []
         for part in self.parts():
@@ -324,7 +323,7 @@ class LogPositions:
             located.append(locate(part[::step], received, self.config, book))
         known = [take_rows(part, np.isfinite(part.ecef_m[:, 0])) for part in located]
         if not (count := sum(len(part.time) for part in known)):
-            raise MismatchError(f"{self.path}: the log has no position, so that its line cannot be found")
+            raise NoPositionError(f"{self.path}: the log has no position, so that its line cannot be found")
         placed = join_rows(known)
         return PositionLog(
             path=self.path, time=placed.time, ecef_m=placed.ecef_m, quality=np.full(count, 5), sigma_m=placed.sigma_m,
@@ -341,9 +340,7 @@ class LogPositions:
         matched = match(network, positions)
         used = np.flatnonzero(np.isfinite(matched.probability))
         positions, matched = positions.take(used), matched.take(used)
-        tracks, left_out = find_route(network, matched)
-        if not tracks:
-            raise MismatchError(f"{self.path}: no position lies on a track of the network{_beside(network, matched)}")
+        tracks, left_out = find_route(network, matched, self.path)
         return RouteOfLog(
             network=network,
             tracks=tuple(tracks),
@@ -353,15 +350,3 @@ class LogPositions:
             time=self.time,
             reading=self.reading,
         )
-
-
-def _beside(network: Network, matched: Matched) -> str:
-    """Return how the positions lie to the tracks that they are near but not on, the end of a sentence."""
-    track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
-    near = track >= 0
-    if not near.any():
-        return "; is it the map of this region, and its CRS right?"
-    most = int(np.bincount(track[near]).argmax())
-    away = float(np.median(offset[track == most]))
-    side = "right" if away > 0.0 else "left"
-    return f": they lie {abs(away):.1f} m {side} of {network.names[most]}; the map lacks their track, or is displaced"

@@ -10,39 +10,16 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Strings, join_rows
+from railfix.core.arrays import Datetimes, join_rows
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import read_bytes
-from railfix.core.tables import reading_table
-from railfix.io.mate import mate_table
+from railfix.io.sensor_tables import COLUMNS, get_column, get_times, names_of_columns, read_sensor_table
 from railfix.motion.samples import GroundUnits, ListedBalises, Samples, SensorSamples
 from railfix.pipeline.config import Config
-from railfix.run.convert import sensor_table
 from railfix.track import Track
 from railfix.track.track import section_spans
 
-#: Columns of each table besides ``time_gpst``, as `railfix simulate` writes them; those in brackets may be absent.
-COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
-    "tachometer": ("pulse", "[direction]"),
-    "inertial": (
-        "force_forward_mps2", "force_right_mps2", "force_down_mps2", "roll_rate_radps", "pitch_rate_radps",
-        "yaw_rate_radps",
-    ),
-    "radar": ("speed_mps",),
-    "ranging": ("unit", "range_m", "[sigma_m]"),
-    "ranging_units": ("unit", "x_m", "y_m", "z_m"),
-    "balises": ("balise", "[sigma_m]"),
-    "list of balises": ("balise", "chainage_m", "[track]", "[sigma_m]"),
-}  # fmt: skip
-
-
 #: Class of the samples of each sensor.
 _CLASSES: Final = {name: type(samples) for name, samples in SensorSamples().tables.items()}
-#: Sensors that may be silent for some time, which rows with the time alone report.
-_SILENT: Final = ("tachometer", "ranging", "balises")
-#: Tables without a time, and columns of names.
-_TIMELESS: Final = ("ranging_units", "list of balises")
-_NAMES: Final = ("unit", "balise", "track")
 
 
 def read_sensors(
@@ -63,9 +40,9 @@ def read_sensors(
     samples: dict[str, Any] = {}
     for sensor, path in paths.items():
         if path is not None:
-            table = _table(path, sensor)
-            columns = {name: _column(path, table, name) for name in _names_of_columns(sensor)}
-            samples[sensor] = make_samples(sensor, _times(table), columns)
+            table = read_sensor_table(path, sensor)
+            columns = {name: get_column(table, name) for name in names_of_columns(sensor)}
+            samples[sensor] = make_samples(sensor, get_times(table), columns)
     return SensorSamples(**samples)
 
 
@@ -105,13 +82,11 @@ def read_units(path: Path) -> GroundUnits:
 
     InputFileError: no such table, or a unit twice.
     """
-    table = _columns(path, "ranging_units")
-    names = table["unit"].cast(pl.String)
+    table = read_sensor_table(path, "ranging_units")
+    names = table["unit"]
     if names.n_unique() < len(names):
         raise InputFileError(path, f"names unit {names.filter(names.is_duplicated())[0]} twice; give each once")
-    return GroundUnits(
-        name=names.to_numpy().astype(np.str_), ecef_m=table.select("x_m", "y_m", "z_m").cast(pl.Float64).to_numpy()
-    )
+    return GroundUnits(name=names.to_numpy().astype(np.str_), ecef_m=table.select("x_m", "y_m", "z_m").to_numpy())
 
 
 def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> ListedBalises:
@@ -122,8 +97,8 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
 
     InputFileError: no such table, a name twice, or none on the line.
     """
-    table = _columns(path, "list of balises")
-    names = _names(path, table, "balise")
+    table = read_sensor_table(path, "list of balises")
+    names = get_column(table, "balise")
     if len(twice := table["balise"].filter(table["balise"].is_duplicated())):
         raise InputFileError(path, f"lists balise {twice[0]} twice; give each once")
     chainage = table["chainage_m"].to_numpy()
@@ -183,91 +158,3 @@ def check_filter(config: Config, options: Iterable[str]) -> None:
     for name in options:
         if config.filter == "off":
             raise SettingsError(f"--{name} needs the filter along the track; leave out --filter off")
-
-
-def _times(table: pl.DataFrame) -> Datetimes:
-    return table["time_gpst"].to_numpy().astype("datetime64[ns]")
-
-
-def _names_of_columns(kind: str) -> list[str]:
-    """Return the names of the columns of a table, those that may be absent among them."""
-    return [column.strip("[]") for column in COLUMNS[kind]]
-
-
-def _column(path: Path, table: pl.DataFrame, name: str) -> NDArray[Any]:
-    """A column of a sensor table; an empty whole number is 0, other missing values are NaN."""
-    if name not in table.columns:
-        return np.full(len(table), np.nan)
-    if name == "balise":
-        return _names(path, table, name)
-    if name == "unit":
-        return table[name].cast(pl.String).to_numpy().astype(np.str_)
-    return table[name].fill_null(0 if table[name].dtype.is_integer() else np.nan).to_numpy()
-
-
-def _names(path: Path, table: pl.DataFrame, name: str) -> Strings:
-    """Return a column of names, none of them empty."""
-    if (empty := table[name].is_null()).any():
-        raise InputFileError(path, f"row {int(empty.arg_max() or 0) + 2}: {name} is empty; name it")
-    return table[name].cast(pl.String).to_numpy().astype(np.str_)
-
-
-def _table(path: Path, kind: str) -> pl.DataFrame:
-    """Return a table with times that do not fall."""
-    table = _columns(path, kind)
-    if not table["time_gpst"].dtype.is_temporal():
-        raise InputFileError(path, "time_gpst is no time; expected GPS time as 2024-03-05T03:10:00.000000000")
-    if (unknown := table["time_gpst"].is_null()).any():
-        raise InputFileError(path, f"row {int(unknown.arg_max() or 0) + 2}: time_gpst is empty; remove the row")
-    falling = np.flatnonzero(np.diff(_times(table)) < np.timedelta64(0, "ns"))
-    if len(falling):
-        raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
-    if kind in _SILENT:  # a stream that was recorded has rows with the time alone (`railfix.live.stream`)
-        table = table.filter(~pl.all_horizontal(_select_columns(table, kind).is_null()))
-        if not len(table):
-            raise InputFileError(path, f"has no row of the {kind} but its time; leave the file out")
-    return table
-
-
-def _select_columns(table: pl.DataFrame, kind: str) -> pl.Expr:
-    """Return the columns of a sensor that the table has, without the time."""
-    return pl.col([name for name in _names_of_columns(kind) if name in table.columns])
-
-
-def _columns(path: Path, kind: str) -> pl.DataFrame:
-    with reading_table(path, f"cannot be read as a table of the {kind} ({{}})"):
-        if mate_table(path):
-            table = sensor_table(path, kind)
-        elif path.suffix == ".parquet":
-            table = pl.read_parquet(path)
-        else:
-            table = pl.read_csv(
-                read_bytes(path),
-                schema_overrides={"time_gpst": pl.Datetime("ns"), **dict.fromkeys(_NAMES, pl.String())},
-                infer_schema_length=None,
-                comment_prefix="#",
-            )
-    stamp = () if kind in _TIMELESS else ("time_gpst",)
-    needed = (*stamp, *(name for name in COLUMNS[kind] if not name.startswith("[")))
-    missing = [name for name in needed if name not in table.columns]
-    if missing:
-        raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
-    if not len(table):
-        raise InputFileError(path, f"has no rows; expected those of the {kind}, or leave the file out")
-    empty = table.select(pl.all_horizontal(_select_columns(table, kind).is_null())).to_series()
-    return table.with_columns(
-        _numbers(path, table[name], may_be_empty=empty if name == "pulse" else pl.Series([name != "chainage_m"]))
-        for name in _names_of_columns(kind)
-        if name not in _NAMES and name in table.columns
-    )
-
-
-def _numbers(path: Path, column: pl.Series, *, may_be_empty: pl.Series) -> pl.Series:
-    """Return a column as numbers; pulses and directions are whole numbers."""
-    numbers = column.cast(pl.Int64 if column.name in ("pulse", "direction") else pl.Float64, strict=False)
-    wrong = numbers.is_null() & (column.is_not_null() | ~may_be_empty)
-    if wrong.any():
-        row = int(wrong.arg_max() or 0)
-        message = f"row {row + 2}: {column.name} is {column[row]!r}, a number was expected; correct the row"
-        raise InputFileError(path, message)
-    return numbers

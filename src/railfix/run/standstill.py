@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
-from railfix.core.errors import MismatchError
+from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.geodesy import axes_at, range_with_rotation
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
@@ -78,14 +78,15 @@ def standstill_codes(
     position.
 
     `base` are the observations of a base station and its position, ECEF, shape (3,) [m].
-    MismatchError: the antenna moves, its log has no position, or it shares no epoch or satellite with the base station.
+    NoPositionError: the log has no position. MismatchError: the antenna moves, or the log shares no epoch or satellite
+    with the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
     seen = ranges_without_map(obs, received, config, book)
     places = locate(obs, received, config, book).ecef_m
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
-        raise MismatchError("the log has no positions; are the navigation files of its day?")
+        raise NoPositionError("the log has no position; are the navigation files of its day?")
     # thirds of the log, as a train that returns is at its first position in the end
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
     level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
@@ -131,9 +132,7 @@ def standstill_codes(
 
 
 def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
-    """Return observed minus computed codes at a position, with the Earth's rotation during transit; NaN
-    where unused.
-    """
+    """Return observed minus computed codes at a position with the Earth's rotation during transit; NaN: unused."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
     return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)

@@ -364,7 +364,7 @@ def line_of_file(settings: LineFile) -> FileLine:
 
 
 def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, Floats]:
-    """Return parameters at about every half metre, the knots among them, and the arc length there (Gauss, 3 points)."""
+    """Return parameters at about every half metre, including the knots, and the arc length there (Gauss, 3 points)."""
     pieces = np.maximum(np.ceil(np.diff(knots) / _STEP_M).astype(np.int64), 1)
     knot, number = places_in_groups(pieces)
     at = np.append(knots[knot] + number * (np.diff(knots) / pieces)[knot], knots[-1])

@@ -32,7 +32,9 @@ from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath
-from railfix.core.settings import read_toml, validate
+from railfix.core.settings import validate
+from railfix.core.settings_files import read_toml
+from railfix.core.staged_files import check_path
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario
@@ -103,6 +105,7 @@ def load_recipe(name: FilePath) -> Recipe:
     InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a recipe is not one (names
     twice, other keys); settings of a run are checked by `Recipe.scenario`.
     """
+    check_path(name, what="a path or the name of a shipped scenario")
     path = find_scenario(name)
     table = read_toml(path, what="a scenario file")
     description = str(table.pop("description", ""))
@@ -157,7 +160,7 @@ def load_scenario(name: FilePath) -> Scenario:
 
 
 def scenario_table(scenario: Scenario) -> dict[str, Any]:
-    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings.write_toml`.
+    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings_files.write_toml`.
 
     None is the word "none"; `multipath` is not in it.
     """

@@ -1,4 +1,4 @@
-"""Tables of all sensors of a run, balises and their list among them, from the motion of the antennas."""
+"""Tables of all sensors of a run, including balises and their list, from the antennas' motion."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError, needs_extra
 from railfix.core.files import FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.crs import (
@@ -48,6 +48,16 @@ class FrameShift:
     up_m: float = 0.0
 
     notes: tuple[str, ...] = ()
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Notes on the transformation, and on the shift in plan where there is one."""
+        size = float(np.hypot(self.east_m, self.north_m))
+        moved = (
+            f"map: {self.frame} moved by {size:.2f} m (east {self.east_m:+.2f}, north {self.north_m:+.2f}) to "
+            f"{self.used}, the frame of the positions (--same-frame: they are in that of the map)"
+        )
+        return (*self.notes, moved) if size > 0.0 else self.notes
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -198,10 +208,8 @@ def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
     """Move JGD2011 by a semi-dynamic correction, once in each thousandth of a degree, and with the plate."""
-    try:
+    with needs_extra(f"{path}: semi-dynamic correction"):
         import jgdtrans
-    except ImportError:
-        raise InputFileError(path, "semi-dynamic correction needs jgdtrans: pip install 'railfix[maps]'") from None
     try:
         correction = jgdtrans.loads(read_text(path), format="SemiDynaEXE")
     except jgdtrans.ParseParFileError as error:

@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, NoPositionError
 from railfix.core.geodesy import axes_at
+from railfix.core.notebook import plural
 from railfix.core.settings import Settings
-from railfix.core.tables import plural
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog, qualities_in_words
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
@@ -23,17 +23,18 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 #: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 _TURN: Final = -0.5  #: The path turns back where the cosine of its turn is less: by more than 120 degrees.
-#: Positions that deviate laterally from their neighbours by more than a distance [m], this many medians of such
-#: distances and a curve of this radius [m] are outliers; the search is repeated without them, in some rounds, where
-#: there are enough positions. Where the neighbours are farther away in time [s], the path beside them is straight, too:
-#: the cosine of its turns is this at least.
-_NEAR_S: Final = 2.5
-_STRAIGHT: Final = 0.87
+#: Positions off the line between their neighbours by more than a distance [m], this many medians of such distances and
+#: what a curve of this radius [m] needs are outliers; the search is repeated without them, in some rounds, where there
+#: are enough positions. Along the line a change of speed counts with this acceleration [m/s2]. The line is straight
+#: between neighbours near in time [s], or where the cosine of the turns of the path around them is this at least.
 _BESIDE_M: Final = 5.0
-_LEAST_RADIUS_M: Final = 150.0
 _BESIDE_MEDIANS: Final = 6.0
+_LEAST_RADIUS_M: Final = 150.0
 _ROUNDS: Final = 20
 _ENOUGH: Final = 10
+_ACCELERATION_MPS2: Final = 2.0
+_NEAR_S: Final = 2.5
+_STRAIGHT: Final = 0.87
 _STANDING_WINDOW_S: Final = 3.0  #: Half of the window of the displacement.
 
 
@@ -158,12 +159,7 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 
 
 def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
-    """Flag positions off the line between their neighbours by more than `_BESIDE_M`, `_BESIDE_MEDIANS` medians of all
-    such distances, and what a curve of `_LEAST_RADIUS_M` needs, the farthest first.
-
-    Between neighbours that are far away a train may turn or change its speed: a position there is an outlier only where
-    the path before and after it goes on in the direction of the line between its neighbours.
-    """
+    """Flag positions off the straight line between their neighbours, the farthest first; shape (n,)."""
     wrong = np.zeros(len(time), dtype=np.bool_)
     if len(time) < _ENOUGH or np.isnat(time).any():
         return wrong
@@ -174,17 +170,18 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
             break
         t, points = elapsed[rows], ecef_m[rows]
         before, after = t[1:-1] - t[:-2], t[2:] - t[1:-1]
-        share = (before / np.maximum(before + after, 1e-9))[:, None]
-        off = np.linalg.norm(points[1:-1] - points[:-2] * (1.0 - share) - points[2:] * share, axis=1)
-        chord = points[2:] - points[:-2]
+        chord, share = points[2:] - points[:-2], before / np.maximum(before + after, 1e-9)
         length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
+        off = points[1:-1] - points[:-2] - chord * share[:, None]
+        along = (off * chord).sum(axis=1) / length
+        across = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0.0))
+        along = np.maximum(np.abs(along) - 0.5 * _ACCELERATION_MPS2 * before * after, 0.0)
+        straight = (np.maximum(before, after) <= _NEAR_S) | _goes_on(points, chord / length[:, None])
+        size = np.where(straight, np.hypot(across, along), 0.0)
         of_curve = length**2 / (8.0 * _LEAST_RADIUS_M)
-        far = np.maximum(before, after) > _NEAR_S
-        across = np.linalg.norm(np.cross(points[1:-1] - points[:-2], chord), axis=1) / length
-        off = np.where(far, np.where(_goes_on(points, chord / length[:, None]), across, 0.0), off)
-        limit = np.maximum(of_curve, max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(off))))
-        around = np.pad(off, 1)
-        farthest = (off > limit) & (off >= around[:-2]) & (off > around[2:])
+        limit = np.maximum(of_curve, max(_BESIDE_M, _BESIDE_MEDIANS * float(np.median(size))))
+        around = np.pad(size, 1)
+        farthest = (size > limit) & (size >= around[:-2]) & (size > around[2:])
         if not farthest.any():
             break
         wrong[rows[1:-1][farthest]] = True
@@ -335,7 +332,7 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
             message = (
                 f"no position has quality {accepted}; the log has {qualities_in_words(log)} (--quality takes others)"
             )
-            raise InputFileError(log.path, message)
+            raise NoPositionError(f"{log.path}: {message}")
     if max_sigma_m is not None:
         if not np.isfinite(log.sigma_m).any():
             raise InputFileError(log.path, "a largest sigma was given, but the log has no standard deviations")
@@ -378,7 +375,8 @@ def from_position_log(
 ) -> tuple[Track, Thinned]:
     """Create a track from the accurate positions of a log, and report the selection of rows.
 
-    InputFileError: fewer than two points are left, the times run backwards, or the log has no column for a filter.
+    NoPositionError: fewer than two points are left. InputFileError: the times run backwards, the log has no column for
+    a filter, or a gap is too long.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)
@@ -404,4 +402,6 @@ def from_position_log(
         )
         return track, thinned
     except ValueError as error:
+        if len(thinned.kept) < 2:
+            raise NoPositionError(f"{log.path}: {error}") from None
         raise InputFileError(log.path, str(error)) from None

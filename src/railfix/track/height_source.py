@@ -11,7 +11,7 @@ import numpy as np
 from pyproj import CRS
 
 from railfix.core.arrays import Floats, places_in_groups
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError, SettingsError, needs_extra
 from railfix.core.files import FilePath, ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.file_kind import find_kind
@@ -106,11 +106,8 @@ def _dense(track: Track) -> Track:
 @contextmanager
 def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
     """Yield a raster and its CRS; InputFileError where it names none."""
-    try:
+    with needs_extra(f"{path}: a raster"):
         import rasterio
-    except ImportError:
-        needed = "reading a raster needs rasterio; install it with: pip install 'railfix[maps]'"
-        raise InputFileError(path, needed) from None
     try:
         with rasterio.open(path) as raster:
             if raster.crs is None:

@@ -21,7 +21,6 @@ from railfix.core.arrays import cheapest_path
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.io.mate import mate_table, read_mate
-from railfix.io.named_columns import read_named_columns
 from railfix.track.crs import choose_crs
 from railfix.track.elements import CantElement, Design, PlanElement, ProfileElement, plan_starts, segment_of_design
 from railfix.track.georeference import EllipsoidalHeights, georeference
@@ -98,15 +97,10 @@ def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
         if _POSITION not in file.name.upper() or wanted not in names:
             return {}
         file = names[wanted]
-    if file.suffix.lower() == ".parquet":
-        cells = read_mate(file, ("TRACK_EDGE_ID", "TRACK_SEGMENT_TYPE")).cast(pl.String).to_dict()
-    else:
-        cells = read_named_columns(file).cells
-    names_of = {name.upper(): name for name in cells}
     edges: dict[str, list[Row]] = {}
-    for values in zip(*(cells[name] for name in names_of.values()), strict=True):
-        row = {name: str(v).strip() for name, v in zip(names_of, values, strict=True) if v is not None}
-        edges.setdefault(row.get("TRACK_EDGE_ID", ""), []).append(row)
+    for row in read_mate(file, ("TRACK_EDGE_ID",), table or _POSITION).cast(pl.String).iter_rows(named=True):
+        cells = {name: value.strip() for name, value in row.items() if value is not None}
+        edges.setdefault(cells.get("TRACK_EDGE_ID", ""), []).append(cells)
     return {edge: sorted(rows, key=lambda row: _number(str(file), row, _SPAN[0])) for edge, rows in edges.items()}
 
 

@@ -2,8 +2,9 @@
 
 A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, a
 track that the map lacks, and the common error of the positions: a first-order Gauss-Markov process east, north and up,
-on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). What is left of each position has heavy tails (Student's
-t) and lasts for `correlation_s`, of which each position has its share. A track that the map lacks runs beside the
+on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The remaining error of each position has heavy tails
+(Student's t) and persists for `correlation_s`; the likelihood of a position is weighted by the fraction of that time it
+stands for. A track that the map lacks runs beside the
 nearest one at a constant distance (`SHIFTS_M`), clear of all others, or is anywhere else.
 """
 
@@ -36,11 +37,11 @@ _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
 _LEAVE_BESIDE_COST: Final = 10.0
 _ENTER_BESIDE_COST: Final = 7.0
-#: And the same of a position that lies farther than this beyond an end of a track at which the map ends [m].
+#: Distance beyond a track end at which the map ends, above which the same applies to a position [m].
 _OPEN_COST: Final = 2.0
 _BEYOND_M: Final = 10.0
 _ROUNDED_M: Final = 1e-6
-#: Way by which a connection may exceed the straight distance of two places [m], and its share of it: a bend.
+#: Length by which a connection may exceed the straight distance of two positions [m], and fraction of it: a bend.
 _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Difference of path length and distance at which a joint is half as probable as where they agree [m].
@@ -119,8 +120,11 @@ class Transitions:
         share[:m, -1] = np.where(self._opens[k], np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
         share[-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
+        # a train that has passed an open end, or comes to one, is on a track that the map lacks; as it begins on one
+        # with `UNMAPPED_PRIOR`, leaving has that factor, too, and a run and its return are equally probable
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
-        share[m:-1, :m] = np.exp(-_ENTER_BESIDE_COST)
+        share[:m, m:-1][self._opens[k]] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
+        share[m:-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
@@ -172,9 +176,7 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the equilibrium probabilities of the states of an urn, and its transition matrix after a time, from row to
-    column.
-    """
+    """Return an urn's equilibrium probabilities and transition matrix after a time, from row to column."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, RowArrays, take_rows
-from railfix.core.errors import MismatchError
+from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, FilePath
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.io.positions import read_positions
@@ -69,9 +69,7 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions, given in the frame of the satellites, in that of the network; otherwise
-        MismatchError.
-        """
+        """Return positions in the satellites' frame in that of the network; otherwise MismatchError."""
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -180,7 +178,7 @@ def match(
     """
     given = np.flatnonzero(np.isfinite(log.latitude_deg))
     if not len(given):
-        raise MismatchError(f"{log.path}: has no position")
+        raise NoPositionError(f"{log.path}: has no position")
     sigma, notes = _sigma(network, log, given, sigma_m)
     if within_m is None:
         within_m = float(np.clip(_WITHIN_SIGMAS * np.quantile(sigma, 1.0 - _BEST), _WITHIN_M, _FARTHEST_M))

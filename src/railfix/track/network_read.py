@@ -231,6 +231,10 @@ class NetworkQuality:
     findings: tuple[NetworkFinding, ...]
 
 
+#: Kinds of findings that are errors of the network; they come first.
+FAULTS: Final = ("gap", "joint", "kink")
+
+
 def check_network(network: Network) -> NetworkQuality:
     """Check the connections of a network and the distances between its tracks."""
     joined: nx.Graph[int] = nx.Graph()
@@ -238,6 +242,7 @@ def check_network(network: Network) -> NetworkQuality:
     joined.add_edges_from((link.first, link.second) for link in network.links)
     loose = [(t, e) for t in range(len(network.tracks)) for e in (0, 1) if (t, e) not in network.passages]
     findings = [*_gaps(network, loose), *_joints(network), *_too_near(network)]
+    findings.sort(key=lambda finding: finding.kind not in FAULTS)
     return NetworkQuality(
         tracks=len(network.tracks),
         switches=sum(len(others) > 1 for others in network.passages.values()),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
+from railfix.core.errors import MismatchError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
@@ -142,11 +143,14 @@ def _fill_legs(
     return np.array(numbers), np.array([from_m, *place[1::2]]), np.array([*place[0::2], to_m])
 
 
-def find_route(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
-    """Return the tracks that a run passed in order of travel, each once, and those that no route joins to them."""
+def find_route(network: Network, matched: Matched, path: str = "the log") -> tuple[list[int], list[int]]:
+    """Return the tracks that a run passed in order of travel, each once, and those that no route joins to them.
+
+    MismatchError: no position lies on a track; the message names the log and where its positions lie.
+    """
     seen = matched.track[matched.track >= 0]
     if not len(seen):
-        return [], []
+        raise MismatchError(f"{path}: no position lies on a track of the network{_beside(network, matched)}")
     passed = [int(t) for t in seen[np.concatenate([[True], np.diff(seen) != 0])]]
     share = {t: float(matched.probabilities[matched.candidates.track == t].sum()) for t in set(passed)}
     routes = [network.route_over(passed)]
@@ -157,6 +161,24 @@ def find_route(network: Network, matched: Matched) -> tuple[list[int], list[int]
     # `fsum` rounds the same in any order: the return over the same tracks has the same length
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
+
+
+def left_out_note(network: Network, left_out: Sequence[int]) -> str:
+    """Return the note on tracks that no route joins to those of a run, `find_route`."""
+    beside = ", ".join(network.names[k] for k in left_out)
+    return f"no route joins these tracks to {beside}: the train turned back there, or the map has a gap"
+
+
+def _beside(network: Network, matched: Matched) -> str:
+    """Return how the positions lie to the tracks that they are near but not on, the end of a sentence."""
+    track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
+    near = track >= 0
+    if not near.any():
+        return "; is it the map of this region, and its CRS right?"
+    most = int(np.bincount(track[near]).argmax())
+    away = float(np.median(offset[track == most]))
+    side = "right" if away > 0.0 else "left"
+    return f": they lie {abs(away):.1f} m {side} of {network.names[most]}; the map lacks their track, or is displaced"
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:

@@ -12,8 +12,8 @@ import numpy as np
 
 from railfix.core.arrays import take_rows
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import FilePath, ending
-from railfix.core.tables import plural
+from railfix.core.files import FilePath, ending, path_names
+from railfix.core.notebook import plural
 from railfix.io.file_kind import GDAL, find_kind, wrong_kind
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum
@@ -72,6 +72,7 @@ def read_track(
     SettingsError
         An option is unknown or contradicts the file.
     """
+    names = path_names(paths)
     reading = MapReading(**options)
     check_height_datum(reading.height_datum)
     if reading.duplicates not in ("merge", "keep"):
@@ -79,11 +80,8 @@ def read_track(
     for key, value in (("sigma_plan_m", reading.sigma_plan_m), ("sigma_height_m", sigma_height_m)):
         if value is not None and not value > 0.0:
             raise SettingsError(f"{key} is {value:g}; a positive number of metres was expected")
-    files = [paths] if isinstance(paths, str | PathLike) else list(paths)
-    if not files:
-        raise SettingsError("no track map was given")
     return track_of_segments(
-        [segment for file in files for segment in read_segments(file, reading)],
+        [segment for file in names for segment in read_segments(file, reading)],
         heights=heights,
         geoid=reading.geoid,
         name=name,

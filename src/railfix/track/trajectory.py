@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -13,9 +12,9 @@ import scipy
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, places_in_groups, read_only
-from railfix.core.errors import RailfixWarning
+from railfix.core.errors import check_type
 from railfix.core.geodesy import axes_at
-from railfix.core.tables import NotebookTable, plural
+from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
 _FIRST_CANDIDATES = 6  #: Samples examined in the first round; four times as many for positions not yet proven.
@@ -170,18 +169,12 @@ class Trajectory(FrozenArrays, NotebookTable):
             raise ValueError(f"points {int(np.argmin(self.length_m))} and the next are equal")
 
     @classmethod
-    def from_track(cls, track: Track) -> Trajectory:
-        """Create a trajectory that takes the track for the antenna's path, with a `RailfixWarning`.
-
-        The antenna of a train is above the track and swings out in curves: `antenna_trajectory` computes its path from
-        the vehicle file. `from_antenna_path` is for a map that is the antenna's own path.
-        """
-        warnings.warn(f"{TRACK_AS_PATH}; railfix.antenna_trajectory uses one", RailfixWarning, stacklevel=2)
-        return cls.from_antenna_path(track)
-
-    @classmethod
     def from_antenna_path(cls, track: Track) -> Trajectory:
-        """Create a trajectory from a map of the antenna's own path, as of a survey; `notes` records it."""
+        """Create a trajectory from a map of the antenna's own path, as of a survey; `notes` records it.
+
+        The antenna of a train is above the track and swings out in curves: `antenna_trajectory` computes its path.
+        """
+        check_type(track, Track, "track")
         return cls(
             name=track.name, ecef_m=track.ecef_m, chainage_m=track.chainage_m, kilometrage_m=track.kilometrage_m,
             cant_m=track.cant_m, roll_deg=read_only(np.zeros(len(track))), sigma_plan_m=track.sigma_plan_m,

@@ -1,4 +1,4 @@
-"""Lines of map files of geographic information systems, read through GDAL by `pyogrio`, OpenStreetMap among them.
+"""Lines of map files of geographic information systems, including OpenStreetMap, read through GDAL by `pyogrio`.
 
 OpenStreetMap's ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Exporters
 write the tags as columns, as one object or JSON text (`tags`), as hstore text (`other_tags` of GDAL) or as a class
@@ -20,7 +20,7 @@ from xml.etree.ElementTree import ParseError, iterparse
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, needs_extra
 from railfix.core.files import FilePath, open_stream, unpacked_file
 from railfix.io.file_kind import KIND_WORDS, find_kind
 from railfix.io.xml_lines import read_gpx_lines, read_kml_lines
@@ -220,18 +220,14 @@ def _ways(
     return [*found, *short]
 
 
-INSTALL: Final = "install it with: pip install 'railfix[maps]'"
 _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")  #: Columns that name a line, in this order.
 
 
 def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
     """Read CRS, properties and geometries of all features of a kind ("LineString", "none": any), an entry a layer."""
-    try:
+    with needs_extra(f"{path}: {KIND_WORDS[find_kind(path)]}"):
         import pyogrio
         import shapely
-    except ImportError:
-        what = KIND_WORDS[find_kind(path)]
-        raise InputFileError(path, f"is {what}, which pyogrio and shapely read; {INSTALL}") from None
     layers = []
     pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # ids of nodes in .osm.pbf may be negative
     try:

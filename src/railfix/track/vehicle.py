@@ -13,10 +13,11 @@ import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import MismatchError, SettingsError
-from railfix.core.files import FilePath
+from railfix.core.errors import MismatchError, SettingsError, check_type
 from railfix.core.geodesy import axes_at, enu_axes
-from railfix.core.settings import Settings, load_settings
+from railfix.core.settings import Settings
+from railfix.core.settings_files import load_settings
+from railfix.core.staged_files import FilePath
 from railfix.track.curves import centre_curve, with_breaks
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.track import Track
@@ -326,6 +327,8 @@ def antenna_trajectory(
         Track and vehicle do not match: the track is shorter than the vehicle, bends too sharply, has
         cant of unknown side, or is itself the path of an antenna.
     """
+    check_type(track, Track, "track")
+    check_type(vehicle, Vehicle, "vehicle")
     if ANTENNA_PATH in track.provenance.notes:
         raise MismatchError(f"{track.name}: {ANTENNA_PATH}; use it without a vehicle file")
     if antenna not in vehicle.antennas:

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, needs_extra
 from railfix.core.files import FilePath, file_sha256, read_bytes
 from railfix.io.xml_lines import read_root, tag
 from railfix.track.crs import choose_crs
 from railfix.track.landxml_file import finite_number, read_landxml_segments
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment
-from railfix.track.vector_file import INSTALL, plan_segment
+from railfix.track.vector_file import plan_segment
 
 if TYPE_CHECKING:
     from rdflib import Graph
@@ -180,10 +180,8 @@ def _graph(path: FilePath) -> Graph:
 @lru_cache(maxsize=2)
 def _parse(path: str, _: str) -> Graph:
     """Return the triples of a file, kept for its relations."""
-    try:
+    with needs_extra(f"{path}: RDF"):
         from rdflib import Graph
-    except ImportError:
-        raise InputFileError(path, f"reading RDF needs rdflib; {INSTALL}") from None
     data = read_bytes(path)
     begin = data.lstrip()[:5]
     # N-Triples is a part of Turtle

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
+from railfix.core.notebook import NotebookTable
 from railfix.kernels.tracking.index import TrackStatus as TrackStatus
 from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind
@@ -23,8 +24,8 @@ def is_bounded(status: Codes) -> Masks:
     return np.asarray(_IS_BOUNDED[status])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Tracked:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Tracked(NotebookTable):
     """Places of T epochs; NaN where there is none."""
 
     time: Datetimes  #: Shape (T,).

@@ -178,8 +178,9 @@ def hold_signs(
 ) -> tuple[Masks, Masks, HeldState]:
     """Return which conditions have been true for their time, which within their time of release, and the state.
 
-    An interval between epochs counts for half the time of holding at most, so that one epoch after a gap proves
-    nothing. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a time of holding of 0
+    An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
+    sufficient. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a time of holding of
+    0
     counts at once.
     """
     conditions = signs.shape[1]
@@ -209,7 +210,8 @@ class PowerState:
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
     #: Peak of C/N0 plus the decay since the GPS epoch; -inf before the first; shape (K,).
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
-    #: When its present time of tracking began, and its last observation, since the GPS epoch; NaN before; shape (K,).
+    #: Begin of the present tracking of each channel, and its last observation, since the GPS epoch; NaN before; shape
+    #: (K,).
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
     gain: float = -np.inf  #: Peak of the gain's logarithm plus the decay since the GPS epoch.

@@ -26,7 +26,9 @@ from pydantic import Field, model_validator
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.settings import Settings, read_toml, validate
+from railfix.core.notebook import NotebookTable
+from railfix.core.settings import Settings, validate
+from railfix.core.settings_files import read_toml
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
 #: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.
@@ -88,8 +90,8 @@ class AraimLevels:
     unmonitored: Floats  #: Probability of faults that are not modes, or leave no position; shape (T,).
 
 
-@dataclass(frozen=True, kw_only=True)
-class AraimResult:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class AraimResult(NotebookTable):
     """ARAIM of T epochs; NaN without a position."""
 
     along: AraimLevels  #: Along the track, with the map as a constraint.

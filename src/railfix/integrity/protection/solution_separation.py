@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
+from railfix.core.notebook import NotebookTable
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 
@@ -49,7 +50,7 @@ class Cause(IntEnum):
     NO_POSITION = 5
     #: Three of these at a time, or more.
     THREE_FAULTS = 6
-    #: Infinite: local faults cannot be bounded at this place of the line.
+    #: Infinite: local faults cannot be bounded on this part of the line.
     UNBOUNDED = 7
     #: As `UNCHECKED`, mostly faults of a constellation, alone or with satellites.
     UNCHECKED_CONSTELLATION = 8
@@ -61,8 +62,8 @@ class Cause(IntEnum):
     UNCHECKED_TOGETHER = 11
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProtectionLevel:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ProtectionLevel(NotebookTable):
     """Levels along the track of T epochs; NaN without a position."""
 
     #: Level at which all tails together stay within the risk; at most the largest of the three parts, whose allocations
@@ -358,7 +359,9 @@ class LevelStatus(IntEnum):
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """LevelStatus of epochs, int8 of shape (T,), from protection levels [m], NaN without a position.
+    """Return the `LevelStatus` of epochs by their levels and an alarm limit (P1 2.4), int8 of shape (T,).
+
+    Levels [m] are NaN without a position.
 
     An epoch with a position and without consistency (`ProtectionLevel.consistent`) alarms.
     """

@@ -203,7 +203,8 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
 
     A subset is excluded when the rest passes and has `min_redundancy` degrees of freedom left, and when each of its
     satellites is in error against the rest: by more than noise of its sigma reaches (chi-square mode), by more than the
-    square root of the limit (fixed mode). One goes before two; of several the least statistic. Where another subset of
+    square root of the limit (fixed mode). A single exclusion is preferred to a pair; of several the one with the least
+    statistic. Where another subset of
     the same size would be excluded as well and fits worse by no more than noise explains (`separation_risk`), the epoch
     is inseparable. The noise scale, shape (T,) or (), is that of `detect`.
     """

@@ -53,7 +53,7 @@ class Selection:
 
 
 class BlockReader:
-    """Reader of one file in file order; knows its last tag, number of epochs and fraction read.
+    """Reader of one file in file order, with its last tag, number of epochs and fraction read.
 
     A cut last record is left out with a note.
     """

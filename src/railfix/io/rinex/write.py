@@ -17,8 +17,9 @@ from typing import IO, Final, Literal, cast, get_args
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
-from railfix.core.errors import OutputError
-from railfix.core.files import FilePath, hatanaka_program, stage_file
+from railfix.core.errors import OutputError, check_type
+from railfix.core.files import FilePath, hatanaka_program
+from railfix.core.staged_files import stage_file
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.observations_lines import KINDS
 
@@ -156,6 +157,8 @@ def write_observations(
     OutputError
         The file cannot be written.
     """
+    if not isinstance(observations, Iterable):
+        check_type(observations, Observations, "observations")
     pieces = iter([observations] if isinstance(observations, Observations) else observations)
     first = next((piece for piece in pieces if len(piece)), None)
     if first is None:

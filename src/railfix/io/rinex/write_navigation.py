@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, take_rows
 from railfix.core.constants import BDT_MINUS_GPST_S
+from railfix.core.errors import check_type
 from railfix.core.files import FilePath
 from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_to_utc, seconds, timedelta, to_week
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
@@ -67,6 +68,7 @@ def write_navigation(
     """
     if packing is not None and packing.startswith("crx"):
         raise ValueError("navigation files have no Hatanaka form; use packing 'plain' or 'gz'")
+    check_type(navigation, Navigation, "navigation")
     kepler, glonass = navigation.kepler, navigation.glonass
     letters = sorted({str(s)[0] for s in (*kepler.satellite, *glonass.satellite)})
     kind = letters[0] if len(letters) == 1 else "M"

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.observation_model import IntegerChannels, Linearised, OwnUnknowns, PhaseClocks, Phases
@@ -75,8 +76,8 @@ class ArcAmbiguities:
     covariance_m2: Floats  #: From noise alone, without the map error; shape (A, A).
 
 
-@dataclass(frozen=True, kw_only=True)
-class PhasePositions:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class PhasePositions(NotebookTable):
     """Positions along the line from code and phase, T epochs by M channels."""
 
     #: Along the trajectory, within its ends; NaN without an initial position or enough satellites; shape (T,).

@@ -91,7 +91,8 @@ class Linearised:
     phase_clock_m: Floats
     known: Floats  #: Prior information: errors of the map, ties between clocks; shape (T, P, P).
     inverse: Floats  #: Inverse of the normal matrix of the own unknowns, shape (T, P, P).
-    right: Floats  #: Right-hand side of the own unknowns, of the codes until `shift_phases`; shape (T, P).
+    #: Right-hand side of the additional unknowns; of the codes alone before `shift_phases`; shape (T, P).
+    right: Floats
     coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
     prior: Floats  #: Information of the map's errors, shape (2,) [1/m^2].
 

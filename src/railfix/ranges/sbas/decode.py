@@ -1,6 +1,6 @@
 """SBAS messages decoded by tables of bit fields (RTCA DO-229D, A.4.4), in SI units; nothing is applied here.
 
-Every decoder returns arrays by name, all with n rows, among them `row`: the message that each row comes from.
+Every decoder returns arrays by name, all with n rows; `row` is the message that each row comes from.
 """
 
 from __future__ import annotations

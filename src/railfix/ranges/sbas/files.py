@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from os import PathLike
 from typing import Final
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Bytes, Integers
 from railfix.core.errors import InputFileError
-from railfix.core.files import BrokenLines, FilePath, read_text_lines
+from railfix.core.files import BrokenLines, FilePath, path_names, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
 from railfix.io.file_kind import find_kind, wrong_kind
 from railfix.io.receiver.framing import SbasFrames
@@ -223,13 +222,10 @@ def read_sbas(
     InputFileError
         A file is missing or of another kind, (stop) a line is broken, or no message is left.
     """
-    files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
-    if not files:
-        raise ValueError("at least one SBAS file is needed")
+    sources = tuple(path_names(paths))
     gathered = _Gathered()
-    for number, path in enumerate(files):
-        _read_file(str(path), number, broken_lines, gathered, band)
-    sources = tuple(str(path) for path in files)
+    for number, path in enumerate(sources):
+        _read_file(path, number, broken_lines, gathered, band)
     if not gathered.raw:
         raise InputFileError(
             ", ".join(sources), f"holds no SBAS message of {band} that can be read (setting sbas_band)"

@@ -11,6 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, freeze_rows, join_rows
 from railfix.core.checksums import crc24q
+from railfix.core.notebook import NotebookTable
 
 Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections.
 #: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.
@@ -65,8 +66,8 @@ def message_type(bits: Bytes, band: Band = "L1") -> Integers:
     return second >> 2 if band == "L1" else (bits[:, 0].astype(np.int64) & 15) << 2 | second >> 6
 
 
-@dataclass(frozen=True, kw_only=True)
-class SbasMessages(RowArrays):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class SbasMessages(RowArrays, NotebookTable):
     """Messages that passed every check, N rows in the order of their reception."""
 
     #: GPS time at which the message had been received completely: from here on it may be used; shape (N,).

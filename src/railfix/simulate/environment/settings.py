@@ -177,7 +177,7 @@ class TreeSettings(ScenarioSettings):
     #: Width of a crown, and distance to the next.
     length_m: Between = (4.0, 9.0)
     gap_m: Between = (0.0, 6.0)
-    share: Share = 1.0  #: Fraction of the places with a tree.
+    share: Share = 1.0  #: Fraction of the planting positions with a tree.
     #: Specific attenuation, largest loss, and fraction of the lost amplitude that is scattered forward.
     attenuation_db_per_m: NotNegative = 1.0
     most_db: NotNegative = 12.0

@@ -20,8 +20,8 @@ _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between passes of one lin
 _APART_WIDTHS: Final = 3.0
 _MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must lie on the line.
 _SEAM_M: Final = 200.0  #: Distance over which the seam of two passes is evened out [m].
-#: Longer without any row [s] a run is followed over no more than a distance [m], and where it goes on in the direction
-#: of that distance: cosine of the largest angle.
+#: Longest gap without rows [s]; a longer one is bridged over at most a distance [m], and only where the run continues
+#: in its direction: cosine of the largest angle.
 _GAP_S: Final = 10.0
 BRIDGED_M: Final = 500.0
 _GOES_ON: Final = 0.9
@@ -193,9 +193,7 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Return one turn of a closed line: from point `start` to `end`, which is the same point; the gap is
-    distributed.
-    """
+    """Return one turn of a closed line: from point `start` to `end`, the same point; the gap is distributed."""
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
@@ -248,9 +246,7 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Return the fractional point of the course, direction (0: off the course) and distance to its right [m], shapes
-    (q,).
-    """
+    """Return the fractional course point, direction (0: off the course) and distance to its right [m], shapes (q,)."""
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
     count = min(_NEIGHBOURS, len(course))
@@ -319,9 +315,7 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
 def without_other_track(
     course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
 ) -> tuple[list[Pass], float]:
-    """Return the passes of the direction with more, where each has a separate track, and the distance of the tracks,
-    otherwise 0 [m].
-    """
+    """Return the passes of the more frequent direction on its own track, and the tracks' distance, else 0 [m]."""
     across: dict[int, Floats] = {}
     for sign in (1, -1):
         found = [
