@@ -540,7 +540,7 @@ def test_a_hundred_thousand_epochs(tmp_path: Path):
 
 def test_the_command_writes_every_table(tmp_path: Path):
     runs = campaign(tmp_path / "runs")[:2]
-    arguments = ["evaluate", *(str(run.run) for run in runs), "--out", str(tmp_path / "out"), "--beside-p1"]
+    arguments = ["evaluate", *(str(run.run) for run in runs), "--out", str(tmp_path / "out")]
     for number, run in enumerate(runs):
         file = tmp_path / f"reference{number}.csv"
         write_reference(file, run.reference)  # type: ignore[arg-type]
@@ -548,8 +548,6 @@ def test_the_command_writes_every_table(tmp_path: Path):
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "By configuration, its runs together" in result.output
-    assert "65.80" in result.output
-    assert "+3.00" in result.output
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert {entry["input"] for entry in written["inputs"]} == {"positions", "record", "reference"}
     for entry in written["inputs"]:

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 import railfix
 from railfix.cli.ground import app
+from railfix.report import plots
 from railfix.simulate import Scenario
 from railfix.track.trajectory import TRACK_AS_PATH
 from railfix.track.vector_file import read_layers
@@ -103,6 +104,10 @@ WRONG: dict[str, tuple[Callable[..., object], str]] = {
     ),
     "name of a run": (lambda _: railfix.evaluate_runs(["run"]), "expected RunAndReference, got str"),
     "report on a result": (lambda m: railfix.write_report([m["result"]], "a.html"), "path, or several, were expected"),
+    "picture of a result": (lambda m: plots.plot_plan(m["result"]), "expected a polars table, got Result; positions_t"),
+    "picture without errors": (
+        lambda m: plots.plot_error_over_time(railfix.positions_table(m["result"])), "the table lacks a column"
+    ),
     "scenario by name": (lambda _: railfix.write_run("city", "out"), "; load_scenario returns one"),
     "dataset by name": (lambda _: railfix.observations_from_xarray("a.nc"), "expected Dataset, got str"),
     "setting changed": (lambda m: setattr(m["config"], "min_satellites", 2), r"settings\.replaced\(min_satellites=2\)"),

@@ -37,6 +37,11 @@ from recordings_score import straight_line, trajectory_of
 from recordings_truth import smartloc_rinex_truth
 from signal_attacks import Scene
 
+#: Suspicions that count as seen, by that of an attack; positions that leave or contradict the map are no alarm.
+_ALARMS: Final = {
+    Suspicion.JAMMING_SUSPECTED: (Suspicion.JAMMING_SUSPECTED, Suspicion.SPOOFING_SUSPECTED),
+    Suspicion.SPOOFING_SUSPECTED: (Suspicion.SPOOFING_SUSPECTED,),
+}
 SINGLE: Final = parse_config({"filter": "off"})
 #: Trials of each attack.
 TRIALS: Final = 50
@@ -130,7 +135,7 @@ def trial(train: Train, attack: Attack, at: int, rng: np.random.Generator, *, ki
     start = at
     if kind is Suspicion.JAMMING_SUSPECTED:  # from 5 dB on
         start = int(np.argmax(np.nan_to_num(train.scene.observations.cn0_dbhz - attacked.cn0_dbhz).max(axis=1) >= 5.0))
-    after = np.flatnonzero((found >= kind) & (np.arange(len(found)) >= start))
+    after = np.flatnonzero(np.isin(found, _ALARMS[kind]) & (np.arange(len(found)) >= start))
     delay = float(train.scene.seconds[after[0]] - train.scene.seconds[start]) if len(after) else np.nan
     error = np.abs(result.chainage_m - train.chainage_m)
     promised = result.protection.status != int(LevelStatus.ALARM)
@@ -138,8 +143,14 @@ def trial(train: Train, attack: Attack, at: int, rng: np.random.Generator, *, ki
     silent = np.convolve(~promised[start:], np.ones(_SILENT), mode="valid") == _SILENT
     silence = float(np.argmax(silent)) if silent.any() else np.nan
     texts = {word for text in cause_text(result.interference.causes).tolist() for word in text.split("+") if word}
+    early = int(np.isin(found[:start], _ALARMS[Suspicion.JAMMING_SUSPECTED]).sum())
     return Trial(
-        delay, silence, int((found[:start] > 0).sum()), float(np.nanmax(error)), int(exceeded.sum()), frozenset(texts)
+        delay,
+        silence,
+        early,
+        float(np.nanmax(error)),
+        int(exceeded.sum()),
+        frozenset(texts),
     )
 
 
@@ -216,8 +227,9 @@ def clean_row(name: str, log: Observations, navigation: Navigation, line: Trajec
         motion.drift_jump_sigmas, motion.speed_jump_sigmas, motion.position_jump_sigmas, motion.part_sigmas,
         motion.off_line_sigmas,
     ]  # fmt: skip
+    alarms = int(np.isin(found.suspicion, _ALARMS[Suspicion.JAMMING_SUSPECTED]).sum())
     cells = " ".join(f"{abs(np.nanmax(one)):7.1f}" if np.isfinite(one).any() else "      -" for one in largest)
-    return f"{name:18} {len(log):6} {int((found.suspicion > 0).sum()):6} {cells}"
+    return f"{name:18} {len(log):6} {alarms:6} {cells}"
 
 
 def main() -> int:

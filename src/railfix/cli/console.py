@@ -21,7 +21,8 @@ from rich.text import Text
 from typer import echo
 
 from railfix import kernels
-from railfix.core.tables import Table, plural
+from railfix.core.notebook import plural
+from railfix.core.tables import Table
 from railfix.run.output import finite_values
 from railfix.run.record import budget_tables, level_basis
 
@@ -55,9 +56,7 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Print for each run and antenna the accuracy of its positions and whether its stated figures are true; the worst
-    first.
-    """
+    """Return each run's and antenna's accuracy and whether its stated figures are true; the worst first."""
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
@@ -218,9 +217,7 @@ def show_files(console: Console, paths: Iterable[Path]) -> None:
 
 @contextmanager
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
-    """Yield a progress bar on the standard error output, with the rate and the time left; silent where that is not a
-    terminal.
-    """
+    """Yield a progress bar on the standard error output, with rate and time left; silent without a terminal."""
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),

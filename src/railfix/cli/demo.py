@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from railfix.cli.console import (
     TableConsole,
@@ -18,11 +17,9 @@ from railfix.cli.console import (
     show_table,
 )
 from railfix.cli.options import OverwriteOption, VerboseOption, overwriting
-from railfix.core.tables import plural
-from railfix.evaluate import Evaluation
-from railfix.evaluate.tables import error_tables
+from railfix.core.notebook import plural
+from railfix.evaluate.tables import error_tables, level_tables
 from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import prior_basis_text
 from railfix.report import read_runs, write_page
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
@@ -95,41 +92,5 @@ def demo(
         show_notes(console, summary.notes)
         show_budget(console, summary)
         if evaluation is not None:
-            show_errors(evaluation)
-
-
-def show_errors(evaluation: Evaluation) -> None:
-    """Print errors along the line: on the map, of those that passed every check, and of the conventional position."""
-    console = TableConsole()
-    for table in error_tables(evaluation):
-        show_table(console, table)
-    show_levels(evaluation, console)
-
-
-def show_levels(evaluation: Evaluation, console: Console) -> None:
-    """Print the protection level of each antenna: median, availability, and errors above it."""
-    indicative = any(run.protection.get("basis") == "indicative" for run in evaluation.runs)
-    for kind, found in evaluation.integrity.items():
-        rows = found.stanford.filter(grouping="all", levels_of="usable", own_limit=True)
-        for row in rows.filter(rows["antenna"] != "all").iter_rows(named=True):
-            median = median_level(evaluation, kind, row["antenna"])
-            over = found.beyond.filter(antenna=row["antenna"])
-            named = "indicative protection level" if indicative else "protection level"
-            console.print(
-                f"{named} ({kind}), {row['antenna']}: median {'-' if median is None else f'{median:.2f} m'}, "
-                f"within the alarm limit of {row['alarm_limit_m']:g} m at "
-                f"{100 * (row['availability_of_observed'] or 0.0):.2f} % of the epochs with observations, errors over "
-                f"it: {int(over['usable'].sum())} of {row['judged']:,}, and "
-                f"{int((~over['usable']).sum())} where the run had raised an alarm or a doubt"
-            )
-    for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
-        console.print(f"protection level: {text}")
-
-
-def median_level(evaluation: Evaluation, kind: str, antenna: str) -> float | None:
-    """Return the median of the finite levels of the positions of status ok [m]; None without one."""
-    if evaluation.levels is None:
-        return None
-    wanted = {"antenna": antenna, "position": "constrained_ok", "level": f"{kind}_protection_level_m"}
-    found: float | None = evaluation.levels.filter(**wanted)["level_p50_m"].item()
-    return found
+            for table in (*error_tables(evaluation), *level_tables(evaluation, worst=5)):
+                show_table(console, table)

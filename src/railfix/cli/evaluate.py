@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final
 
-import polars as pl
 import typer
-from rich.console import Console
 
 from railfix.cli.console import (
     TableConsole,
@@ -31,13 +29,15 @@ from railfix.cli.options import (
 )
 from railfix.core.errors import SettingsError
 from railfix.core.settings import validate
-from railfix.core.tables import Column, listing, number, percent, plain_table, signed
+from railfix.core.tables import plain_table
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
 from railfix.evaluate.evaluation_inputs import POSITIONS_TABLE, TABLES, EvaluationInputs, list_position_tables
 from railfix.evaluate.range_errors import ModelInputs, StationBeside, error_model_from_runs
-from railfix.evaluate.tables import P1_COMMERCIAL, P1_TABLE_4, error_tables, group_tables, level_tables
+from railfix.evaluate.tables import error_tables, group_tables, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
-from railfix.ranges.cn0_curve import KINDS, Cn0Curve, CurveFit, write_cn0_curve
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve
+from railfix.ranges.cn0_curve_file import write_cn0_curve
+from railfix.ranges.cn0_curve_fit import CurveFit
 from railfix.ranges.cn0_curve_log import cn0_curve_from_log
 from railfix.ranges.error_model import LARGEST_PRIOR, ErrorModel, FaultRate, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, summary
@@ -56,7 +56,7 @@ _MOST_SECTIONS: Final = 20
 _MOST_BEYOND: Final = 5
 
 
-def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: Literal["nothing", "p1"]) -> None:
+def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
     """Figures of each run, then by groups, then where the files are."""
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
@@ -76,23 +76,7 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
         show_table(console, table)
     for table in group_tables(evaluation):
         show_table(console, table, most=_MOST_SECTIONS)
-    if beside == "p1":
-        _show_p1(console)
     show_files(console, files.values())
-
-
-def _show_p1(console: Console) -> None:
-    """The figures of the source paper."""
-    rate: Column = ("rate %", "rate", percent)
-    test_line = (("configuration", "configuration", str), rate, ("mean", "mean_m", signed), ("std", "std_m", number))
-    caption = "The source paper, test line (table 4)"
-    show_table(console, listing("p1", pl.DataFrame(P1_TABLE_4), test_line, caption))
-    caption = (
-        "The source paper, commercial lines with MSAS (5): rate of the section without tunnels (figure 10), "
-        "largest error of all (figure 11)"
-    )
-    commercial = (("position", "position", str), rate, ("max", "max_m", number))
-    show_table(console, listing("p1", pl.DataFrame(P1_COMMERCIAL), commercial, caption))
 
 
 @from_models
@@ -105,9 +89,6 @@ def evaluate(
     ] = None,
     files: Annotated[TrackFiles, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     options: EvaluationOptions,
-    beside_p1: Annotated[
-        bool, typer.Option("--beside-p1", rich_help_panel="Choices", help="Also show the results of the source paper.")
-    ] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -153,7 +134,7 @@ def evaluate(
         notes = [note for run in evaluation.runs for note in run.notes]
         print_json({"antennas": list_antenna_errors(evaluation), "notes": notes, "files": list(written.values())})
     else:
-        show_evaluation(evaluation, written, beside="p1" if beside_p1 else "nothing")
+        show_evaluation(evaluation, written)
 
 
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:

@@ -34,9 +34,7 @@ _LEAP_UTC: Final = np.array(
 
 
 def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
-    """Return a GPS time; ValueError where the value is no time, or has a time zone, which numpy would
-    convert to UTC.
-    """
+    """Return a GPS time; ValueError where it is no time, or has a time zone, which numpy would convert to UTC."""
     text = str(value).strip().replace(" ", "T")
     if re.search(r":.*([Zz]|[+-][\d:]+)$", text):
         raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind it by the leap seconds")
@@ -103,9 +101,7 @@ def gpst_to_utc(time: ArrayLike) -> Datetimes:
 
 
 def nearest_rows(time: ArrayLike, wanted: ArrayLike, *, within_ns: int) -> Indices:
-    """Return the row of rising times nearest to each requested one, the earlier of two; -1 where none is
-    near enough.
-    """
+    """Return the row of rising times nearest to each requested one, the earlier of two; -1 where none is near."""
     have, want = (np.asarray(each, dtype="datetime64[ns]").astype(np.int64) for each in (time, wanted))
     if not len(have):
         return np.full(len(want), -1, dtype=np.intp)

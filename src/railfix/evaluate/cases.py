@@ -11,7 +11,8 @@ from pydantic import Field
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_text
-from railfix.core.settings import Settings, load_settings, validate, write_toml
+from railfix.core.settings import Settings, validate
+from railfix.core.settings_files import load_settings, write_toml
 from railfix.evaluate.evaluation_inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
@@ -69,7 +70,7 @@ class CaseFile(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A case with its files where they are."""
+    """A case with the paths of its files."""
 
     name: str  #: Name of its folder.
     folder: Path
@@ -118,9 +119,7 @@ def write_case(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_cases(folder: Path) -> list[Case]:
-    """Read the cases in the subfolders of a folder, or the one in the folder itself, in order of their names
-    (`read_case`).
-    """
+    """Read the cases in the subfolders of a folder, or the one in the folder itself, by name (`read_case`)."""
     if not folder.is_dir():
         raise InputFileError(folder, "there is no such folder; expected one of folders with a case.toml")
     folders = (

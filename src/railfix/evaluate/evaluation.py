@@ -13,7 +13,7 @@ import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError, check_type
 from railfix.core.files import fingerprint
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.evaluate.accuracy import ALL, KEYS, USED, figures_by
 from railfix.evaluate.epoch_table import antenna_epochs, below
 from railfix.evaluate.evaluation_inputs import (
@@ -93,9 +93,7 @@ class Evaluation(NotebookTable):
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return one figure of the row with these values, by default of "all", own, constrained; otherwise
-        LookupError.
-        """
+        """Return one figure of the row with these values, by default "all", own, constrained; otherwise LookupError."""
         chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
         rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
         if len(rows) != 1:

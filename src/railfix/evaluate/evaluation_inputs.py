@@ -61,9 +61,7 @@ class RunFolder(RunRecord):
         return dict(self._line.get("chainage_of") or {})
 
     def turn_m(self, antenna: str) -> float:
-        """Length of a closed line by the chainage of an antenna [m]; infinite for other lines, and where no run states
-        it.
-        """
+        """Length of a closed line by an antenna's chainage [m]; infinite for others, and where no run states it."""
         turn = (self._line.get("turn_m") or {}).get(antenna)
         return float("inf") if turn is None else float(turn)
 

@@ -176,9 +176,7 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
 
 
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
-    """Return the stated probability and the fraction of right positions, by class; None without a table of
-    the filter.
-    """
+    """Return the stated probability and the fraction of right positions, by class; None without the filter."""
     filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
         return None

@@ -135,8 +135,7 @@ SAME_MAP_M: Final = 1.0
 SAME_TRAJECTORY_M: Final = 0.01
 #: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: A distance along the line that exceeds twice the error by this much leads to another pass, and is no chord of a curve
-#: [m].
+#: Excess of the distance along the line over twice the error, above which it belongs to another pass of the line [m].
 _ANOTHER_PASS_M: Final = 50.0
 #: Rounding of chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
@@ -186,9 +185,7 @@ def compute_errors(
     method: Literal["auto", "chainage", "trajectory"],
     files: TrackFiles,
 ) -> PlaceErrors:
-    """Return the errors of one antenna, by chainage where run and reference share a map within `SAME_MAP_M`, otherwise
-    along the trajectory.
-    """
+    """Return one antenna's errors, by chainage on a shared map (`SAME_MAP_M`), else along the trajectory."""
     _check_same_place(run, antenna, answers)
     against, trusted = _against_chainage(run, antenna, answers)
     turn = run.turn_m(antenna)
@@ -287,9 +284,7 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory of a run's positions, its files and notes; MismatchError: the positions do not lie on the
-    line.
-    """
+    """Return the trajectory of a run's positions, files and notes; MismatchError: the positions are off it."""
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")
     if not tracks:

@@ -233,9 +233,7 @@ def _where(rows: pl.DataFrame) -> list[Column]:
 
 
 def _pool_runs(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of all runs of a configuration together, or the rows of the runs where each has its own
-    configuration.
-    """
+    """Return the rows by configuration, or by run where each run has its own configuration."""
     runs = rows.filter(pl.col("run") != "all")
     several = "all" in rows["run"] and runs["run"].n_unique() > runs["configuration"].n_unique()
     return rows.filter(run="all") if several else runs
@@ -326,16 +324,6 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
     return listing(f"above-level-{kind}", shown, columns, caption)
 
 
-#: Results of P1 (3.3, table 4; 5, figures 10 to 12), for comparison on request.
-P1_TABLE_4: Final = (
-    {"configuration": "GPS only", "rate": 0.9909, "mean_m": 2.14, "std_m": 1.98},
-    {"configuration": "GPS+QZS", "rate": 0.9915, "mean_m": 1.97, "std_m": 1.99},
-    {"configuration": "L1-SAIF corrections", "rate": 0.9641, "mean_m": 0.88, "std_m": 1.83},
-)
-P1_COMMERCIAL: Final = (
-    {"position": "conventional", "rate": 0.867, "max_m": 65.8},
-    {"position": "constrained, all screens", "rate": 0.846, "max_m": 10.2},
-)
 #: Epochs beyond their level in ``evaluation.json``, the worst; the CSV file has all.
 MOST_BEYOND: Final = 200
 

@@ -88,9 +88,7 @@ def plausible_kepler(records: KeplerRecords) -> Masks:
 
 
 def plausible_glonass(records: GlonassRecords) -> Masks:
-    """Return the records whose radius, and semi-major axis by the energy integral, are plausible for GLONASS, shape
-    (n,).
-    """
+    """Return the records with a radius and (energy integral) semi-major axis of GLONASS, shape (n,)."""
     position = records.position_ecef_m
     turning = EARTH_ROTATION_RATE * np.stack([-position[:, 1], position[:, 0], np.zeros(len(position))], axis=1)
     radius = np.linalg.norm(position, axis=1)

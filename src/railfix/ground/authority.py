@@ -37,7 +37,7 @@ class Authority(Settings):
     stopped: bool  #: The train is ordered to stop.
     #: The end is one that the train is asked to accept instead of a farther one, if it can stop before it.
     shortens: bool = False
-    session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Start on board that `report` is of.
+    session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0  #: Identifier of the on-board start that `report` belongs to.
     overlap_cm: Number = 0  #: Way beyond the end that is kept for a train that passes it at release speed.
     #: Chainages, lower first, and highest speed [cm/s] of each speed restriction in the interval.
     restrictions: Annotated[tuple[SpeedPart, ...], Field(max_length=MOST_PARTS)] = ()

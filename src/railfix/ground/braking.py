@@ -43,9 +43,7 @@ class Target(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Gradients as steps: uphill in running direction positive, from one position to the next; level before
-    the first.
-    """
+    """Gradients as steps: uphill positive, from one position to the next; level before the first."""
 
     from_m: Sequence[float] = ()
     gradient: Sequence[float] = ()

@@ -84,9 +84,7 @@ class OrderDesk:
         return self._asked.get(key, (self.clock(), ""))[0]
 
     def release_train(self, values: Values, by: str) -> str | None:
-        """Release the stop of a train; as nothing confirms the position of a silent train, its release is ordered
-        twice.
-        """
+        """Release the stop of a train; for a silent train, whose position is unconfirmed, it is ordered twice."""
         train = number_of(values, "train")
         if isinstance(train, str):
             return train

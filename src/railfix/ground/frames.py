@@ -181,9 +181,7 @@ class FrameReceiver:
         return frame, frame
 
     def _begin(self, session: int) -> None:
-        """Begin with a new start of the sender, whose numbers and clock have another origin; late frames
-        are rejected.
-        """
+        """Begin a new start of the sender, with other origins of numbers and clock; late frames are rejected."""
         if self._session is not None:
             self._retired.append(self._session)
         self._session, self._accepted, self._links, self._shortest_ns = session, _Seen(), {}, None

@@ -156,9 +156,7 @@ class LinkProtocol(QuicConnectionProtocol):
         return self.certificate is not None and datetime.now(UTC) > self.certificate.not_valid_after_utc
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
-        """Process a packet; acknowledgements to a verified peer are delayed where possible, which halves packets and
-        work.
-        """
+        """Process a packet; delayed acknowledgements to a verified peer halve packets and work."""
         if self._handshakes is not None and not self._begun:
             self._begun = True
             self._handshakes.begin(self, str(addr[0]))

@@ -19,7 +19,7 @@ from railfix.ground.layout import Layout
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, with_train
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
-#: Difference of a reported length from the configured one that is rounding [m].
+#: Largest rounding difference between a reported and the configured length [m].
 LENGTH_ROUNDING_M: Final = 0.02
 #: Largest speed of a standing train; and against the facing, beyond which a train rolls back [m/s].
 STANDING_MPS: Final = 0.5
@@ -283,9 +283,7 @@ def _runs_by(report: PlacedReport) -> int | None:
 
 
 def stop_contradicted(report: PlacedReport, reason: str) -> TrainInterval:
-    """Return a train that is stopped, its interval extended to the reported position and to the authority
-    that it has.
-    """
+    """Return a train that is stopped, its interval extended to the reported position and to its authority."""
     (rear, front), d, noted = covered_m(report), report.known.direction, _noted(report)
     held = noted.end_m if report.held_m is None else report.held_m
     end, rear = d * max(d * noted.end_m, d * held), d * min(d * rear, d * held) if report.turns else rear
@@ -367,9 +365,7 @@ def _with_granted(state: Interlocking, message: TrainMessage) -> Interlocking:
 
 
 def _turn(known: TrainInterval, facing: int, rear: float, ahead: float, layout: Layout) -> TrainInterval:
-    """Return a train that has changed ends: no new authority; its earlier position and its authority remain
-    occupied.
-    """
+    """Return a train that has changed ends: no new authority; its earlier position and authority remain occupied."""
     held = ahead if known.held_end_m is None else known.held_end_m
     covered = facing * max(facing * ahead, facing * known.rear_m)
     back = facing * min(facing * rear, facing * known.front_m, facing * held)

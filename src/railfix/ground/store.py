@@ -212,9 +212,7 @@ class Store:
 
 
 def _time_outs(url: str) -> dict[str, Any]:
-    """Return options with which a connection fails rather than hangs: times to connect, for a statement, and for a dead
-    network.
-    """
+    """Return time-outs of a connection: to connect, for a statement, and for a dead network."""
     if url.startswith("postgresql"):
         return {"connect_timeout": 2, "tcp_user_timeout": 5000, "options": "-c statement_timeout=5000"}
     if url.startswith(("mysql", "mariadb")):

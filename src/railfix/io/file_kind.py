@@ -108,9 +108,7 @@ def wrong_kind(path: FilePath, expected: str) -> InputFileError:
 
 
 def has_times(path: FilePath) -> bool:
-    """Return whether a table or GPX file has properties of a log of positions that a track map lacks: times,
-    qualities.
-    """
+    """Return whether a table or GPX file has times or qualities, which a track map lacks."""
     head = read_head(path)
     names = _header_line(head).lower()
     return b"time>" in head or any(word in names for word in _OF_POSITIONS)

@@ -117,9 +117,7 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield bytes of a connection, which is opened again after growing waits when it breaks; empty bytes report that it
-    is open.
-    """
+    """Yield bytes of a connection, reopened after growing waits; empty bytes report that it is open."""
     broken, wait_s, ever_open = 0, settings.reconnect_first_s, False
     while True:
         reason = "the other end has closed the connection"

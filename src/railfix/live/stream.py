@@ -77,9 +77,7 @@ def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[ReceivedData]:
 
 
 def epoch_ends(buffer: Bytes) -> Indices:
-    """Return positions in the bytes after the messages that complete an epoch: RXM-RAWX, MeasEpoch, and the last MSM of
-    an epoch.
-    """
+    """Return offsets after messages that complete an epoch: RXM-RAWX, MeasEpoch, last MSM."""
     frames = find_frames(buffer, at_end=False)
     raw, msm = frames.of("ubx", ubx.RXM_RAWX), frames.of("rtcm3", *rtcm.MSM_NUMBERS)
     last = msm[rtcm.completes_epoch(frames, msm)]
@@ -250,9 +248,7 @@ class SensorLines:
         return tuple(cells)
 
     def _row(self, cells: list[str]) -> tuple[np.datetime64, Mapping[str, float | str]] | None:
-        """Return the time and values of a row, without values if it has the time alone; None for a line that is not a
-        row.
-        """
+        """Return the time and values of a row, no values if it has the time alone; None for another line."""
         if len(cells) != len(self.columns):
             return None
         given = dict(zip(self.columns, cells, strict=True))

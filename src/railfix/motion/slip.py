@@ -359,9 +359,7 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """At rest the force is the component of gravity; when released it falls toward zero, and the change is the
-        motion.
-        """
+        """At rest the force is the component of gravity; its fall toward zero at release is the motion."""
         limits = self.limits
         self._stood += dt
         if self.state == MotionState.STANDING and self._stood < _SETTLING_S:

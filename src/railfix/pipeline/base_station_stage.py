@@ -34,9 +34,7 @@ _SAME_PLACE_M: Final = 0.01
 
 
 class Stations(NamedTuple):
-    """Surveyed positions: units of two-way ranges, a base station ("stream": its position is in its
-    headers), balises.
-    """
+    """Surveyed positions: units of two-way ranges, a base station ("stream": by its headers), balises."""
 
     units: GroundUnits | None = None
     base_ecef_m: Floats | Literal["stream"] | None = None

@@ -176,9 +176,7 @@ def _lasting(
 
 
 def _integer_channels(corrected: CorrectedRanges) -> IntegerChannels:
-    """Return wavelengths, and the channels that share a clock and a signal; GLONASS has a frequency each:
-    no integers.
-    """
+    """Return wavelengths, and the channels that share a clock and a signal; GLONASS: no integers."""
     names = zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True)
     labels = ["" if name[0] == "R" else CLOCK_GROUP[name[0]] + signal for name, signal in names]
     _, group = np.unique(labels, return_inverse=True)

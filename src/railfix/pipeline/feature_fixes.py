@@ -142,9 +142,7 @@ def _fix_feature(
     facing: float,
     last: tuple[float, float, float] | None,
 ) -> FeatureFix | None:
-    """Compare the profile that was passed with a feature; `noise` is that of the position by the wheel, and of the
-    profile.
-    """
+    """Compare the passed profile with a feature; `noise` is of the wheel's position and of the profile."""
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
     # In rising arc length: for a vehicle that reverses or faces the other way the signs of pitch change, heading does

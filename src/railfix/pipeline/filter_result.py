@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Masks
-from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
+from railfix.core.notebook import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState
 from railfix.kernels.tracking import index as ix
@@ -122,9 +122,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
         return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return the number of epochs that have a position with a bound: ``1,890 of 2,000 epochs tracking or
-        coasting``.
-        """
+        """Return the number of epochs with a bounded position: ``1,890 of 2,000 epochs tracking or coasting``."""
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:

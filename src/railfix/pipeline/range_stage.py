@@ -23,9 +23,7 @@ from railfix.screens import Verdict, suspicion_sigma_m
 
 
 class Models(NamedTuple):
-    """Measured models: weights of the ranges that replace `Config.noise`, the curve of the screen "cn0", the support
-    message of ARAIM levels.
-    """
+    """Measured models: weights in place of `Config.noise`, C/N0 curve, support message of ARAIM levels."""
 
     error_model: ErrorModel | None = None
     cn0_curve: Cn0Curve | None = None

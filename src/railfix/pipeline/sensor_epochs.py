@@ -261,9 +261,7 @@ def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes) -> dict
 
 
 def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
-    """Return the position of the vehicle's ranging unit from the antenna: along, right and up of its path,
-    shape (3,).
-    """
+    """Return the ranging unit's position from the antenna: along, right and up of its path, shape (3,)."""
     facing = trajectory.front_sign
     along = facing * limits.range_ahead_m - ahead_m(trajectory)
     return np.array([along, facing * limits.range_right_m, limits.range_above_m])

@@ -304,9 +304,7 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Covariance of the antennas' positions, shape (3 A, 3 A): along-track and map errors are common, height and
-    mounting errors are not.
-    """
+    """Covariance of antenna positions, shape (3 A, 3 A); only along-track and map errors are common."""
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])
@@ -316,9 +314,7 @@ def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
-    """Return the covariance of all positions, shape (2 A, 2 A): common errors and the map's are equal for
-    all antennas.
-    """
+    """Return the covariance of all positions, shape (2 A, 2 A): common and map errors are equal for all antennas."""
     nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
     step = np.diff(nearest.points_m, axis=0)
     middle = nearest.points_m[:-1] + step / 2.0
@@ -371,9 +367,7 @@ class _Places:
 def _places(
     points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
 ) -> _Places:
-    """Likelihood of antenna positions on a track and at shifts across it; without shifts beyond the ends of
-    the track.
-    """
+    """Likelihood of antenna positions on a track and at shifts across it; none beyond the ends of the track."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
     dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
     line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)

@@ -21,8 +21,8 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.epoch_rows import EVERY
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
-from railfix.core.tables import NotebookTable
 from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.second_codes import SecondCodes
 
@@ -165,7 +165,7 @@ def ionosphere_free(
 ) -> Combined:
     """Return the ionosphere-free combination of two codes, with the test of their difference by `combine_codes`.
 
-    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise no epoch before makes less. `delays_m` are the group delays that
+    ``P = (ratio P1 - P2) / (ratio - 1)``, whose noise is not smoothed over epochs. `delays_m` are the group delays that
     the corrections contain already, of the first and the second code, shapes (T, K).
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)

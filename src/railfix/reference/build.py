@@ -238,9 +238,7 @@ class _ReferenceBuilder:
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:
-        """Dopplers that can be projected on this antenna's path: its own, and those of the other antenna where a
-        vehicle links the two.
-        """
+        """Dopplers that project on this antenna's path: its own, and the other antenna's on one vehicle."""
         tied = self.trajectory.body_chainage_m is not None
         return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
 

@@ -182,9 +182,7 @@ def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
 
 
 def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
-    """Check the rows of one antenna by their distance to the other antenna's position at the same instant (P2 3.3: 5
-    cm); return the reasons.
-    """
+    """Check one antenna's rows by their distance to the other's at that instant (P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     there, place = other.time[rows], other.ecef_m[rows]
@@ -262,9 +260,7 @@ def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, 
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
-    """Check the rows by their distance to the trajectory; return the reasons with their position along it and its
-    standard deviation.
-    """
+    """Check rows by their distance to the trajectory; return reasons, positions along it and their sigmas."""
     rows = fixes.good
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))

@@ -281,9 +281,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the random error of the wheel from the closing errors, without its scale error [m per square
-    root of m].
-    """
+    """Return the wheel's random error from the closing errors, without its scale error [m per square root of m]."""
     moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
@@ -334,9 +332,7 @@ def assemble_reference(
     settings: ReferenceSettings,
     facts: dict[str, Any],
 ) -> Built:
-    """Return the reference trajectory of one antenna: positions of fixes, smoothed between them; `excess` (G - 1,) in
-    sigmas.
-    """
+    """Return one antenna's reference trajectory: fixes, smoothed between them; `excess` (G - 1,) in sigmas."""
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))
     is_fix = np.zeros(len(time), dtype=np.bool_)

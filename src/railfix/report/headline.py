@@ -6,11 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from railfix.core.tables import number, share
 from railfix.evaluate import Evaluation
 from railfix.evaluate.accuracy import PASSED
+from railfix.evaluate.evaluation_inputs import floats
 from railfix.report.runs import ReportedRun, get_figures
 from railfix.run.verdict import POSITIONS, judge_run
 
@@ -106,7 +108,7 @@ def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
 
 def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> str:
     """Return how many usable errors exceed their level, or without levels how the errors compare with the sigma."""
-    kinds = {run.folder.level_kind: run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
+    kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
         len(evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=name, antenna=antenna))
         for kind, name in kinds.items()
@@ -150,9 +152,10 @@ def _describe_marked(errors: pl.DataFrame | None) -> list[str]:
     if not len(marked):
         return []
     statuses = ", ".join(status.replace("_", " ") for status in marked["status"].unique(maintain_order=True))
+    largest = number(float(np.abs(floats(marked, "error_m")).max()), 1, " m")
     return [
         f"{len(marked):,} further positions failed a check and carry its status ({statuses}); their largest "
-        f"error is {number(marked['error_m'].abs().max(), 1)} m. They are drawn, but not counted above."
+        f"error is {largest}. They are drawn, but not counted above."
     ]
 
 

@@ -19,7 +19,7 @@ import polars.selectors as cs
 
 from railfix import __version__
 from railfix.core.errors import NoPositionError, OutputError, needs_extra
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
@@ -265,5 +265,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """Return the columns of a table of the schema in their order; those that railfix has not are empty."""
+    """Return the columns of a table of the schema in their order; those without a value in railfix are empty."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

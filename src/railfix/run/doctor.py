@@ -40,9 +40,7 @@ Kind = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class FileFinding:
-    """Properties of one file: kind, facts in words, span in GPS time and position (ECEF, shape (3,) [m])
-    where known.
-    """
+    """Properties of one file: kind, facts, span in GPS time and position (ECEF, shape (3,) [m]) where known."""
 
     path: Path
     kind: Kind
@@ -82,9 +80,7 @@ class Diagnosis:
 
 
 def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
-    """Read each file as every kind until one fits, and compare them with each other; InputFileError where one is
-    missing.
-    """
+    """Read each file as every kind until one fits, and compare them; InputFileError where one is missing."""
     for path in paths:
         if path.is_dir():
             raise InputFileError(path, "is a folder; name the files in it")
@@ -98,9 +94,7 @@ def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -
 
 
 def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
-    """Return the properties of a file: its content determines the kind, and the reader of that kind reports
-    its faults.
-    """
+    """Return the properties of a file: its content determines the kind, whose reader reports its faults."""
     errors: list[str] = []
     kinds = _find_kinds(path)
     for kind in kinds:

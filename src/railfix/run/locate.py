@@ -13,8 +13,8 @@ import polars as pl
 
 from railfix.core.arrays import Floats, join_rows
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
-from railfix.core.files import write_whole
 from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.staged_files import write_whole
 from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
@@ -358,9 +358,7 @@ def _features(rows: pl.DataFrame) -> list[Feature]:
 
 
 def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
-    """Return features at the middle of their change: the change of a transition curve is flat, and noise would choose a
-    point on it.
-    """
+    """Return features at the middle of their change, which noise cannot shift on a flat transition."""
     lag = max(round(BASE_M / STEP_M), 1)
     found = []
     for feature in features:

@@ -132,9 +132,7 @@ def standstill_codes(
 
 
 def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
-    """Return observed minus computed codes at a position, with the Earth's rotation during transit; NaN
-    where unused.
-    """
+    """Return observed minus computed codes at a position with the Earth's rotation during transit; NaN: unused."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
     return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)

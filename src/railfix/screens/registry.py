@@ -8,7 +8,8 @@ from importlib.metadata import entry_points
 from typing import Any, Final
 
 from railfix.core.errors import SettingsError
-from railfix.screens.base import ObservationScreen, PairScreen, PositionScreen, Screen
+from railfix.screens.base import ObservationScreen, Screen
+from railfix.screens.pairs import PairScreen, PositionScreen
 
 #: Group of entry points.
 GROUP: Final = "railfix.screens"
@@ -26,9 +27,7 @@ def _rank(screen: Screen[Any]) -> int:
 
 
 def _find_installed() -> list[Screen[Any]]:
-    """Load the screens of installed packages; SettingsError where an entry point is no screen, or has the name of
-    another one.
-    """
+    """Load the screens of installed packages; SettingsError: one is no screen, or its name is taken."""
     found: list[Screen[Any]] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         package = entry.dist.name if entry.dist else "?"

@@ -93,9 +93,7 @@ class Alignment(Knots):
         return CubicHermiteSpline(chainage, place, tangent, axis=0)
 
     def at(self, chainage_m: ArrayLike) -> Floats:
-        """Return the points of the curve, shape (..., 3) ECEF [m]; beyond the ends its first and last pieces
-        continue.
-        """
+        """Return points of the curve, shape (..., 3) ECEF [m]; its first and last pieces continue beyond the ends."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64)))
 
     def tangent_at(self, chainage_m: ArrayLike) -> Floats:

@@ -83,7 +83,7 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     """Indices of a satellite in force from `first` to `last`, by transmission; none where a moment is not served."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
-    # Of records sent at one time the record for the later time.
+    # Of records sent at the same time, the one with the later reference time.
     rows = rows[np.append(np.diff(records.transmitted[rows]) > np.timedelta64(0, "ns"), True)]
     sent = records.transmitted[rows]
     begin, end = (int(np.searchsorted(sent, time, side="right")) for time in (first, last))

@@ -19,8 +19,9 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
-from railfix.ranges.atmosphere import rtca_mapping, thin_shell_obliquity
+from railfix.ranges.atmosphere import thin_shell_obliquity
 from railfix.ranges.sbas.ionosphere import EARTH_RADIUS_KM, pierce_point
+from railfix.ranges.sbas.troposphere import rtca_mapping
 from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 
@@ -58,7 +59,7 @@ class Interpolated:
         return np.asarray(b + u / 2.0 * ((c - a) + u * (2.0 * a - 5.0 * b + 4.0 * c - d + u * (3.0 * (b - c) + d - a))))
 
     def rate(self, time_s: Floats) -> Floats:
-        """Return the rates of change a second, shape (T, C)."""
+        """Return the rates of change per second, shape (T, C)."""
         a, b, c, d, u = self._place(time_s)
         slope = (c - a) + u * (2.0 * (2.0 * a - 5.0 * b + 4.0 * c - d) + 3.0 * u * (3.0 * (b - c) + d - a))
         return np.asarray(slope / 2.0 / self._spacing_s)

@@ -13,7 +13,7 @@ import polars as pl
 
 from railfix.core.errors import OutputError, check_type
 from railfix.core.files import FilePath
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import write_navigation, write_observations
@@ -92,7 +92,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
 
 
 def _list_effects(scenario: Scenario) -> str:
-    """Return one sentence a group of errors: on, or none."""
+    """Return one sentence per group of errors: its size, or that it is off."""
     usual = Scenario().errors
     names = list(type(usual).model_fields)
     errors = [name for name in names if getattr(scenario.errors, name) != getattr(usual, name)]

@@ -223,7 +223,7 @@ class DrawnSlips(ScenarioSettings):
     slip_chance: Share = 0.0
     slide_chance: Share = 0.0
     ratio: Share = 0.3  #: Largest ratio, see `SlipInterval`; uniform between a fifth of it and all.
-    #: Longest; uniform between a fifth of it and all, and never longer than the acceleration.
+    #: Longest duration; drawn uniformly between a fifth of it and all of it, at most that of the acceleration.
     duration_s: Positive = 3.0
 
 

@@ -260,9 +260,7 @@ def find_operation(crs: str) -> Transformer | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Operations:
-    """Operations of PROJ between two systems over a box: usable operations, best first, and operations with missing
-    grids.
-    """
+    """PROJ's operations between two systems over a box: usable ones, best first, and ones with missing grids."""
 
     usable: tuple[Transformer, ...]
     lacking: tuple[Any, ...] = ()
@@ -299,9 +297,7 @@ def name_operation(description: str, crs: str | None = None) -> str:
 
 
 def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operations:
-    """Find PROJ's operations between two systems, never a ballpark one; over a box those whose area of use contains it,
-    best first.
-    """
+    """Find PROJ's operations between two systems but ballpark ones, whose area of use contains a box, best first."""
     area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of grids that are not installed, which are named here

@@ -165,9 +165,7 @@ class ProfileElement:
 
     @cached_property
     def _clothoid(self) -> tuple[Floats, Floats, Floats]:
-        """Distances, heights over the start and gradients of a clothoid, whose angle grows with the square of its
-        length.
-        """
+        """Distances, heights above the start, gradients of a clothoid, with an angle by the square of its length."""
         start, turn = np.arctan(self.first), np.arctan(self.last) - np.arctan(self.first)
         length = self.length_m
         for _ in range(20):  # the length along the curve whose projection is that in plan
@@ -242,9 +240,7 @@ def plan_starts(plan: Sequence[Plan]) -> Floats:
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return the rows and number of each element that contains the distances: the last that begins before, otherwise
-    the first.
-    """
+    """Return rows and numbers of the elements at the distances: the last that begins before, or the first."""
     if not len(starts):
         return []
     index = np.maximum(np.searchsorted(starts, place_m, side="right") - 1, 0)
@@ -257,9 +253,7 @@ def alignment_points(
     cant: Sequence[CantElement],
     at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Points of an alignment such that chords stay within 1 cm of its arcs, and additional points; notes on joints that
-    do not meet.
-    """
+    """Points of an alignment with chords within 1 cm of its arcs, further points, notes on open joints."""
     starts = plan_starts(plan)
     length = starts[-1] + plan[-1].length_m
     places = [np.array([0.0, length]), np.asarray(at_m, dtype=np.float64)]

@@ -18,7 +18,7 @@ import scipy
 from railfix.core.arrays import Floats, Indices, Integers, RowArrays, join_rows, places_in_groups, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.track.route import Segment, one_frame, sigma_of_files
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 from railfix.track.trajectory import NearestOnPolyline, project_on_segments
@@ -301,9 +301,7 @@ class Network(NotebookTable):
         return self.names.index(name)
 
     def ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
-        """Lengths and paths from a node, first near it and, where the track is not found there, in the whole
-        network.
-        """
+        """Lengths and paths from a node, first near it, else in the whole network."""
         import networkx as nx
 
         for cutoff in (_NEAR_WAY_M, None):

@@ -2,8 +2,9 @@
 
 A hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818) whose state is a track near the position, a
 track that the map lacks, and the common error of the positions: a first-order Gauss-Markov process east, north and up,
-on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). What is left of each position has heavy tails (Student's
-t) and lasts for `correlation_s`, of which each position has its share. A track that the map lacks runs beside the
+on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The remaining error of each position has heavy tails
+(Student's t) and persists for `correlation_s`; the likelihood of a position is weighted by the fraction of that time it
+stands for. A track that the map lacks runs beside the
 nearest one at a constant distance (`SHIFTS_M`), clear of all others, or is anywhere else.
 """
 
@@ -175,9 +176,7 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the equilibrium probabilities of the states of an urn, and its transition matrix after a time, from row to
-    column.
-    """
+    """Return an urn's equilibrium probabilities and transition matrix after a time, from row to column."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)

@@ -69,9 +69,7 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions, given in the frame of the satellites, in that of the network; otherwise
-        MismatchError.
-        """
+        """Return positions in the satellites' frame in that of the network; otherwise MismatchError."""
         _check_region(network, self)
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):

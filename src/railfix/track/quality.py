@@ -14,9 +14,10 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import check_type
+from railfix.core.notebook import NotebookTable, plural
 from railfix.core.settings import Settings
-from railfix.core.tables import NotebookTable, plural
-from railfix.track.track import HEIGHTS_M, Geometry, Track, compute_geometry, kilometrage_breaks, mean_gradients
+from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
+from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.
@@ -24,7 +25,7 @@ _LEAST_CANT_M: Final = 5e-4  #: Cant of less than this everywhere was meant to b
 _NEAR_DUPLICATE_M: Final = 0.10  #: Points nearer than this are the same point measured twice.
 _CURVED_1PM: Final = 1 / 3000  #: Curvature of less than this is straight [1/m].
 _ADVERSE_M: Final = 0.005  #: Cant of less than this has no side [m].
-_CENTIMETRE_M: Final = 0.01  #: Distance of a chord from its arc that `needed_spacing_m` is for [m].
+_CENTIMETRE_M: Final = 0.01  #: Largest distance of a chord from its arc, from which `needed_spacing_m` follows [m].
 #: A turn at a point of more than this and sharper than `least_radius_m` is a kink.
 _KINK_DEG: Final = 3.0
 _SHARP_KINK_DEG: Final = 15.0  #: A kink of more than this is an error, otherwise a warning.

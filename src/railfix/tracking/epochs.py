@@ -139,7 +139,7 @@ class SensorEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """The last epoch: what a change of the carrier phase is taken from."""
+    """The last epoch, from which changes of the carrier phase are computed."""
 
     channel: Strings  #: Shape (K,).
     sat_ecef_m: Floats  #: Shape (K, 3).

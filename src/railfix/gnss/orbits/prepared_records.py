@@ -123,9 +123,7 @@ _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 
 
 class _Issues:
-    """Records by satellite and issue, each valid from half-way between the preceding toe and its own; F/NAV before
-    I/NAV.
-    """
+    """Records by satellite and issue, each valid from half-way after the preceding toe; F/NAV before I/NAV."""
 
     def __init__(self, kepler: KeplerRecords) -> None:
         row = np.isin(kepler.message, ("LNAV", "INAV", "FNAV", "CNV1")).nonzero()[0]
@@ -245,9 +243,7 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
 
 
 def group_delay_sigma_m(records: KeplerRecords, signal: str) -> Floats:
-    """Return the sigma of a group delay that LNAV lacks a part of (L2C and L5 without ISC), shape (n,) [m];
-    otherwise 0.
-    """
+    """Return the sigma of a group delay without ISC (L2C and L5 by LNAV), shape (n,) [m]; otherwise 0."""
     lacking = np.isin(records.satellite.astype("<U1"), ["G", "J"]) & (records.message == "LNAV")
     return np.where(lacking, _WITHOUT_ISC_M.get(signal[:1], 0.0) * (signal not in _P_CODES), 0.0)
 

@@ -210,7 +210,8 @@ class PowerState:
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
     #: Peak of C/N0 plus the decay since the GPS epoch; -inf before the first; shape (K,).
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
-    #: When its present time of tracking began, and its last observation, since the GPS epoch; NaN before; shape (K,).
+    #: Begin of the present tracking of each channel, and its last observation, since the GPS epoch; NaN before; shape
+    #: (K,).
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
     gain: float = -np.inf  #: Peak of the gain's logarithm plus the decay since the GPS epoch.

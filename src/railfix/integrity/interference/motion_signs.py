@@ -191,7 +191,7 @@ def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floa
 
 
 def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return the distance from where the last position and velocity lead to, beyond a train's reach; also in sigmas."""
+    """Return the distance from the position extrapolated by the last velocity, less a train's reach; also in sigmas."""
     dt = seconds(now.time - before.time)
     velocity = np.where((moving.time == before.time)[:, None], moving.velocity_mps[:, :3], np.nan)
     slow = np.isnan(velocity[:, 0])

@@ -51,9 +51,7 @@ _FRAME_S: Final = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """Subframes of unfinished records: `latest` identifies the last record (`issued`); `waiting` are GLONASS
-    satellites.
-    """
+    """Unfinished records: `latest` identifies the last record (`issued`); `waiting` are GLONASS satellites."""
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -196,7 +194,7 @@ class _EphemerisBuilder:
                 self.issue(self._glonass(satellite, after, within=_FRAME_S), after)
 
     def issue(self, record: Record | None, time: np.datetime64) -> None:
-        """Append a record, unless it is the satellite's last one of that message again or cannot be."""
+        """Append a record unless it repeats the satellite's last one of that message or is implausible."""
         if record is None:
             return
         raw, issue = record

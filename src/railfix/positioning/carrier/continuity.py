@@ -44,9 +44,7 @@ def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
 
 
 def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
-    """Return the row of each channel in the previous epoch, shape (M,); -1, the NaN appended to values, for new
-    ones.
-    """
+    """Return each channel's row in the previous epoch, shape (M,); -1, a NaN appended to values, for new ones."""
     row = {key: i for i, key in enumerate(before)}
     return np.array([row.get(key, -1) for key in now], dtype=np.intp)
 
@@ -245,9 +243,7 @@ def _reject_jumps(
 
 @dataclass(frozen=True)
 class _ContinuityFit:
-    """Residuals of all channels, with their size in sigmas (of the residual for kept channels, of the prediction for
-    others).
-    """
+    """Residuals of all channels, and in sigmas (of the residual if kept, else of the prediction)."""
 
     residual: Floats
     size: Floats

@@ -99,9 +99,7 @@ class SbasCorrections:
     def from_log(
         cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best", limits: SbasLimits | None = None
     ) -> SbasCorrections:
-        """Corrections from recorded messages of the requested PRN or of `best_prn`; ValueError: no message of that PRN
-        exists.
-        """
+        """Corrections from messages of the requested PRN or of `best_prn`; ValueError: there are none."""
         prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.describe_choice(prn))
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
         corrections.notes += tuple(corrections._leave_out(messages.of(prn)))

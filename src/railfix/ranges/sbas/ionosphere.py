@@ -378,9 +378,7 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Return the weights of the corners (M, 4), and where they are valid: four good corners, or three around the
-    position.
-    """
+    """Return the corners' weights (M, 4) and validity: four good corners, or three around the position."""
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)

@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, cast
 
 import numpy as np
+import polars as pl
+from polars.exceptions import ColumnNotFoundError
 
-from railfix.core.files import stage_file
+from railfix.core.errors import SettingsError
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import timedelta
 from railfix.report.plots.chart import (
     BLUE,
@@ -40,10 +43,19 @@ _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
 
 def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
     """Return a function that draws the charts of another function, with its parameters and `ax`."""
+    own = signature(chart_of)
+    of_table = next(iter(own.parameters.values())).annotation == "pl.DataFrame"
 
     @wraps(chart_of)
     def draw(*args: Any, ax: Axes | None = None, **kwargs: Any) -> Axes:
-        return draw_chart(chart_of(*args, **kwargs), ax)
+        if of_table and args and not isinstance(args[0], pl.DataFrame):
+            hint = "positions_table and train_table of a result, and evaluations, have rows to filter by antenna"
+            raise SettingsError(f"{draw.__name__}: expected a polars table, got {type(args[0]).__name__}; {hint}")
+        try:
+            chart = chart_of(*args, **kwargs)
+        except ColumnNotFoundError as error:
+            raise SettingsError(f"{draw.__name__}: the table lacks a column ({error})") from None
+        return draw_chart(chart, ax)
 
     draw.__name__ = draw.__qualname__ = f"plot_{chart_of.__name__}"
     draw.__annotations__ = {**chart_of.__annotations__, "ax": "Axes | None", "return": "Axes"}
@@ -51,7 +63,6 @@ def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
         f"{chart_of.__doc__}\n\n    Drawn into the axes `ax`, or into a new figure; the axes are returned.\n    "
     )
     del draw.__wrapped__
-    own = signature(chart_of)
     ax = Parameter("ax", Parameter.KEYWORD_ONLY, default=None, annotation="Axes | None")
     draw.__signature__ = own.replace(parameters=[*own.parameters.values(), ax], return_annotation="Axes")  # type: ignore[attr-defined]
     return draw

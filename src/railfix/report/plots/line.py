@@ -247,9 +247,7 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Return chainage and distance [m] from the previous position, while the train moved; `prefix` begins the
-    columns.
-    """
+    """Return chainage and distance [m] from the previous position while moving; `prefix` begins the columns."""
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
         moved = distance > 0.0

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.geodesy import axes_at
-from railfix.core.tables import plural
+from railfix.core.notebook import plural
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.survey import equations as eq
 from railfix.track.survey.equations import Equations, ReferenceLine, RunColumns
@@ -107,9 +107,7 @@ def adjust(
 
 
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
-    """Return the weight of each row as a fraction of an independent position, by time and distance since the last row,
-    shape (n,).
-    """
+    """Return each row's fraction of an independent position, by time and distance since the last, shape (n,)."""
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
     by_time = since / np.maximum(2.0 * limits.correlation_s, 1e-9)
@@ -310,9 +308,7 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return points of an open line without points at its ends that do not lead on, which are noise of
-    standing runs.
-    """
+    """Return points of an open line without the points at its ends that are noise of standing runs."""
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:

@@ -193,9 +193,7 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Return one turn of a closed line: from point `start` to `end`, which is the same point; the gap is
-    distributed.
-    """
+    """Return one turn of a closed line: from point `start` to `end`, the same point; the gap is distributed."""
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
@@ -248,9 +246,7 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Return the fractional point of the course, direction (0: off the course) and distance to its right [m], shapes
-    (q,).
-    """
+    """Return the fractional course point, direction (0: off the course) and distance to its right [m], shapes (q,)."""
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
     count = min(_NEIGHBOURS, len(course))
@@ -319,9 +315,7 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
 def without_other_track(
     course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
 ) -> tuple[list[Pass], float]:
-    """Return the passes of the direction with more, where each has a separate track, and the distance of the tracks,
-    otherwise 0 [m].
-    """
+    """Return the passes of the more frequent direction on its own track, and the tracks' distance, else 0 [m]."""
     across: dict[int, Floats] = {}
     for sign in (1, -1):
         found = [
