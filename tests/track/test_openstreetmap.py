@@ -205,7 +205,7 @@ def test_all_that_a_map_without_heights_needs_is_asked_for_at_once(tmp_path: Pat
     rasterio = pytest.importorskip("rasterio")
     path = tmp_path / "area.osm"
     path.write_text(_xml())
-    with pytest.raises(InputFileError, match=r"--heights log .*FILE.*--height-datum.*--height-sigma.*--geoid"):
+    with pytest.raises(InputFileError, match=r"--heights.* log.*file.*--height-datum.*--height-sigma.*--geoid"):
         track_of_segments(read_segments(path, MapReading())[:1])
     raster = tmp_path / "ground.tif"
     with rasterio.open(

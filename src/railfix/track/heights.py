@@ -163,7 +163,9 @@ def heights_of_file(heights_m: Floats, place: Georeference, reading: MapReading,
     check_height_datum(reading.height_datum)
     datum, geoid = own_height_datum(reading.crs, reading.height_datum, reading.geoid, path=path)
     if datum is None:
-        raise SettingsError(f"{path}: the height datum is missing; give --height-datum ellipsoidal or orthometric")
+        raise SettingsError(
+            f"{path}: the height datum is missing; give height_datum (--height-datum): ellipsoidal or orthometric"
+        )
     return ellipsoidal_heights(heights_m, place, datum=datum, geoid=geoid, path=path)
 
 
