@@ -87,6 +87,23 @@ def test_networks_orbits_and_maps_without_heights_are_no_problem(desk: Path, tmp
 
 
 @pytest.mark.requirement("A6")
+@pytest.mark.parametrize(("name", "datum"), [("a.kml", "orthometric --geoid egm96"), ("a.geojson", "ellipsoidal")])
+def test_heights_are_taken_as_the_format_defines_them(tmp_path: Path, name: str, datum: str) -> None:
+    """KML's altitudes are above EGM96 (OGC KML 2.3, 13.9); other formats leave it open."""
+    points = [[135.45, 35.05, 120.0], [135.451, 35.05, 120.0], [135.452, 35.05, 120.0]]
+    line = {"type": "Feature", "properties": {}, "geometry": {"type": "LineString", "coordinates": points}}
+    text = json.dumps({"type": "FeatureCollection", "features": [line]})
+    if name.endswith("kml"):
+        places = " ".join(",".join(map(str, point)) for point in points)
+        text = f"<kml xmlns='http://www.opengis.net/kml/2.2'><Placemark><LineString><coordinates>{places}"
+        text += "</coordinates></LineString></Placemark></kml>"
+    (tmp_path / name).write_text(text)
+    found = examine_files([tmp_path / name])
+    assert " ".join(found.findings[0].options) == f"--height-datum {datum}"
+    assert f"takes them as {datum.split()[0]}" in found.problems[0]
+
+
+@pytest.mark.requirement("A6")
 def test_a_map_with_errors_is_named_as_map_check_names_it(desk: Path, tmp_path: Path) -> None:
     head, *rows = (line for line in (desk / "line.csv").read_text().splitlines() if not line.startswith("#"))
     Random(1).shuffle(rows)
