@@ -35,10 +35,10 @@ from railfix.gnss.observations import Observations
 from railfix.io import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
-from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.error_model import ErrorModel, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, fit_bins
 from railfix.ranges.sbas import SbasCorrections, read_sbas
+from railfix.ranges.sbas.troposphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.run.driver import RunOptions
 from railfix.run.processor_setup import make_processor
 from railfix.track import read_track

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -157,6 +158,7 @@ def test_an_error_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_manual_needs_no_array_library() -> None:
     program = """
 import sys
+from pathlib import Path
 from railfix.__main__ import main
 sys.argv = ["railfix", "--help"]
 try:
@@ -166,6 +168,19 @@ finally:
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
+
+
+@pytest.mark.requirement("G5")
+@pytest.mark.parametrize(("words", "code"), [("map check", 3), ("map network", 3), ("doctor", 5)])
+def test_a_geopackage_without_the_extra_for_maps_names_it(
+    words: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyogrio", None)
+    (tmp_path / "line.gpkg").write_bytes(b"SQLite format 3\0")
+    result = RUNNER.invoke(app, [*words.split(), str(tmp_path / "line.gpkg")])
+    assert result.exit_code == code, result.output
+    sentence = "line.gpkg: is a GeoPackage, which pyogrio and shapely read; install it with: pip install 'railfix[maps"
+    assert sentence in " ".join((result.stderr + result.stdout).split())
 
 
 @pytest.mark.requirement("G4")

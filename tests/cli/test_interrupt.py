@@ -73,6 +73,18 @@ def test_ctrl_c_while_the_program_starts_is_one_sentence(tmp_path: Path, words: 
     assert (code, error) == (128 + signal.SIGINT, SENTENCE)
 
 
+def test_a_signal_that_the_caller_ignores_stays_ignored() -> None:
+    """As `nohup` does with SIGHUP, and a shell with SIGINT of its background jobs."""
+    process = subprocess.Popen(
+        ["sh", "-c", f"trap '' HUP INT; exec {sys.executable} -m railfix simulate --list"], stdout=subprocess.DEVNULL
+    )
+    while not is_starting(process):
+        time.sleep(0.01)
+    for number in (signal.SIGHUP, signal.SIGINT):
+        process.send_signal(number)
+    assert process.wait(PATIENCE_S) == 0
+
+
 @pytest.mark.slow
 def test_an_evaluation_that_is_interrupted_leaves_nothing(good: Desk, tmp_path: Path) -> None:
     words = [str(word) for word in ("evaluate", good.folder / "results", "--reference", good.folder / "truth.csv")]

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import railfix
 from railfix.cli import app
-from railfix.ranges.cn0_curve import read_cn0_curve
+from railfix.ranges.cn0_curve_file import read_cn0_curve
 
 RUNNER = CliRunner()
 #: georinex cuts time tags to 1 us: at 40 m/s the satellites' ranges are the same to a millimetre.

@@ -16,7 +16,7 @@ from attacked_line import run_sequence
 from changed_line import ChangedLine
 from ground_rules import take_out
 from railfix.core.errors import InputFileError
-from railfix.core.settings import load_settings
+from railfix.core.settings_files import load_settings
 from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.interlocking import extend_authorities, stop_orders

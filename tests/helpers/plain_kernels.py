@@ -17,7 +17,7 @@ from railfix import kernels
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking import layout
 from railfix.tracking import TrackingLimits
-from railfix.tracking.bank import OTHERS, SourceKind, classify_source
+from railfix.tracking.bank import KINDS, OTHERS
 from railfix.tracking.packing import _pack_sources, pack_parameters
 from railfix.tracking.state import HYPOTHESIS, MONITORS
 
@@ -70,7 +70,7 @@ def kernel_state(
     run.
     """
     listed = [*names, *OTHERS] if names else []
-    count, satellites = len(log_probability), sum(classify_source(name) == SourceKind.SATELLITE for name in names)
+    count, satellites = len(log_probability), sum(name not in KINDS for name in names)
     x, P = np.zeros((count + len(listed), ix.SATELLITES)), np.zeros((count + len(listed), ix.SATELLITES, ix.SATELLITES))
     x[: len(place_m), ix.ARC], P[: len(place_m), ix.ARC, ix.ARC] = place_m, np.square(sigma_m)
     hypothesis, values = np.zeros(count, dtype=HYPOTHESIS), np.zeros(1, dtype=MONITORS)

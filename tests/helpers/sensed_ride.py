@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, ListedBalises, SensorSamples

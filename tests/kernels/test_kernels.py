@@ -27,8 +27,8 @@ from railfix.kernels.tracking.recursion import advance
 from railfix.kernels.tracking.velocity import write_velocities
 from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
+from railfix.positioning.igg3_fit import robust_fit
 from railfix.positioning.normal_equations import misfit, normal_equations, point_position, position_on_line
-from railfix.positioning.receiver_noise import robust_fit
 from railfix.run.processor_setup import make_processor
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track

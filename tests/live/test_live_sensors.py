@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from railfix.cli import app
 from railfix.core.errors import InputFileError
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageStatus, Source
 from railfix.live import console

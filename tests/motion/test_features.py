@@ -138,10 +138,14 @@ def test_features_of_a_map_are_where_the_line_bends() -> None:
 @pytest.mark.parametrize("spacing_m", [2.0, 5.0, 10.0, 20.0])
 @pytest.mark.parametrize("start_m", [0.0, 3.0, 7.0])
 @pytest.mark.parametrize("radii", ["of the map", "none"])
-def test_features_are_the_same_at_any_spacing_of_the_map(spacing_m: float, start_m: float, radii: str) -> None:
-    """Four transitions of 60 m between straight and radii of 300 m, and three vertical curves of 15 to 60 m."""
-    breaks = np.array([0.0, 120.0, 180.0, 300.0, 360.0, 480.0, 540.0, 660.0, 720.0, 840.0])
-    bends = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]) / 300.0
+@pytest.mark.parametrize("transition_m", [60.0, 0.01])
+def test_features_are_the_same_at_any_spacing_of_the_map(
+    spacing_m: float, start_m: float, radii: str, transition_m: float
+) -> None:
+    """Four transitions to 300 m radius, or curves of 120 m without any, and three vertical curves of 15 to 60 m."""
+    middles = np.array([150.0, 330.0, 510.0, 690.0])
+    breaks = np.array([0.0, *np.sort([*(middles - transition_m / 2.0), *(middles + transition_m / 2.0)]), 840.0])
+    bends = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]) / (300.0 if transition_m > 1.0 else 120.0)
     grid = np.linspace(0.0, 840.0, 84_001)
     heading = cumulative_simpson(np.interp(grid, breaks, bends), x=grid, initial=0.0)
     gradient = np.interp(

@@ -11,11 +11,11 @@ import polars as pl
 import pytest
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.motion.radar_watch import RadarWatch
 from railfix.motion.samples import (
     GroundUnits,
     InertialSamples,
     RadarSpeeds,
-    RadarWatch,
     SensorSamples,
     StationRanges,
     TachometerPulses,

@@ -283,15 +283,13 @@ def test_verdicts_on_pairs_go_to_the_epochs_of_each_antenna() -> None:
     )  # fmt: skip
     rows = slice(0, 4), slice(4, 9)
     antennas = SimpleNamespace(parts=rows, chainage_at=lambda arc_m: arc_m)
-    chunk = SimpleNamespace(
-        names=("front", "rear"), antennas=antennas, pair=pair, rows=dict(zip(chainage, rows, strict=True))
-    )
+    by_name = dict(zip(chainage, rows, strict=True))
     solution = SimpleNamespace(status=np.zeros(9, dtype=np.int8), arc_m=np.concatenate([*chainage.values()]))
-    status, published = screen_positions(chunk, solution, [(screen, None)], parse_config({}))  # type: ignore[arg-type]
+    status, published = screen_positions(pair, by_name, antennas, solution, [(screen, None)], parse_config({}))  # type: ignore[arg-type]
     motions = {name: FilteredMotion(values, values, values, values) for name, values in chainage.items()}
     filtered = screen_filtered([(screen, None)], pair, motions)
     for name, refused in (("front", [1, 2]), ("rear", [0, 2])):
-        assert np.flatnonzero(status[chunk.rows[name]] == 9).tolist() == refused
+        assert np.flatnonzero(status[by_name[name]] == 9).tolist() == refused
         for screened in (published[name]["spacing"], filtered[name]):
             assert np.flatnonzero(screened.reject).tolist() == refused
             known = np.isfinite(screened.metric)

@@ -18,9 +18,10 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.result_tables import antenna_positions
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.igg3_fit import robust_fit
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, noise_scale, robust_fit
+from railfix.positioning.receiver_noise import NoiseScaleLimits, epoch_variance, noise_scale
 from railfix.simulate.demonstration import demo_files
 
 

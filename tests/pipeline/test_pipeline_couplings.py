@@ -24,10 +24,10 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.range_stage import Models
 from railfix.pipeline.results import AntennaResult
-from railfix.positioning import inter_system, line_fix, receiver_noise
+from railfix.positioning import igg3_fit, inter_system, line_fix
 from railfix.positioning.approximate import ApproximatePosition
+from railfix.positioning.igg3_fit import RobustFit
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import RobustFit
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
 
@@ -217,14 +217,14 @@ def faults(*sizes_m: float) -> np.ndarray:
 @pytest.mark.requirement("B4")
 def test_a_pair_that_the_robust_fit_keeps_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two that disagree with the rest the rest can be faulty: nothing is excluded, and a check has failed."""
-    observations, original = with_code(front(), faults(60.0, 90.0)), receiver_noise.robust_fit
+    observations, original = with_code(front(), faults(60.0, 90.0)), igg3_fit.robust_fit
     believed = front_alone(observations, BASE)
     assert (believed.raim.outcome == Outcome.EXCLUDED_TWO).all()
 
     def keeps_all(ranges: Ranges, *args: Any, **options: Any) -> RobustFit:
         return replace(original(ranges, *args, **options), kept=ranges.weight > 0)
 
-    for module in (inter_system, receiver_noise):
+    for module in (inter_system, igg3_fit):
         monkeypatch.setattr(module, "robust_fit", keeps_all)
     doubted = front_alone(observations, BASE)
     assert (doubted.raim.outcome == Outcome.UNRESOLVED).all()
@@ -237,13 +237,13 @@ def test_a_pair_that_the_robust_fit_keeps_is_not_believed(monkeypatch: pytest.Mo
 @pytest.mark.requirement("B4")
 def test_an_unresolved_fault_leaves_the_ranges_of_the_robust_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three faults are more than RAIM excludes: the position is that of the rest, and its status a failed check."""
-    change, original = faults(60.0, 90.0, 80.0), receiver_noise.robust_fit
+    change, original = faults(60.0, 90.0, 80.0), igg3_fit.robust_fit
     faulty = (change != 0)[:, fault_free().columns]
 
     def rejects_them(ranges: Ranges, *args: Any, **options: Any) -> RobustFit:
         return replace(original(ranges, *args, **options), kept=(ranges.weight > 0) & ~faulty)
 
-    for module in (inter_system, receiver_noise):
+    for module in (inter_system, igg3_fit):
         monkeypatch.setattr(module, "robust_fit", rejects_them)
     found = front_alone(with_code(front(), change), BASE | {"noise_scale": {"prior": 1e6}})
     assert (found.raim.outcome == Outcome.UNRESOLVED).all()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import re
 import runpy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -29,12 +32,14 @@ from railfix import (
 )
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.positioning.receiver_noise import LastingErrorLimits
+from railfix.integrity.persistent_biases import LastingErrorLimits
 from railfix.track import Track, from_positions
 from railfix.track.point_files import write_track_csv
 
 #: The example that calls the stages one by one.
 EXAMPLE = ROOT / "docs" / "gallery" / "stages_by_hand.py"
+#: Has a table of arguments that cannot be right, each with its sentence.
+PAGE = (ROOT / "docs" / "researcher.md").read_text(encoding="utf-8")
 #: Stages of P1's figure 1, in their order, by room.
 STAGES = {
     "ranges": ("select_channels", "find_satellites", "corrected_ranges"),
@@ -209,10 +214,11 @@ def test_a_range_that_is_nan_is_not_used_and_a_faulty_one_is_excluded() -> None:
     level = integrity.protection_level(model, clock.tolist(), n_excluded=found.excluded)
     assert (level.level_m > np.abs(clean.constrained.arc_m - arc)).all()
     before = integrity.linear_model(used, line, fix.constrained.arc_m, section=fix.constrained.section)
-    with pytest.raises(ValueError, match="uses satellites that were excluded; make it from the ranges and positions"):
+    with pytest.raises(ValueError, match="uses satellites that were excluded; make it from the") as solved:
         integrity.protection_level(before, clock.tolist(), n_excluded=found.excluded)
-    with pytest.raises(ValueError, match="scale must be positive"):
+    with pytest.raises(ValueError, match="scale must be positive") as scaled:
         integrity.exclude_faults(used, line, fix, scale=0.0)
+    assert all(f"`{error.value}`" in PAGE for error in (solved, scaled))
 
 
 #: Arguments of `weighted_ranges` (satellites, codes, sigmas, clocks) that cannot be right: which, how, the sentence.
@@ -249,6 +255,7 @@ def test_nonsense_is_one_sentence(case: str) -> None:
     with pytest.raises(ValueError, match=sentence) as error:
         positioning.weighted_ranges(*given)
     assert "\n" not in str(error.value)
+    assert f"`{error.value}`" in PAGE
 
 
 @pytest.mark.requirement("S1")
@@ -259,8 +266,9 @@ def test_lists_are_arrays_and_systems_are_known() -> None:
     assert np.abs(fix.constrained.arc_m - arc).max() < 3.0
     channels = np.array(["G01", "E05"]), np.array(["1C", "1C"])
     for letter in ("X", "g"):
-        with pytest.raises(ValueError, match=f"systems names '{letter}', which is no constellation; known are G"):
+        with pytest.raises(ValueError, match=f"systems names '{letter}', which is no constellation; known are G") as e:
             ranges.select_channels(*channels, systems=(letter,))
+        assert f"`{e.value}`".replace("'g'", "'X'") in PAGE
 
 
 @pytest.mark.requirement("S1")
@@ -275,5 +283,48 @@ def test_every_screen_has_metric_limit_and_reject() -> None:
     )  # fmt: skip
     assert weak.reject.tolist() == [[True, False, False]]
     np.testing.assert_array_equal(weak.floor.reject, weak.floor.metric < weak.floor.limit)
+    for name in screens.__all__:
+        if name.endswith("_screen"):
+            returned = _own_types(get_type_hints(getattr(screens, name))["return"])
+            assert any(issubclass(own, screens.Screened) for own in returned), name
     apart = screens.antenna_spacing_screen(np.array([100.0, 120.0]), np.array([80.0, 80.0]), 20.0)
     np.testing.assert_array_equal(apart.reject, np.abs(apart.metric) > apart.limit)
+
+
+#: Sources of stages: a paper with its section, another publication with its year, a program with its function.
+SOURCE = re.compile(r"P[1-5]\b|\b(19|20)\d\d\b|RTKLIB: `\w+`")
+
+
+@pytest.mark.requirement("S1")
+@pytest.mark.parametrize("room", STAGES)
+def test_a_public_stage_names_its_source_first(room: str) -> None:
+    package = import_module(f"railfix.{room}")
+    for name in STAGES[room]:
+        first = " ".join(inspect.getdoc(getattr(package, name)).split("\n\n")[:2])
+        assert SOURCE.search(first), name
+
+
+def _own_types(annotation: Any) -> Iterator[type]:
+    """Yield the classes of the package that an annotation names."""
+    if isinstance(annotation, type) and annotation.__module__.startswith("railfix"):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _own_types(part)
+
+
+@pytest.mark.requirement("S1")
+def test_types_that_a_call_of_a_stage_needs_are_exported() -> None:
+    faces = [
+        import_module(f"railfix.{room}") for room in (*STAGES, "core", "gnss", "screens", "track", "integrity.raim")
+    ]
+    exported = {getattr(face, name) for face in faces for name in face.__all__ if isinstance(getattr(face, name), type)}
+    functions = [getattr(import_module(f"railfix.{room}"), name) for room, names in STAGES.items() for name in names]
+    functions += [getattr(screens, name) for name in screens.__all__ if name.endswith("_screen")]
+    assert len(functions) > 20
+    hidden = {
+        f"{function.__name__}: {own.__name__}"
+        for function in functions
+        for annotation in get_type_hints(function).values()
+        for own in set(_own_types(annotation)) - exported
+    }
+    assert not hidden

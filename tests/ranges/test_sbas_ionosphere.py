@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import sbas_cases as cases
-from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.sbas import IonosphereDelays, IonosphereState, SbasCorrections, SbasLimits
 from railfix.ranges.sbas.ionosphere import (
     BANDS,
@@ -19,6 +18,7 @@ from railfix.ranges.sbas.ionosphere import (
     pierce_point,
     point_number,
 )
+from railfix.ranges.sbas.troposphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 
 pytestmark = pytest.mark.requirement("C1")
 

@@ -17,8 +17,8 @@ from railfix.core.timescale import from_week
 from railfix.gnss.orbits.states import satellite_states
 from railfix.io import read_observations
 from railfix.io.rinex.navigation import read_navigation
-from railfix.ranges.atmosphere import rtca_troposphere_m
 from railfix.ranges.sbas import IonosphereState, SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
+from railfix.ranges.sbas.troposphere import rtca_troposphere_m
 
 GPS = np.array([f"G{i:02d}" for i in range(1, 33)])
 #: What RTKLIB does: corrections as sent, at the second of their tag, whatever their degradation data and UDREI.

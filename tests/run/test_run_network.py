@@ -30,7 +30,7 @@ from railfix.simulate.scenario_file import load_recipe
 from railfix.track import read_track
 from railfix.track.frames import points_at
 from railfix.track.network import Network
-from railfix.track.network_match import Matched, match
+from railfix.track.network_match import match
 from railfix.track.network_read import links_of_ends
 from railfix.track.network_route import find_route
 
@@ -114,7 +114,7 @@ def test_beside_the_route_no_position_is_ok_and_nothing_bounds_it(
 ) -> None:
     """The route is the loop, 20 m beside the track on which the demo drove: the probability of the route says so."""
 
-    def wrong(network: Network, _: Matched) -> tuple[list[int], list[int]]:
+    def wrong(network: Network, *_: object) -> tuple[list[int], list[int]]:
         return [network.find_index(name) for name in ("line 0", "loop 0", "line 1")], []
 
     monkeypatch.setattr("railfix.run.route.find_route", wrong)

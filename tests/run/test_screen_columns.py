@@ -15,7 +15,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.result_columns import OBSERVATION_COLUMNS, POSITION_COLUMNS
 from railfix.pipeline.result_tables import observations_table, positions_table
 from railfix.pipeline.results import Result
-from railfix.ranges.cn0_curve import read_cn0_curve
+from railfix.ranges.cn0_curve_file import read_cn0_curve
 from railfix.run.processor_setup import make_processor
 from railfix.run.sources import TrackReading, open_line
 from railfix.simulate.demonstration import demo_inputs

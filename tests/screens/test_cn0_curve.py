@@ -17,18 +17,9 @@ from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, OutputError, SettingsError
 from railfix.gnss.observations import ObservationHeader
 from railfix.io import read_navigation, read_observations
-from railfix.ranges.cn0_curve import (
-    KINDS,
-    Cn0Curve,
-    Cn0CurveSource,
-    Cn0Mean,
-    Cn0Samples,
-    CurveFit,
-    fit_cn0_curve,
-    read_cn0_curve,
-    satellite_kind,
-    write_cn0_curve,
-)
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean, satellite_kind
+from railfix.ranges.cn0_curve_file import read_cn0_curve, write_cn0_curve
+from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 from railfix.ranges.cn0_curve_log import cn0_curve_from_log, satellite_elevation_deg
 from railfix.report.plots.screens import draw_cn0_curve, draw_screen
 from railfix.screens import ScreenPicture, cn0_screen

@@ -34,7 +34,7 @@ from railfix.screens import (
 )
 from railfix.screens.antenna_pair import Spacing, TagDifference
 from railfix.screens.antenna_spacing import SCREEN
-from railfix.screens.base import FilteredMotion, PairedEpochs, on_pairs
+from railfix.screens.pairs import FilteredMotion, PairedEpochs, on_pairs
 from railfix.tracking import TrackStatus
 
 START = np.datetime64("2021-01-01T00:00:00", "ns")

@@ -9,7 +9,7 @@ import pytest
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.simulate import (
     Element,
     GeneratedLine,

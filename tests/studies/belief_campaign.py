@@ -44,7 +44,7 @@ from posterior_score import arc_of, bounds
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason, Status
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.evaluate.cases import read_case

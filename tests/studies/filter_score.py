@@ -30,7 +30,8 @@ from railfix.pipeline.smoothed_track import Replay, SmoothedTrack, smooth
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
-from railfix.tracking.bank import budget, classify_source
+from railfix.tracking.bank import budget
+from railfix.tracking.packing import pack_state
 
 CONFIG = parse_config({"filter": "track"})
 #: Noise of the smartLoc receiver's codes against the weights, as a variance (docs/recordings: about 8).
@@ -299,7 +300,8 @@ def show_terms(all_cases: list[Case]) -> None:
                 continue
             apart = np.abs(state.bank.mean[:, 0] - state.mean[0, 0])
             sigma = np.sqrt(state.bank.covariance[:, 0, 0])
-            prior = np.array([given.prior[classify_source(name)] for name in state.bank.without])
+            source = pack_state(state, limits, levels=True).source
+            prior = source["prior"][source["running"]]
             level = found.ground_level_m
             spent = prior * (ndtr((apart - level) / sigma) + ndtr((-apart - level) / sigma))
             own = 2.0 * ndtr(-level[0] / found.sigma_m[0])

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.reasons import Status
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.evaluate.range_errors import range_errors
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.stanford import Region, stanford

@@ -15,7 +15,7 @@ import numpy as np
 from p1_rtklib import PROGRAM, single_points
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.reasons import CHECK_FAILED, Status
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.gnss.observations import Observations
 from railfix.integrity.point_validation import PointStatus
 from railfix.motion.samples import SensorSamples
@@ -24,7 +24,8 @@ from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
+from railfix.ranges.cn0_curve_file import write_cn0_curve
+from railfix.ranges.cn0_curve_fit import Cn0Samples, fit_cn0_curve
 from railfix.run.processor_setup import make_processor
 from railfix.run.sensors import read_sensors
 from railfix.simulate import Scenario, Simulation

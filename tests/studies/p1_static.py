@@ -17,7 +17,7 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.reasons import Status
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.gnss.observations import Observations
 from railfix.pipeline.config import parse_config
 from railfix.run.processor_setup import make_processor

@@ -20,7 +20,7 @@ import polars as pl
 
 import paths  # noqa: F401
 from railfix.core.constants import GRAVITY_MPS2
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import InertialSamples, SensorSamples, TachometerPulses
 from railfix.motion.slip import MotionSamples, MotionState, SlipLimits, SlipResult, find_slips

@@ -24,18 +24,12 @@ from railfix.io import read_navigation, read_observations
 from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.igg3_fit import map_information, robust_fit
+from railfix.positioning.inter_system import OffsetState, tie_clocks
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.normal_equations import Constrained, point_position, position_on_line
 from railfix.positioning.range_arrays import Ranges, without
-from railfix.positioning.receiver_noise import (
-    NoiseState,
-    OffsetState,
-    epoch_sigma_m,
-    map_information,
-    noise_scale,
-    robust_fit,
-    tie_clocks,
-)
+from railfix.positioning.receiver_noise import NoiseState, epoch_sigma_m, noise_scale
 from railfix.positioning.search_index import SearchIndex
 from railfix.positioning.section_search import find_section
 from railfix.ranges.channels import clock_groups

@@ -201,6 +201,36 @@ def _map_row(name: str, command: str, words: dict[str, str], code: int, text: st
     return Row(name, command, line, code, text)
 
 
+def _frame_and_network_rows() -> Iterator[Row]:
+    """Older datums by a named operation; the same rows as CSV and .pos; heights, cant, topology and features."""
+    heights = "--height-datum ellipsoidal"
+    datums = {
+        "ed50_bergen": "ED50 to WGS 84 .7.' .accuracy 7 m", "ed50_rome": "ED50 to WGS 84 .1.' .accuracy 10 m",
+        "s42_83_prague": r"1942.83. to WGS 84 .5.' .accuracy 5 m", "agd66_nsw": "AGD66 to WGS 84 .13.' .accuracy 3 m",
+        "s42_83_budapest": "1942.83. to WGS 84 .3.' .accuracy 4 m",
+    }  # fmt: skip
+    for name, operation in datums.items():
+        for command, code in (("check", 0), ("network", 0), ("doctor", 5)):
+            words = {"{map}": f"maps/{name}.geojson", "{heights}": heights}
+            yield _map_row(f"{name}.geojson", command, words, code, operation)
+    matches = {
+        ("ed50_two_lines", "ed50_log.csv"): "0 with a probability below 0.9.*accuracy 10 m.*10.0 m is taken",
+        **dict.fromkeys([("par", "s8.csv"), ("par", "s8.pos")], "200 with a probability below 0.9"),
+        **dict.fromkeys([("lev", f"{log}.{kind}") for log in ("h0", "h4") for kind in ("csv", "pos")],
+                        "200 on a track.* 0 with a probability below 0.9"),
+    }  # fmt: skip
+    for (name, log), text in matches.items():
+        words = f"map match maps/{name}.geojson {heights} --log maps/{log} --out {{out}}/m.csv --overwrite"
+        yield Row(log, "match", words, 0, text)
+    yield Row("signedcant.csv", "check", "map check maps/signedcant.csv", 6, "cant")
+    yield Row(
+        "osm_layer.osm", "network", "map network maps/osm_layer.osm", 0, "2 tracks.* 0 switches.*2 separate parts"
+    )
+    yield Row("slip.osm", "network", "map network maps/slip.osm", 0, "4 tracks.* 4 switches.*1 separate part")
+    for name in ("features_5m.csv", "features_20m.csv"):  # radii of 1,500 m, no change of curvature by 1/1000 m
+        yield Row(name, "features", f"map features maps/{name} --out {{out}}/f.csv --overwrite", 0, r"\b0 features")
+
+
 def _receiver_rows() -> Iterator[Row]:
     log = "reports/three-epochs.rtcm3"
     words = f"convert {log} --out {{out}}/q.rnx --nav-out {{out}}/q.nav --overwrite"
@@ -218,7 +248,14 @@ def _receiver_rows() -> Iterator[Row]:
 
 def list_rows() -> list[Row]:
     """Return all rows."""
-    return [*_log_rows(), *_navigation_rows(), *_position_rows(), *_map_rows(), *_receiver_rows()]
+    return [
+        *_log_rows(),
+        *_navigation_rows(),
+        *_position_rows(),
+        *_map_rows(),
+        *_frame_and_network_rows(),
+        *_receiver_rows(),
+    ]
 
 
 def write_line(path: Path) -> Path:
@@ -236,7 +273,7 @@ def run_row(row: Row, cases: Path, out: Path) -> tuple[bool, int, str]:
     for word in row.words.replace("{nav}", "reports/base.nav").split():
         word = word.replace("{out}", str(out)).replace("{line}", str(line))
         folder = cases.parent if word.startswith("kinematic/") else cases
-        words.append(str(folder / word) if re.match("(reports|newcomer|kinematic)/", word) else word)
+        words.append(str(folder / word) if re.match("(reports|newcomer|maps|kinematic)/", word) else word)
     result = CliRunner(env={"COLUMNS": "500"}).invoke(app, words)
     text = " ".join(f"{result.stdout} {result.stderr}".split())
     codes = (row.exit_code,) if isinstance(row.exit_code, int) else row.exit_code

@@ -28,12 +28,12 @@ from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.level_stage import get_risk_budget
 from railfix.positioning.range_arrays import FILLER_SATELLITE_M, Ranges
-from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
 from railfix.ranges.channels import clock_groups
 from railfix.ranges.error_model import ErrorModel, read_error_model
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
 from railfix.ranges.sbas.sbas_sources import apply_long_term
+from railfix.ranges.sbas.troposphere import rtca_troposphere_sigma_m
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 

@@ -16,7 +16,8 @@ import numpy as np
 
 import paths  # noqa: F401
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.ranges.atmosphere import rtca_mapping, thin_shell_obliquity
+from railfix.ranges.atmosphere import thin_shell_obliquity
+from railfix.ranges.sbas.troposphere import rtca_mapping
 from railfix.simulate import LineSettings, Scenario, SensorSettings, Simulation, SkySettings, sensor_tables, write_run
 from railfix.simulate.receiver import NoiseSettings
 from railfix.simulate.settings import (

@@ -1,7 +1,8 @@
 """Walk of one pseudorange from its log to the tables: ``python tests/studies/walk.py [off|track]``.
 
 Three seconds of the demonstration are run. Printed are the functions of the package that are given the pseudorange, as
-observed or corrected, those among them that also return it, and the classes whose instances hold it.
+observed or corrected, up to the position and after it (results and tables), those among them that also return it, and
+the classes whose instances hold it. Properties and special methods, which read a field or make an object, are apart.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import sys
 import tempfile
 import threading
 from datetime import datetime, timedelta
+from functools import cached_property
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,6 +26,8 @@ from railfix.run.inputs import RunInputs, RunOptions
 from railfix.simulate.demonstration import demo_files
 
 SOURCE = str(Path(railfix.__file__).parent)
+#: The first function that is called with the positions.
+AFTER = "pipeline/results.antenna_results"
 #: Epoch of the pseudorange, and how far nested containers are searched.
 EPOCH, DEPTH = 5, 6
 
@@ -34,6 +38,7 @@ class Walk:
     def __init__(self, numbers: set[float]) -> None:
         self.numbers = np.array(sorted(numbers))
         self.given: dict[str, None] = {}
+        self.fields: dict[str, None] = {}
         self.passed: dict[str, None] = {}
         self.classes: dict[str, None] = {}
 
@@ -57,12 +62,18 @@ class Walk:
         if not code.co_filename.startswith(SOURCE) or code.co_name.startswith("<") or code.co_name == "__init__":
             return
         name = f"{code.co_filename[len(SOURCE) + 1 : -3]}.{code.co_qualname}"
-        if event == "call" and name not in self.given:
+        if event == "call" and name not in self.given and name not in self.fields:
             names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
             if sum([self.holds(frame.f_locals.get(each)) for each in names]):
-                self.given[name] = None
+                (self.fields if is_field(frame) else self.given)[name] = None
         elif event == "return" and name in self.given and name not in self.passed and self.holds(result):
             self.passed[name] = None
+
+
+def is_field(frame: FrameType) -> bool:
+    """Whether a property or a special method is called."""
+    own = getattr(type(frame.f_locals.get("self")), frame.f_code.co_name, None)
+    return isinstance(own, (property, cached_property)) or frame.f_code.co_name.startswith("__")
 
 
 def run(settings: Config) -> None:
@@ -107,7 +118,15 @@ def main() -> None:
     run(settings)
     sys.setprofile(None)
     threading.setprofile(None)
-    for title, names in (("given it", walk.given), ("return it", walk.passed), ("classes", walk.classes)):
+    given = list(walk.given)
+    position = given.index(AFTER)
+    for title, names in (
+        ("given it up to the position", given[:position]),
+        ("given it after the position", given[position:]),
+        ("properties and special methods that are given it", walk.fields),
+        ("return it", walk.passed),
+        ("classes", walk.classes),
+    ):
         print(f"{title}: {len(names)}", *names, sep="\n  ")
 
 

@@ -278,7 +278,6 @@ def test_geojson_collection_and_multi_line_are_a_route(tmp_path: Path) -> None:
         (feature([[1, 50, 2], [1, 51]]), "every point must be"),
         (feature([[1, 50, 2], [1, "x", 3]]), "not a number"),
         (feature([[1, 50, 2], [1, None, 3]]), "not finite"),
-        (feature(LINE), "the height datum is missing"),
         (feature(LINE, height_datum="levelled"), "expected 'ellipsoidal' or 'orthometric'"),
         (feature(LINE, height_datum="orthometric"), "needs a geoid"),
         (feature([p[1::-1] + p[2:] for p in LINE], height_datum="ellipsoidal"), "swapped"),
@@ -292,6 +291,10 @@ def test_broken_geojson_is_refused_in_one_sentence(tmp_path: Path, document: obj
     sentence = refused(geojson(tmp_path, document))
     assert said in sentence
     assert "line.geojson" in sentence
+
+
+def test_geojson_without_a_height_datum(tmp_path: Path) -> None:
+    assert "give --height-datum ellipsoidal or" in refused(geojson(tmp_path, feature(LINE)), SettingsError)
 
 
 def test_geojson_with_an_unknown_crs(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_as_plain_python_the_recursion_gives_the_same(name: str, first: int, mon
     _, state = track(part(epochs, before), line, sensors=_sensors_of(sensors, before), levels=True)
     own = _sensors_of(sensors, cut)
     compiled, _ = track(part(epochs, cut), line, state, sensors=own, levels=True)
-    monkeypatch.setattr("railfix.tracking.filter._kernel", lambda: plain("tracking.recursion").advance)
+    monkeypatch.setattr("railfix.kernels.tracking.recursion.advance", plain("tracking.recursion").advance)
     found, _ = track(part(epochs, cut), line, state, sensors=own, levels=True)
     for field in fields(Tracked):
         one, other = getattr(found, field.name), getattr(compiled, field.name)
@@ -148,7 +148,7 @@ def test_the_update_of_each_sub_filter_keeps_its_digits(monkeypatch: pytest.Monk
         errors.append(float(np.abs((P - prior) / np.outer(sigma, sigma)).max()))
 
     monkeypatch.setitem(names, "correct_state", corrected)
-    monkeypatch.setattr("railfix.tracking.filter._kernel", lambda: advance)
+    monkeypatch.setattr("railfix.kernels.tracking.recursion.advance", advance)
     track(part(replace(case.epochs, phase_m=phase), slice(0, 4)), case.line, levels=True)
     assert len(errors) > 20
     assert max(errors) < 1e-8
@@ -327,7 +327,7 @@ def test_first_weights_are_students_with_the_clock_of_each_kind_known() -> None:
 
 @pytest.mark.requirement("E5")
 def test_a_second_fit_sets_place_and_speed_free_by_their_own_variances(monkeypatch: pytest.MonkeyPatch) -> None:
-    (rows, one), evidence = _made_epoch(), plain("tracking.evidence")
+    (rows, one), evidence = _made_epoch(), plain("tracking.update")
     weights, covariances, reweight = list[np.ndarray](), list[np.ndarray](), evidence.reweight
     reweight(rows, one.equations, one.covariance, rows.variance, one.fit)
 

@@ -136,7 +136,7 @@ def test_the_bound_of_an_epoch_between_by_hand() -> None:
         values=np.array([100.0, 10.0, 5.0, 6.0, 3.0, 0.5, 2.0, 0.0, 7.0, 0.0]),
     )
     none = np.empty(0, dtype=np.intp)
-    levels, after = carried_levels(found, epochs, none, Tracked.empty(epochs.time[:0], 10), case.line, state, LIMITS)
+    levels, after = carried_levels(found, none, Tracked.empty(epochs.time[:0], 10), case.line, state, LIMITS)
     # 102 = 100 + 10 * 0.2: 5 + 0.5 * 0.2 + 3 * 0.2^2 / 2; then 1.5 m ahead of 103 m
     np.testing.assert_allclose(levels.level_m, [5.16, 5.0 + 1.5 + 0.15 + 0.135, np.nan], rtol=0, atol=1e-9)
     np.testing.assert_allclose(levels.ground_level_m, levels.level_m + 1.0, rtol=0, atol=1e-6)
@@ -154,7 +154,7 @@ def test_the_bound_of_an_epoch_between_by_hand() -> None:
         (branches, 0.1, np.sqrt(0.1**2 + 2.0**2 - 0.3**2)),
     ):
         found = replace(found, status=np.full(3, own, dtype=np.int8), sigma_m=np.full(3, before))
-        told, _ = carried_levels(found, epochs, none, Tracked.empty(epochs.time[:0], 10), case.line, state, LIMITS)
+        told, _ = carried_levels(found, none, Tracked.empty(epochs.time[:0], 10), case.line, state, LIMITS)
         np.testing.assert_allclose(told.sigma_m[:2], after_m)
 
 

@@ -21,7 +21,8 @@ from rich.text import Text
 from typer import echo
 
 from railfix import kernels
-from railfix.core.tables import Table, plural
+from railfix.core.notebook import plural
+from railfix.core.tables import Table
 from railfix.run.output import finite_values
 from railfix.run.record import budget_tables, level_basis
 

@@ -17,7 +17,7 @@ from railfix.cli.console import (
     show_table,
 )
 from railfix.cli.options import OverwriteOption, VerboseOption, overwriting
-from railfix.core.tables import plural
+from railfix.core.notebook import plural
 from railfix.evaluate.tables import error_tables, level_tables
 from railfix.pipeline.config import Config
 from railfix.report import read_runs, write_page

@@ -35,7 +35,9 @@ from railfix.evaluate.evaluation_inputs import POSITIONS_TABLE, TABLES, Evaluati
 from railfix.evaluate.range_errors import ModelInputs, StationBeside, error_model_from_runs
 from railfix.evaluate.tables import error_tables, group_tables, level_tables
 from railfix.pipeline.level_stage import prior_basis_text
-from railfix.ranges.cn0_curve import KINDS, Cn0Curve, CurveFit, write_cn0_curve
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve
+from railfix.ranges.cn0_curve_file import write_cn0_curve
+from railfix.ranges.cn0_curve_fit import CurveFit
 from railfix.ranges.cn0_curve_log import cn0_curve_from_log
 from railfix.ranges.error_model import LARGEST_PRIOR, ErrorModel, FaultRate, write_error_model
 from railfix.ranges.error_model_fit import ErrorModelFit, ErrorSamples, summary

@@ -21,7 +21,8 @@ from railfix.cli.options import (
     resolve_settings,
 )
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.tables import plain_table, plural
+from railfix.core.notebook import plural
+from railfix.core.tables import plain_table
 from railfix.evaluate.evaluation_inputs import TABLES, list_position_tables, read_run
 from railfix.io.positions_export import style_file, write_positions
 from railfix.pipeline.result_tables import round_floats

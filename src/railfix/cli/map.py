@@ -15,7 +15,8 @@ from railfix.cli.map_network import RUN_ALONE, MapReading, match_command, networ
 from railfix.cli.map_runs import service, survey
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
-from railfix.core.tables import plain_table, plural
+from railfix.core.notebook import plural
+from railfix.core.tables import plain_table
 from railfix.io.positions import read_positions
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import (

@@ -14,9 +14,10 @@ from railfix.cli.console import MOST_FINDINGS, TableConsole, show_notes, show_ta
 from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.arrays import Floats
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
-from railfix.core.files import write_whole
+from railfix.core.notebook import plural
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import plain_table, plural
+from railfix.core.staged_files import write_whole
+from railfix.core.tables import plain_table
 from railfix.run.inputs import ColumnNames, TrackReading
 from railfix.track import check_track, write_track_csv
 from railfix.track.network import Network
@@ -215,12 +216,7 @@ def _in_frame_of(
     if connecting.same_frame == "yes":
         return log, [*log.notes]
     moved, shift = log.transform_to(net, **reading.motion)
-    size = float(np.hypot(shift.east_m, shift.north_m))
-    note = (
-        f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
-        f"{shift.used}, the frame of the positions (--same-frame: they are in that of the map)"
-    )
-    return moved, [*log.notes, *shift.notes, *([note] if size > 0.0 else [])]
+    return moved, [*log.notes, *shift.sentences]
 
 
 def _track_at(net: Network, text: str) -> int:

@@ -13,8 +13,9 @@ import typer
 from railfix.cli.console import TableConsole, show_files, show_notes, show_table, show_verdict
 from railfix.cli.options import Choices, OverwriteOption, Without, check_outputs, from_models, resolve_settings
 from railfix.core.errors import SettingsError
+from railfix.core.notebook import plural
 from railfix.core.settings import INPUTS, Settings, option
-from railfix.core.tables import Column, count, listing, number, percent, plain_table, plural
+from railfix.core.tables import Column, count, listing, number, percent, plain_table
 from railfix.run.inputs import ColumnNames
 from railfix.track.survey.runs import SurveyLimits
 
@@ -57,7 +58,7 @@ def service(
 
     Exit codes are those of `railfix --help`; 5 where the runs are on different maps.
     """
-    from railfix.core.files import write_whole
+    from railfix.core.staged_files import write_whole
     from railfix.evaluate.intervals import compute_service
 
     if not stretch > 0.0 or not limit > 0.0:

@@ -10,9 +10,11 @@ from .errors import (
     RailfixWarning,
     SettingsError,
 )
-from .files import FilePath, file_sha256, write_whole
+from .files import file_sha256
 from .reasons import Reason, Status, reason_text
-from .settings import Settings, load_settings, read_toml, write_toml
+from .settings import Settings
+from .settings_files import load_settings, read_toml, write_toml
+from .staged_files import FilePath, write_whole
 
 __all__ = [
     "FilePath",

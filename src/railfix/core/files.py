@@ -8,7 +8,6 @@ temporary file).
 from __future__ import annotations
 
 import codecs
-import errno
 import hashlib
 import importlib.resources
 import io
@@ -29,10 +28,10 @@ from typing import IO, Any, Final, Literal, cast
 
 import ncompress
 
-from railfix.core.errors import InputFileError, OutputError, SettingsError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.packed import COMPRESS, STREAMS, ZIP, damage_errors, open_zip, zip_member
+from railfix.core.staged_files import FilePath as FilePath
 
-FilePath = str | PathLike[str]
 Paths = FilePath | Sequence[FilePath]  #: One file, or several.
 #: Policy of a reader for a broken line: stop with an error, or skip and count it.
 BrokenLines = Literal["stop", "count"]
@@ -129,12 +128,6 @@ def path_names(paths: Paths) -> list[str]:
     if wrong := [name for name in names if not isinstance(name, str | PathLike)]:
         raise SettingsError(f"a path, or several, were expected, got {type(wrong[0]).__name__}")
     return [str(name) for name in names]
-
-
-def check_path(path: object, *, what: str = "a path") -> None:
-    """Raise SettingsError where a value is not a path; `what` names what was expected."""
-    if not isinstance(path, str | PathLike):
-        raise SettingsError(f"{what} was expected, got {type(path).__name__}")
 
 
 def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:
@@ -271,45 +264,6 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputFileError(path, f"is not {what}; expected a JSON object")
     return content
-
-
-def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
-    """Write a text file under a temporary name, then rename it: a failed write leaves no file.
-
-    `what` is the kind of file, for the OutputError raised where it cannot be written.
-    """
-    with stage_file(path, what=what) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
-    """Yield a temporary path in the folder of a file, which replaces the file if the block ends without error."""
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        try:
-            yield temporary
-            temporary.replace(target)
-        finally:
-            if temporary.parent.is_dir():
-                temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_error(target, error, what=f"the {what} ") from error
-
-
-#: Errors of a file system without space, and what to do.
-_FULL: Final = {
-    errno.ENOSPC: "free some space on the disk, or name a folder on another",
-    errno.EDQUOT: "free some of your quota, or name a folder elsewhere",
-    errno.EFBIG: "name a folder on a file system for larger files",
-}
-
-
-def write_error(path: FilePath, error: OSError, *, what: str = "") -> OutputError:
-    """Return the error of a file that cannot be written: the system's reason, and what to do."""
-    hint = _FULL.get(error.errno or 0, "name a folder that can be written to")
-    return OutputError(f"{path}: {what}cannot be written ({error.strerror or error}); {hint}")
 
 
 def read_text_lines(path: FilePath) -> list[str]:

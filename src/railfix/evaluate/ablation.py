@@ -22,7 +22,7 @@ from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.filter_result import AlongTrack
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.results import AntennaResult
-from railfix.ranges.cn0_curve import read_cn0_curve
+from railfix.ranges.cn0_curve_file import read_cn0_curve
 from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.driver import Progress, collect_notes, open_inputs, read_samples_and_units
 from railfix.run.inputs import ColumnNames, RunInputs, RunOptions

@@ -20,9 +20,10 @@ import polars as pl
 from railfix import __version__
 from railfix.core.arrays import Datetimes, Indices
 from railfix.core.errors import MismatchError, RailfixError
-from railfix.core.files import fingerprint, read_bytes, write_whole
+from railfix.core.files import fingerprint, read_bytes
 from railfix.core.geodesy import sigma_along
 from railfix.core.reasons import Status
+from railfix.core.staged_files import write_whole
 from railfix.core.timescale import nearest_rows, seconds
 from railfix.evaluate.accuracy import ALL, FIGURE_COLUMNS, has_position
 from railfix.evaluate.cases import Case, check_not_fitted, read_cases

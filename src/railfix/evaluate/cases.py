@@ -11,7 +11,8 @@ from pydantic import Field
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_text
-from railfix.core.settings import Settings, load_settings, validate, write_toml
+from railfix.core.settings import Settings, validate
+from railfix.core.settings_files import load_settings, write_toml
 from railfix.evaluate.evaluation_inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions

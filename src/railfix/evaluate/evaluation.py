@@ -13,7 +13,7 @@ import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError, check_type
 from railfix.core.files import fingerprint
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.evaluate.accuracy import ALL, KEYS, USED, figures_by
 from railfix.evaluate.epoch_table import antenna_epochs, below
 from railfix.evaluate.evaluation_inputs import (

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Strings, freeze_arrays, freeze_rows
-from railfix.core.tables import NotebookTable, plural, time_span_text
+from railfix.core.notebook import NotebookTable, plural, time_span_text
 
 
 def _records_text(satellite: Strings, toe: Datetimes) -> str:

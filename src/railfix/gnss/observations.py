@@ -19,7 +19,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Masks, Strings, copy_with, freeze_arrays
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP
 from railfix.core.errors import check_type
-from railfix.core.tables import NotebookTable, plural, time_span_text
+from railfix.core.notebook import NotebookTable, plural, time_span_text
 from railfix.core.timescale import gps_time
 
 

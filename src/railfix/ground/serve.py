@@ -20,7 +20,8 @@ from pydantic import BeforeValidator, Field, model_validator
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.settings import Settings, load_settings
+from railfix.core.settings import Settings
+from railfix.core.settings_files import load_settings
 from railfix.core.timescale import utc_to_gpst
 from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders

@@ -1,7 +1,13 @@
 # The names of `railfix.integrity`, imported at their first use (lazy-loader).
 
 from .fault_exclusion import RaimResult, compute_statistic, exclude_faults
-from .persistent_biases import BiasLimits, PersistentBiases, reject_persistent_biases
+from .persistent_biases import (
+    BiasLimits,
+    LastingErrorLimits,
+    LastingErrorState,
+    PersistentBiases,
+    reject_persistent_biases,
+)
 from .point_validation import PointStatus, position_dilution, validate_point
 from .protection import Cause, LevelStatus, ProtectionLevel, RiskBudget, availability, protection_level
 from .protection.solution_separation import MapDeviation, RangeBounds
@@ -11,6 +17,8 @@ __all__ = [
     "BiasLimits",
     "Cause",
     "Exclusion",
+    "LastingErrorLimits",
+    "LastingErrorState",
     "LevelStatus",
     "LinearModel",
     "MapDeviation",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Codes, Floats, Indices, Masks
-from railfix.core.tables import NotebookTable
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
+from railfix.core.notebook import NotebookTable
 from railfix.integrity.raim import (
     Detection,
     Exclusion,
@@ -18,14 +18,13 @@ from railfix.integrity.raim import (
     detect,
     exclude,
     linear_model,
-    reliability,
     worst_channel,
 )
 from railfix.positioning.antenna_rows import AntennaRows, Line
+from railfix.positioning.igg3_fit import robust_on_line
 from railfix.positioning.line_fix import FixLimits, LineFix, fix_on_line, refit_epochs
 from railfix.positioning.normal_equations import point_position
 from railfix.positioning.range_arrays import Ranges, without
-from railfix.positioning.receiver_noise import robust_on_line
 from railfix.positioning.search_index import SearchIndex
 
 
@@ -54,7 +53,7 @@ def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
     """Return the statistic of the residuals and its threshold (P4) without judging: every outcome is UNTESTABLE."""
-    found = _detect(ranges, fix, scale, limits or RaimLimits())
+    found = _detect(fix, ranges.redundancy, scale, limits or RaimLimits())
     return RaimResult(
         outcome=np.full(len(ranges), int(Outcome.UNTESTABLE), dtype=np.int8), statistic=found.statistic,
         threshold=found.threshold, scale=np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),)),
@@ -63,9 +62,8 @@ def compute_statistic(
     )  # fmt: skip
 
 
-def _detect(ranges: Ranges, fix: LineFix, scale: ArrayLike, limits: RaimLimits) -> Detection:
-    constrained = fix.constrained
-    return detect(constrained.wsse, constrained.residual_m, ranges.redundancy, limits=limits, scale=scale)
+def _detect(fix: LineFix, redundancy: Integers, scale: ArrayLike, limits: RaimLimits) -> Detection:
+    return detect(fix.constrained.wsse, fix.constrained.residual_m, redundancy, limits=limits, scale=scale)
 
 
 def exclude_faults(
@@ -106,7 +104,8 @@ def exclude_faults(
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),))
     if not (scale > 0.0).all(where=np.isfinite(scale)):
         raise ValueError("scale must be positive: the standard deviation of the ranges over that of their weights")
-    raim, test = compute_statistic(ranges, fix, scale, limits=limits), _detect(ranges, fix, scale, limits)
+    raim = compute_statistic(ranges, fix, scale, limits=limits)
+    test = _detect(fix, ranges.redundancy, scale, limits)
     raim.outcome[test.testable] = Outcome.PASSED
     failing = test.detected.nonzero()[0]
     if not len(failing):
@@ -128,7 +127,8 @@ def exclude_faults(
     ranges = without(ranges, raim.excluded)
     fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
     # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
-    raim.outcome[changed[_detect(ranges, fix, scale, limits).detected[changed]]] = Outcome.UNRESOLVED
+    still = _detect(fix, ranges.redundancy, scale, limits).detected[changed]
+    raim.outcome[changed[still]] = Outcome.UNRESOLVED
     return ranges, fix, raim
 
 
@@ -177,9 +177,3 @@ def _second_attempt(
     return exclude(
         linear_model(all_ranges, index, solved.arc_m, section=solved.section), limits=limits, scale=scale[epochs]
     )
-
-
-def add_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, *, limits: RaimLimits) -> RaimResult:
-    """Return the RAIM result with P4's protection level, where the position contains no fault."""
-    level = reliability(model, limits=limits, scale=scale).protection_level_m
-    return replace(raim, protection_level_m=np.where(raim.faulty, np.nan, level))

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, copy_with
 from railfix.core.channel_state import join_channels
+from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel, linear_model
 from railfix.integrity.raim.position_model import update_model
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
-from railfix.positioning.receiver_noise import LastingErrorLimits, LastingErrorState
 
 #: Below this fraction of its own error in its residual a range does not show its error.
 _LEAST_REDUNDANCY: Final = 0.1
@@ -23,6 +25,32 @@ _LEAST_REDUNDANCY: Final = 0.1
 _FORGOTTEN: Final = 1e-12
 #: Remaining degrees of freedom, so that the rest is still checked.
 _LEAST_FREEDOM: Final = 2
+
+
+class LastingErrorLimits(Settings):
+    """When a satellite is wrong for long."""
+
+    #: Time constant of the mean of the residuals: a minute, as reflections on a train that moves last less.
+    memory_s: float = Field(default=60.0, gt=0)
+    #: Limit of a residual in standard deviations: of the weights, or of the receiver's noise where that is larger.
+    clipped: float = Field(default=2.0, gt=0)
+    #: Mean from which on a satellite is left out, over `clipped`. On recordings in cities without a fault the largest
+    #: is 0.59, but for satellites seen by reflection alone; 20 m on one satellite reach it after 75 to 115 s.
+    share: float = Field(default=0.62, gt=0, le=1)
+    most_satellites: int = Field(default=2, ge=0, le=4)  #: Satellites left out at a time; 0: none.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LastingErrorState:
+    """Means of the residuals after the last epoch."""
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    age: float = 0.0  #: [windows].
+    channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
+    #: Sums behind the noise of the ranges, those in error included (`NoiseState`); shape (2,).
+    noise: Floats = field(default_factory=lambda: np.zeros(2))
+    #: In turn: mean square of the residuals of all ranges, without the worst satellite, and so on; shape (S, P).
+    sums: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
 
 class BiasLimits(NamedTuple):
@@ -53,7 +81,7 @@ def reject_persistent_biases(
 ) -> tuple[PersistentBiases, list[LastingErrorState]]:
     """Return ranges, positions and model without satellites whose codes are wrong for a minute, and the new states.
 
-    RAIM tests single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
+    P4 tests single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
     time. The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
 
     Parameters
@@ -87,7 +115,7 @@ def reject_persistent_biases(
     error = _own_errors(model, noise, lasting.clipped)
     for turn in range(lasting.most_satellites):
         mean, sums[turn] = windows.sums(joined.widen(share * error, 0.0), sums[turn])
-        found = _find_worst(mean[:, : joined.present], ranges, lasting.share)
+        found = _find_worst(mean[:, : joined.present], ranges.weight > 0, lasting.share)
         if not found.any():
             continue
         found &= (without(ranges, found).redundancy >= _LEAST_FREEDOM)[:, None]
@@ -105,9 +133,8 @@ def reject_persistent_biases(
     return PersistentBiases(ranges, fix, model, left_out), after_states
 
 
-def _find_worst(mean: Floats, ranges: Ranges, share: float) -> Masks:
+def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
     """Return the used range of each epoch whose mean is the largest, where it is beyond the limit, shape (T, K)."""
-    used = ranges.weight > 0
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)

@@ -33,12 +33,12 @@ def _of_residuals(limits: SinglePointLimits) -> RaimLimits:
 
 
 def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
-    """Return the `PointStatus` of each position, with a separate clock for every constellation, shape (T,).
+    """Return the `PointStatus` of each conventional position (RTKLIB: `valsol`), a clock per constellation, shape (T,).
 
     `noise_scale`: standard deviation of this receiver's ranges over the sigmas of the weights, shape (T,).
     """
     test = detect(
-        point.wsse, point.residual_m, ranges.n_used - ranges.n_clocks - 3, scale=noise_scale,
+        point.wsse, point.residual_m, ranges.space_redundancy, scale=noise_scale,
         limits=_of_residuals(limits),
     )  # fmt: skip
     located = np.asarray(np.isfinite(point.ecef_m).all(axis=1))
@@ -49,7 +49,7 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
 
 
 def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
-    """Return the position dilution of precision, with a separate clock for every constellation, shape (T,).
+    """Return the position dilution of precision (RTKLIB: `dops`), with a clock per constellation, shape (T,).
 
     Root of the trace of the position's covariance for ranges of unit sigma; NaN where the geometry is singular.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Indices, Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import LENIENT, BrokenLines
-from railfix.core.tables import plural
+from railfix.core.notebook import plural
 from railfix.gnss.observations import Observations, first_problems, stack_parts
 
 DUPLICATES: Final = "duplicate epochs"

@@ -14,8 +14,8 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import LENIENT, BrokenLines, FilePath, read_text
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import misspelt
-from railfix.core.tables import NotebookTable
 from railfix.core.timescale import SECONDS_PER_WEEK, from_week, gpst_to_utc, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
 

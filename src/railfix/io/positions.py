@@ -10,9 +10,10 @@ import numpy as np
 
 from railfix.core.arrays import take_rows
 from railfix.core.errors import InputFileError, NoPositionError, SettingsError
-from railfix.core.files import BrokenLines, FilePath, check_path
+from railfix.core.files import BrokenLines, FilePath
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.tables import plural
+from railfix.core.notebook import plural
+from railfix.core.staged_files import check_path
 from railfix.core.timescale import from_week, utc_to_gpst
 from railfix.gnss.observations import first_problems
 from railfix.io.file_kind import FileKind, find_kind, wrong_kind

@@ -20,7 +20,7 @@ import polars.selectors as cs
 from pyproj import CRS
 
 from railfix.core.errors import NoPositionError, needs_extra
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 
 #: Columns of the tables of positions that become attributes, where a table has them.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns
 from railfix.io.position_log import PositionLog, numbers_or_nan, qualities_in_words

@@ -22,7 +22,7 @@ import numba
 import numpy as np
 
 from railfix.core.errors import SettingsError
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 #: Compiled functions of the modules that are imported.

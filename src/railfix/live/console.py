@@ -34,7 +34,8 @@ from railfix.live.engine import LiveOutput
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import Outlet, Sink
 from railfix.live.stream import FOREVER, Sensed
-from railfix.motion.samples import RadarWatch, SensorSamples
+from railfix.motion.radar_watch import RadarWatch
+from railfix.motion.samples import SensorSamples
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.checks import ENOUGH_TO_STOP, check_same_place
 from railfix.run.sensor_checks import SensorChecks

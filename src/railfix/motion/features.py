@@ -28,6 +28,8 @@ _FIT_LIMIT: Final = 3.0  #: Mean square of the other quantity's residual over it
 SCALE_SIGMA: Final = 2e-3  #: Error of a distance by wheel, as a fraction.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
 HALF_LENGTH_M: Final = 60.0  #: Line before and behind a feature that is compared.
+#: A change of less than this fraction of another within `HALF_LENGTH_M` is the ripple of a curve through sparse points.
+_RIPPLE: Final = 0.2
 #: Length over which a change is computed: about the distance of a vehicle's bogies, which smooths shorter changes.
 BASE_M: Final = 15.0
 
@@ -80,7 +82,7 @@ def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None 
     `least`, by quantity, shape (N,), of a measured line: a change must also exceed the root sum of squares of both
     sides.
     """
-    reach = 2 * max(round(BASE_M / STEP_M), 1)
+    reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []
     smallest: dict[Quantity, float] = {"gradient": _GRADIENT_CHANGE, "curvature": _CURVATURE_CHANGE_1PM}
     for quantity, limit in smallest.items():
@@ -96,6 +98,8 @@ def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None 
             arc = 0.5 * float(series.arc_m[first] + series.arc_m[end - 1 + reach])
             found.append(Feature(arc_m=arc, quantity=quantity, change=float(change[k])))
             size[max(first - reach // 2, 0) : end + reach // 2] = 0.0
+            around = size[max(first - around_steps, 0) : end + around_steps]
+            around[around < _RIPPLE * abs(change[k])] = 0.0
     return sorted(found, key=lambda feature: feature.arc_m)
 
 

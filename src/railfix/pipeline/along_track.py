@@ -11,20 +11,19 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks, copy_with, join_rows
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import Suspicion, WheelSigns, WheelState, wheel_signs
 from railfix.motion.samples import BaliseReadings, ListedBalises, SensorSamples
 from railfix.pipeline.balises import BaliseLimits, find_passings
-from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config
 from railfix.pipeline.filter_result import AlongTrack, FilterFix, FilterState, SingleEpochs
+from railfix.pipeline.interference_stage import Interference
 from railfix.pipeline.outage_gate import ReturnState, gated_codes
 from railfix.pipeline.sensed_motion import SensedMotion
 from railfix.pipeline.sensor_epochs import LineReferences, sensor_epochs
 from railfix.pipeline.smoothed_track import Replay, SmoothedTrack
-from railfix.pipeline.solution import with_coordinates
+from railfix.pipeline.solution import Solution, with_coordinates
 from railfix.positioning.carrier import CycleSlipState, Slips, corrected_phase_m, find_slips
 from railfix.positioning.map_offset import beyond_threshold
 from railfix.ranges.corrected import CorrectedRanges
@@ -110,11 +109,8 @@ def along_track(
     return result, replays, after
 
 
-def single_epochs(chunk: Chunk, antenna: str, config: Config) -> SingleEpochs:
-    """Return what the filter of an antenna uses of the positions of single epochs."""
-    assert chunk.solution is not None, "single epochs are positioned before the filter"
-    k = chunk.names.index(antenna)
-    solution, interference = take_epochs(chunk.solution, chunk.antennas.parts[k]), chunk.interference[k]
+def single_epochs(solution: Solution, interference: Interference | None, config: Config) -> SingleEpochs:
+    """Return what the filter of an antenna uses of the positions of its single epochs."""
     has = with_coordinates(config.failed_checks)[solution.status]
     return SingleEpochs(
         noise_scale=solution.noise_scale,

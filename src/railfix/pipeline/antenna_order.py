@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Datetimes
-from railfix.screens.base import pair_epochs
+from railfix.screens.pairs import pair_epochs
 from railfix.track.trajectory import Trajectory
 
 #: Pairs of positions within so much of the line share their reflections, and count as one sample [m].

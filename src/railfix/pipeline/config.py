@@ -25,16 +25,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, create_model, field_validator, model_validator
 
-from railfix.core.settings import Settings, load_settings, validate
+from railfix.core.settings import Settings, validate
+from railfix.core.settings_files import load_settings
 from railfix.integrity.interference import InterferenceLimits
+from railfix.integrity.persistent_biases import LastingErrorLimits
 from railfix.integrity.protection import RiskBudget
 from railfix.integrity.protection.araim import AraimBudget
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, CycleSlipLimits, PhaseLimits, SmoothingLimits
+from railfix.positioning.igg3_fit import RobustFitLimits
+from railfix.positioning.inter_system import ClockOffsetLimits
 from railfix.positioning.line_fix import FixLimits
 from railfix.positioning.map_offset import MapOffsetLimits
 from railfix.positioning.normal_equations import ConstrainedLimits, SinglePointLimits
-from railfix.positioning.receiver_noise import ClockOffsetLimits, LastingErrorLimits, NoiseScaleLimits, RobustFitLimits
+from railfix.positioning.receiver_noise import NoiseScaleLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.two_frequencies import TwoFrequencyLimits
 from railfix.ranges.base_station import BaseLimits

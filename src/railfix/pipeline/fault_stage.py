@@ -19,16 +19,12 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import reject
 from railfix.positioning.antenna_rows import AntennaRows
+from railfix.positioning.igg3_fit import RobustFit, robust_on_line
 from railfix.positioning.line_fix import LineFix
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.normal_equations import misfit
 from railfix.positioning.range_arrays import Ranges
-from railfix.positioning.receiver_noise import (
-    NoiseState,
-    RobustFit,
-    noise_scale,
-    robust_on_line,
-)
+from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.
@@ -135,7 +131,7 @@ def contradict_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Flo
         known = np.isfinite(arc)
         position = np.where(known[:, None], antennas.at_arc(arc), 0.0)
         wsse = np.where(known, misfit(ranges, position), np.nan)
-    freedom = ranges.n_used - ranges.n_clocks - 3
+    freedom = ranges.space_redundancy
     shown = np.maximum(1.0, point.wsse / np.maximum(freedom, 1))
     lost = (freedom >= 1) & ((wsse - point.wsse) / shown > _chi_square_limit(config.off_map_risk, 2))
     beyond = constrained.overshoot_m > np.maximum(4.0 * constrained.sigma_m, antennas.sigma_plan_m)

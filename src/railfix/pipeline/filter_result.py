@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Masks
-from railfix.core.tables import NotebookTable, median_text, plural, time_span_text
+from railfix.core.notebook import NotebookTable, median_text, plural, time_span_text
 from railfix.core.timescale import seconds
 from railfix.integrity.interference import WheelSigns, WheelState
 from railfix.kernels.tracking import index as ix

@@ -12,8 +12,8 @@ import numpy as np
 from railfix.core.arrays import Bits, Bytes, Codes, Floats, Indices, Integers, Masks, copy_with, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.epoch_rows import join_epochs, take_epochs
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason, Status
-from railfix.core.tables import NotebookTable
 from railfix.core.timescale import GPS_EPOCH
 from railfix.integrity.interference import (
     CAUSES,
@@ -141,8 +141,8 @@ def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
 
 
 def _find_interference(
-    corrected: CorrectedRanges,
-    rows: Indices,
+    cn0: Floats,
+    gain: Floats,
     alarm: Bytes,
     failed: Masks,
     inputs: MotionInputs,
@@ -152,13 +152,10 @@ def _find_interference(
 ) -> tuple[Interference, InterferenceState]:
     """Return the interference of some epochs of one antenna, and the state for the next chunk.
 
-    `alarm`: alarms of the receiver since the previous epoch, of each; `failed`: their position failed a check.
+    `cn0`: of the codes, shape (T, K); `gain`: of the front end; `alarm`: alarms of the receiver since the previous
+    epoch, of each; `failed`: their position failed a check.
     """
-    other_signal = (corrected.reason[rows] & _NOT_ITS_SIGNAL) != 0
-    cn0 = np.where(other_signal | np.isnan(corrected.code_m[rows]), np.nan, corrected.cn0_dbhz[rows])
-    power, power_state = power_signs(
-        inputs.time, inputs.channel, cn0, corrected.observations.front_end_gain[rows], state.power, limits
-    )
+    power, power_state = power_signs(inputs.time, inputs.channel, cn0, gain, state.power, limits)
     motion, motion_state = motion_signs(inputs, state.motion, limits, fitted)
     signs = _signs(alarm, failed, power, motion, limits)
     hold, release = _times(limits)
@@ -219,9 +216,8 @@ class _Due(NamedTuple):
     last: int  #: GPS second of the last epoch.
 
 
-def _due(corrected: CorrectedRanges, gps_second: Integers, rows: slice, state: InterferenceState) -> _Due:
-    """Return the epochs of one antenna at which interference is checked."""
-    second = gps_second[rows]
+def _due(second: Integers, rows: slice, alarms: Bytes, breaks: Masks, state: InterferenceState) -> _Due:
+    """Return the epochs of one antenna at which interference is checked, by the GPS second of each; shapes (T,)."""
     due = np.empty(len(second), dtype=np.bool_)
     due[:1], due[1:] = second[:1] != state.second, second[1:] != second[:-1]
     group = due.cumsum()
@@ -229,8 +225,8 @@ def _due(corrected: CorrectedRanges, gps_second: Integers, rows: slice, state: I
     alarm, broken = np.zeros(count, dtype=np.uint8), np.zeros(count, dtype=np.bool_)
     alarm[0], broken[0] = state.alarm, state.broken
     # epochs after a checked epoch belong to the next one
-    np.bitwise_or.at(alarm, group - due, corrected.observations.receiver_alarm[rows])
-    np.logical_or.at(broken, group - due, corrected.break_before[rows])
+    np.bitwise_or.at(alarm, group - due, alarms)
+    np.logical_or.at(broken, group - due, breaks)
     last = int(second[-1]) if len(second) else state.second
     return _Due(due.nonzero()[0] + (rows.start or 0), group, alarm, broken, last)
 
@@ -281,12 +277,16 @@ def judge_interference(
     if limits.use == "off":
         return [None] * len(states), states
     second = (corrected.time.astype(np.int64) - _FIRST_NS) // _SECOND_NS
-    due = antennas.apart(lambda _, rows, state: _due(corrected, second, rows, state), states)
+    alarms, breaks = corrected.observations.receiver_alarm, corrected.break_before
+    due = antennas.apart(lambda _, rows, own: _due(second[rows], rows, alarms[rows], breaks[rows], own), states)
     rows = np.concatenate([own.rows for own in due])
     broken = np.concatenate([own.broken[:-1] for own in due])
     if any(len(own.rows) or not len(own.group) for own in due):
         inputs = _motion_inputs(corrected, single, antennas, rows, broken)
         fitted = fit_motion(inputs, limits)
+    other_signal = (corrected.reason & _NOT_ITS_SIGNAL) != 0
+    cn0 = np.where(other_signal | np.isnan(corrected.code_m), np.nan, corrected.cn0_dbhz)
+    gain = corrected.observations.front_end_gain
     found: list[Interference] = []
     after: list[InterferenceState] = []
     first = 0
@@ -294,8 +294,8 @@ def judge_interference(
         new, at = None, slice(first, first := first + len(own.rows))
         if len(own.rows) or not len(own.group):
             new, state = _find_interference(
-                corrected, own.rows, own.alarm[:-1], _FAILED[single.status[own.rows]], inputs.take(at), fitted.take(at),
-                state, limits,
+                cn0[own.rows], gain[own.rows], own.alarm[:-1], _FAILED[single.status[own.rows]], inputs.take(at),
+                fitted.take(at), state, limits,
             )  # fmt: skip
         if len(own.group):
             new, state = _on_all_epochs(own, new, state)

@@ -226,16 +226,14 @@ def compute_araim(
     corrected: CorrectedRanges,
     solution: Solution,
     antennas: AntennaRows,
-    support: IntegritySupport | None,
+    support: IntegritySupport,
     config: Config,
-) -> AraimResult | None:
-    """Return ARAIM levels of positions on the line, shape (T,); None without an integrity support message.
+) -> AraimResult:
+    """Return ARAIM levels of positions on the line, shape (T,).
 
     Integrity: URA of the message, atmosphere of `Config.nominal` and the noise of the ranges by its scale; accuracy and
     thresholds: URE instead of URA. The ranges have all reasons.
     """
-    if support is None:
-        return None
     place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
     stated = support.arrays(corrected.satellite[channels].tolist())

@@ -12,13 +12,12 @@ from typing import Final, NamedTuple
 import numpy as np
 import scipy
 
-from railfix.core.arrays import Codes, Floats, Masks, copy_with, patch_rows
+from railfix.core.arrays import Bits, Codes, Floats, Integers, Masks, copy_with, patch_rows
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.epoch_rows import take_epochs
 from railfix.core.reasons import Reason, Status
-from railfix.integrity.fault_exclusion import add_p4_level
 from railfix.integrity.point_validation import validate_point
-from railfix.integrity.raim import LinearModel
+from railfix.integrity.raim import LinearModel, reliability
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import OFF_MAP_S, Config
 from railfix.pipeline.fault_stage import CheckedRanges, check_ranges, contradict_map
@@ -67,12 +66,14 @@ def position_stage(
     )  # fmt: skip
     corrected = reject(corrected, points.gross, Reason.GROSS_ERROR)
     fix = fix_on_line(points.ranges, antennas, points.tied, config.fix_limits)
-    corrected = reject(corrected, _alone_on_clock(corrected, points.ties), Reason.ALONE_ON_ITS_CLOCK)
+    corrected = reject(
+        corrected, _alone_on_clock(corrected.reason, corrected.channels.groups, points.ties), Reason.ALONE_ON_ITS_CLOCK
+    )
     checked, states = check_ranges(corrected, points.ranges, antennas, fix, config, states)
     corrected, fix, model, scale = checked.corrected, checked.fix, checked.model, checked.scale
     constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
     # ranges that contradict each other in space contradict every map
-    unresolved = corrected.unsure | _contradict(fix.point, checked.ranges, scale)
+    unresolved = corrected.unsure | _contradict(fix.point, checked.ranges.space_redundancy, scale)
     off_map = checked.off_map & ~unresolved
 
     excluded = checked.lasting | checked.raim.excluded
@@ -91,7 +92,8 @@ def position_stage(
     )  # fmt: skip
     raim = checked.raim
     if "raim" in config.screens and config.raim_protection == "on":
-        raim = add_p4_level(raim, model, scale, limits=config.raim)
+        level = reliability(model, limits=config.raim, scale=scale).protection_level_m
+        raim = copy_with(raim, protection_level_m=np.where(raim.faulty, np.nan, level))
     corrected = reject(corrected, raim.excluded, Reason.FAULT_EXCLUDED)
     checked = checked._replace(corrected=corrected, raim=raim)
     level, open_elsewhere = level_stage(checked, antennas, offset, config)
@@ -107,7 +109,8 @@ def position_stage(
         off_map = contradict_map(checked.ranges, antennas, fix, sigma.arc_m, config) & ~unresolved
     observed = np.asarray(np.isfinite(corrected.code_m).any(axis=1))
     failed = off_map, raim.faulty | unresolved, open_elsewhere
-    status = _status(observed, checked.ranges, solution, sigma.judged_m, failed, config)
+    counts = checked.ranges.n_used, checked.ranges.redundancy
+    status = _status(observed, counts, solution, sigma.judged_m, failed, config)
     after = [
         copy_with(
             state, offsets=offsets[k], map_offset=map_states[k], off_map=off_map_states[k], carrier=carriers[k]
@@ -117,11 +120,11 @@ def position_stage(
     return corrected, copy_with(solution, status=status), after
 
 
-def _alone_on_clock(corrected: CorrectedRanges, ties: InterSystemBiases) -> Masks:
+def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBiases) -> Masks:
     """Return the satellites that are the only ones of a clock without a known bias, shape (T, K)."""
-    alone = np.zeros(corrected.reason.shape, dtype=bool)
-    for g, group in enumerate(corrected.channels.groups):
-        used = corrected.reason[:, group] == 0
+    alone = np.zeros(reason.shape, dtype=bool)
+    for g, group in enumerate(groups):
+        used = reason[:, group] == 0
         lone = (used.sum(axis=1) == 1) & (ties.sigma_m[:, g] >= UNTIED_M)
         alone[:, group] = used & lone[:, None]
     return alone
@@ -137,20 +140,19 @@ def _consistent(
     """Return ranges and 3-D positions for the test of the map: without the `excluded` satellites where all ranges
     together contradict each other, NaN where they still do or the wrong one cannot be identified.
     """
-    wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing, scale)[:, None]
+    wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing.space_redundancy, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
     if len(changed):
         agreeing = without(agreeing, wrong)
         start = np.where(np.isnan(free.ecef_m), corrected.near_ecef_m, free.ecef_m)[changed]
         solved = point_position(agreeing.take(changed), start, limits=config.single_point)
         free = patch_rows(free, changed, solved)
-    unusable = corrected.unsure | _contradict(free, agreeing, scale)
+    unusable = corrected.unsure | _contradict(free, agreeing.space_redundancy, scale)
     return agreeing, copy_with(free, ecef_m=np.where(unusable[:, None], np.nan, free.ecef_m))
 
 
-def _contradict(point: SinglePoint, ranges: Ranges, scale: Floats) -> Masks:
-    """Return the epochs whose ranges contradict each other in space, shape (T,)."""
-    freedom = ranges.n_used - ranges.n_clocks - 3
+def _contradict(point: SinglePoint, freedom: Integers, scale: Floats) -> Masks:
+    """Return the epochs whose ranges, so many redundant ones, contradict each other in space, shape (T,)."""
     return np.asarray((freedom >= 1) & (point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2))
 
 
@@ -223,7 +225,7 @@ def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, 
 
 def _status(
     observed: Masks,
-    ranges: Ranges,
+    counts: tuple[Integers, Integers],
     solution: Solution,
     sigma: Floats,
     failed: tuple[Masks, Masks, Masks],
@@ -231,13 +233,14 @@ def _status(
 ) -> Codes:
     """Return the status of each epoch, shape (T,): the first condition that is true, the most serious first.
 
-    `failed`: ranges that contradict the map, or each other, and other possible positions; shape (T,) each.
+    `counts`: ranges that are used, and redundant ones; `failed`: ranges that contradict the map, or each other, and
+    other possible positions; shape (T,) each.
     """
     off_map, inconsistent, open_elsewhere = failed
-    redundancy, constrained, section = ranges.redundancy, solution.fix.constrained, solution.fix.section
+    (n_used, redundancy), constrained, section = counts, solution.fix.constrained, solution.fix.section
     conditions = [
         (~observed, Status.NO_OBSERVATION),
-        ((ranges.n_used < config.min_satellites) | (redundancy < 0), Status.TOO_FEW_SATELLITES),
+        ((n_used < config.min_satellites) | (redundancy < 0), Status.TOO_FEW_SATELLITES),
         (constrained.dilution > config.dilution_limit, Status.UNOBSERVABLE),
         (~np.isfinite(solution.arc_m), Status.NO_CONVERGENCE),
         (off_map, Status.OFF_MAP),
@@ -250,7 +253,7 @@ def _status(
         ),
         (constrained.overshoot_m > 0.0, Status.MAP_END),
     ]
-    status = np.full(len(ranges), Status.OK, dtype=np.int8)
+    status = np.full(len(observed), Status.OK, dtype=np.int8)
     for condition, value in reversed(conditions):
         status[condition] = value
     return status

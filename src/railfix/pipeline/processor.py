@@ -54,7 +54,7 @@ from railfix.screens import (
     ScreenSetup,
     in_order,
 )
-from railfix.screens.base import pair_antennas
+from railfix.screens.pairs import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
@@ -291,7 +291,7 @@ class EpochProcessor:
                 check_type(value, expected, what)
         for name, part in observations.items():
             check_type(part, Observations, f"observations of antenna {name}")
-            _check_rising(name, part, state.antennas.get(name))
+            _check_rising(name, part.time, state.antennas.get(name))
         began = min((part.time[0] for part in observations.values() if len(part)), default=np.datetime64("NaT", "ns"))
         received = receive(
             state.received or self.received, self.config, began, navigation=navigation, messages=messages
@@ -333,9 +333,11 @@ class EpochProcessor:
             corrected, solution, antennas, [own.interference for own in own_states], self.config.interference
         )
         status = with_statuses(solution.status, [own.suspicion for own in interference if own is not None])
-        araim = compute_araim(corrected, solution, antennas, self._support, self.config)
-        solution = copy_with(solution, status=status, araim=araim)
-        status, judged = screen_positions(chunk, solution, self._of_positions, self.config)
+        if self._support is not None:
+            araim = compute_araim(corrected, solution, antennas, self._support, self.config)
+            solution = copy_with(solution, araim=araim)
+        solution = copy_with(solution, status=status)
+        status, judged = screen_positions(chunk.pair, chunk.rows, antennas, solution, self._of_positions, self.config)
         chunk = copy_with(
             chunk, corrected=corrected, solution=copy_with(solution, status=status), interference=interference,
             judged=judged,
@@ -380,12 +382,15 @@ class EpochProcessor:
 
         Two antennas are filtered in two threads.
         """
+        assert chunk.solution is not None, "single epochs are positioned before the filter"
+        interference = dict(zip(chunk.names, chunk.interference, strict=True))
 
         def one_antenna(name: str) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
             rows, sensors = chunk.rows[name], chunk.sensors
             return along_track(
                 take_epochs(chunk.corrected, rows), take_epochs(chunk.slips, rows),
-                single_epochs(chunk, name, self.config), self.lines[name], self.config,
+                single_epochs(take_epochs(chunk.solution, rows), interference[name], self.config), self.lines[name],
+                self.config,
                 state.fusion.get(name) or FilterState(), samples=sensors,
                 references=self._line_references(name, sensors),
             )  # fmt: skip
@@ -424,9 +429,8 @@ def _check_received(navigation: Navigation | None, messages: SbasMessages | None
             check_type(value, expected, what)
 
 
-def _check_rising(name: str, observations: Observations, before: AntennaState | None) -> None:
+def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> None:
     """Raise ValueError where an epoch is not after the preceding one, of the chunk `before` or its own."""
-    time = observations.time
     if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
+from railfix.integrity.persistent_biases import LastingErrorState
 from railfix.pipeline.base_station_stage import BaseState
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.filter_result import FilterState
@@ -16,8 +17,9 @@ from railfix.pipeline.interference_stage import InterferenceState
 from railfix.pipeline.observable_checks import ObservableState
 from railfix.pipeline.off_map import OffMapState
 from railfix.pipeline.received import Received
+from railfix.positioning.inter_system import OffsetState
 from railfix.positioning.map_offset import MapOffsetState
-from railfix.positioning.receiver_noise import LastingErrorState, NoiseState, OffsetState
+from railfix.positioning.receiver_noise import NoiseState
 from railfix.positioning.two_frequencies import TwoFrequencyState
 
 

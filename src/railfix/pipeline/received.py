@@ -14,10 +14,10 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.orbits.prepared_records import VALIDITY_S, validity_s
 from railfix.gnss.plausible_records import plausible_navigation
 from railfix.pipeline.config import Config
-from railfix.ranges.base_station import BaseErrors
+from railfix.ranges.base_station import BaseErrors, BaseStationSource
 from railfix.ranges.sbas import DfmcService, SbasCorrections, SbasMessages, SbasState
 from railfix.ranges.sbas.sbas_sources import DfmcSource, SbasSource
-from railfix.ranges.sources import BaseStationSource, BroadcastSource, CorrectionSource, choose_ionosphere
+from railfix.ranges.sources import BroadcastSource, CorrectionSource, choose_ionosphere
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Strings, copy_with
 from railfix.core.epoch_rows import take_epochs
+from railfix.core.notebook import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.core.reasons import Reason, Status
-from railfix.core.tables import NotebookTable, html_list, html_table, median_text, plural, time_span_text
 from railfix.integrity.interference import Sign, WheelSigns
 from railfix.pipeline.chunk import Chunk
 from railfix.pipeline.config import Config

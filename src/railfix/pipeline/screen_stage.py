@@ -17,8 +17,9 @@ from railfix.pipeline.observable_checks import check_observables
 from railfix.pipeline.processor_state import AntennaState
 from railfix.pipeline.range_stage import apply_verdict
 from railfix.pipeline.solution import Solution, with_coordinates
+from railfix.positioning.antenna_rows import AntennaRows
 from railfix.screens import FilteredMotion, PairedEpochs, Screened, ScreenSetup
-from railfix.screens.base import on_pairs
+from railfix.screens.pairs import on_pairs
 
 
 def screen_antennas(
@@ -88,16 +89,21 @@ def screen_pairs(chunk: Chunk, screens: Sequence[tuple[Any, Any]]) -> Chunk:
 
 
 def screen_positions(
-    chunk: Chunk, solution: Solution, screens: Sequence[tuple[Any, Any]], config: Config
+    pair: PairedEpochs | None,
+    rows: Mapping[str, slice],
+    antennas: AntennaRows,
+    solution: Solution,
+    screens: Sequence[tuple[Any, Any]],
+    config: Config,
 ) -> tuple[Codes, dict[str, dict[str, Screened]]]:
     """Return the statuses (T,) after the screens that compare positions of two antennas, and verdicts by antenna.
 
     Both antennas get the status of a screen.
     """
-    status, pair, judged = solution.status.copy(), chunk.pair, {name: dict[str, Screened]() for name in chunk.names}
+    status, judged = solution.status.copy(), {name: dict[str, Screened]() for name in rows}
     if pair is None or not screens:
         return status, judged
-    chainage, rows = chunk.antennas.chainage_at(solution.arc_m), chunk.rows
+    chainage = antennas.chainage_at(solution.arc_m)
     epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
     for screen, limits in screens:
         verdict = screen.judge(*(chainage[rows[name]][own] for name, own in epochs.items()), pair, limits)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, join_rows
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.tracking import (
     BackwardInformation,
     GnssEpochs,

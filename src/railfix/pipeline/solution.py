@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Masks, read_only
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
-from railfix.core.tables import NotebookTable
 from railfix.integrity.fault_exclusion import RaimResult
 from railfix.integrity.protection import ProtectionLevel
 from railfix.integrity.protection.araim import AraimResult

@@ -21,9 +21,9 @@ from railfix.pipeline.range_stage import raw_ranges
 from railfix.pipeline.received import Received, broadcast_source
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
+from railfix.positioning.igg3_fit import robust_fit
 from railfix.positioning.normal_equations import SinglePoint, point_position
 from railfix.positioning.range_arrays import Ranges, weighted_ranges, without
-from railfix.positioning.receiver_noise import robust_fit
 from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_satellites
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
@@ -130,7 +130,7 @@ def ranges_without_map(obs: Observations, received: Received, config: Config, bo
 
 def _solvable(ranges: Ranges) -> Masks:
     """Return the epochs with at least as many satellites as unknowns, shape (T,)."""
-    return np.asarray(ranges.n_used - ranges.n_clocks >= 3)
+    return np.asarray(ranges.space_redundancy >= 0)
 
 
 def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, Masks]:
@@ -152,7 +152,7 @@ def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, M
 
 def _rms_m(ranges: Ranges, point: SinglePoint) -> Floats:
     """Return the root mean square of the residuals by degrees of freedom, shape (T,) [m]; 0 without any."""
-    freedom = ranges.n_used - ranges.n_clocks - 3
+    freedom = ranges.space_redundancy
     square = np.where(ranges.weight > 0, point.residual_m, 0.0) ** 2
     return np.asarray(np.where(freedom >= 1, np.sqrt(square.sum(axis=1) / np.maximum(freedom, 1)), 0.0))
 
@@ -180,10 +180,10 @@ def locate_ranges(time: Datetimes, seen: RangesWithoutMap, config: Config) -> Lo
     start = np.where(np.isnan(seen.near_ecef_m), _below(ranges), seen.near_ecef_m)
     fit = robust_fit(ranges, start, limits=config.robust_fit)
     rest = without(ranges, (ranges.weight > 0) & ~fit.kept)
-    checked = rest.n_used - rest.n_clocks > 3  # one range too many at least, or nothing shows which ones are wrong
+    checked = rest.space_redundancy > 0  # one range too many at least, or nothing shows which ones are wrong
     ranges = without(ranges, (ranges.weight > 0) & ~fit.kept & checked[:, None])
     point = point_position(ranges, start, limits=config.single_point)
-    freedom = ranges.n_used - ranges.n_clocks - 3
+    freedom = ranges.space_redundancy
     scale = np.where(freedom >= 1, point.wsse / np.maximum(freedom, 1), 1.0)
     no_position = seen.no_position
     for failed, reason in (

@@ -2,7 +2,15 @@
 
 from .antenna_rows import AntennaRows
 from .approximate import ApproximatePosition, approximate_position
-from .inter_system import PointPositions, TieLimits, tie_constellations
+from .igg3_fit import RobustFit, RobustFitLimits, robust_fit, robust_on_line
+from .inter_system import (
+    ClockOffsetLimits,
+    OffsetState,
+    PointPositions,
+    TieLimits,
+    tie_clocks,
+    tie_constellations,
+)
 from .line_fix import FixLimits, LineFix, fix_on_line
 from .noise_windows import Windows
 from .normal_equations import (
@@ -14,17 +22,7 @@ from .normal_equations import (
     position_on_line,
 )
 from .range_arrays import InterSystemBiases, Ranges, weighted_ranges, without
-from .receiver_noise import (
-    ClockOffsetLimits,
-    NoiseScaleLimits,
-    OffsetState,
-    RobustFit,
-    RobustFitLimits,
-    noise_scale,
-    robust_fit,
-    robust_on_line,
-    tie_clocks,
-)
+from .receiver_noise import NoiseScaleLimits, noise_scale
 from .search_index import SearchIndex
 from .section_search import Section, SectionLimits, find_section
 

@@ -103,15 +103,10 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
     if not others:
         return first, (EVERY,)
     ends = [0, *accumulate(map(len, observations))]
-    same = all(_has_same_channels(first, other) for other in others)
+    keys = {
+        (each.satellite.tobytes(), each.signal.tobytes(), *sorted(each.header.glonass_channel.items()))
+        for each in observations
+    }
+    same = len(keys) == 1  # channels in the same order, and frequencies of GLONASS
     stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
-
-
-def _has_same_channels(first: Observations, other: Observations) -> bool:
-    """Whether two receivers have the same channels in the same order, and GLONASS satellites the same frequencies."""
-    return (
-        first.satellite.tobytes() == other.satellite.tobytes()
-        and first.signal.tobytes() == other.signal.tobytes()
-        and first.header.glonass_channel == other.header.glonass_channel
-    )

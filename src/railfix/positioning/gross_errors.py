@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Integers, Masks, kernel_array
+from railfix.core.arrays import Floats, Masks, kernel_array
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.positioning.antenna_rows import AntennaRows
@@ -49,7 +49,7 @@ def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
     """
     place, factor = start_ecef_m.copy(), np.ones(ranges.weight.shape)
     root = np.sqrt(ranges.weight)
-    going = np.flatnonzero(ranges.n_used - ranges.n_clocks >= 3)
+    going = np.flatnonzero(ranges.space_redundancy >= 0)
     place[np.setdiff1d(np.arange(len(place)), going)] = np.nan
     for k in range(_STEPS):
         if not len(going):
@@ -83,10 +83,6 @@ def _median(values: Floats) -> Floats:
     return middle
 
 
-def _freedom(ranges: Ranges, unknowns: int) -> Integers:
-    return np.asarray(ranges.n_used - ranges.n_clocks - unknowns, dtype=np.int64)
-
-
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     """Return the raw codes that are off by more than `GROSS_M`, shape (T, M), where the others agree on a position.
 
@@ -99,9 +95,9 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
     located = np.isfinite(place[:, 0])
     agree = _median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M
-    clear = (_freedom(rest, 3) >= _LEFT_IN_SPACE) & agree & located
+    clear = (rest.space_redundancy >= _LEFT_IN_SPACE) & agree & located
     found = gross & clear[:, None]
-    few = np.flatnonzero(gross.any(axis=1) & ~clear & located & (_freedom(ranges, 3) >= 2))
+    few = np.flatnonzero(gross.any(axis=1) & ~clear & located & (ranges.space_redundancy >= 2))
     if len(few):
         found[few] = _one_of_few(ranges.take(few), place[few])
     return found
@@ -120,7 +116,7 @@ def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
         equations = normal_equations(each, place)
         place = place + _step(equations.matrix, equations.vector)
     even = replace(each, weight=kernel_array((each.weight > 0).astype(np.float64)))
-    freedom = _freedom(each, 3)
+    freedom = each.space_redundancy
     square = normal_equations(even, np.nan_to_num(place)).wsse / np.maximum(freedom, 1)
     size = np.full((epochs, channels), np.inf)
     size[epoch, channel] = np.where((freedom >= 1) & np.isfinite(place[:, 0]), np.sqrt(square), np.inf)
@@ -152,11 +148,11 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
     """
     place = least_absolute(ranges, start_ecef_m)
     white = np.abs(residuals_at(ranges, place)) * np.sqrt(ranges.weight)
-    freedom = _freedom(ranges, 3)
+    freedom = ranges.space_redundancy
     spread = _median(white) * np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN
     found = white > _DISAGREE * np.maximum(1.0, spread)[:, None]
     rest = replace(ranges, weight=np.where(found, 0.0, ranges.weight))
-    enough = (_freedom(rest, 3) >= _LEFT_IN_SPACE) & np.isfinite(place[:, 0])
+    enough = (rest.space_redundancy >= _LEFT_IN_SPACE) & np.isfinite(place[:, 0])
     return np.asarray(found & enough[:, None])
 
 
@@ -207,7 +203,7 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
         rival = np.where(others, cost, np.inf).min(axis=1)
         clear[rows] = rival - own[each, best] > _CLEAR * GROSS_M
     rest = replace(ranges, weight=np.where(gross, 0.0, ranges.weight))
-    agreed = (_freedom(rest, 1) >= _LEFT_ON_LINE) & (_median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M)
+    agreed = (rest.redundancy >= _LEFT_ON_LINE) & (_median(np.abs(np.where(gross, np.nan, residual))) < AGREEING_M)
     return LineScan(arc, gross, agreed, clear)
 
 
@@ -268,8 +264,8 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
         suspect[rows] |= np.asarray(index.tree.query(point.ecef_m[rows])[0]) > _BESIDE_M
     # ranges that agree in space have no gross error, wherever the map is
     largest = np.abs(residual).max(axis=1, initial=0.0)
-    agree = located & (_freedom(ranges, 3) >= _LEFT_IN_SPACE) & (largest < 0.5 * GROSS_M)
-    suspect &= ~agree & (_freedom(ranges, 1) > 0)
+    agree = located & (ranges.space_redundancy >= _LEFT_IN_SPACE) & (largest < 0.5 * GROSS_M)
+    suspect &= ~agree & (ranges.redundancy > 0)
     height = geodetic_from_ecef(np.where(located[:, None], point.ecef_m, [6.4e6, 0.0, 0.0]))[2]
     nowhere = ~located | (height < _HEIGHTS_M[0]) | (height > _HEIGHTS_M[1])
     for index, rows in antennas.split(np.flatnonzero(suspect)):

@@ -1,20 +1,118 @@
-"""3-D positions of several constellations, whose receiver clocks are tied by the biases known from earlier epochs."""
+"""3-D positions of several constellations, whose receiver clocks are tied by the biases known from earlier epochs.
+
+The offsets of the constellations' clocks are stable to a metre over hours. Once one is known, a single satellite of a
+constellation contributes, and every satellite is checked against all others. It is estimated from earlier epochs only,
+so that results do not depend on chunks.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Masks, patch_rows
 from railfix.core.epoch_rows import EVERY
+from railfix.core.settings import Settings
 from railfix.positioning.gross_errors import gross_alone
+from railfix.positioning.igg3_fit import RobustFitLimits, robust_fit
+from railfix.positioning.noise_windows import Dated, correlated_sums
 from railfix.positioning.normal_equations import SinglePoint, SinglePointLimits, point_position
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges, without
-from railfix.positioning.receiver_noise import ClockOffsetLimits, OffsetState, RobustFitLimits, robust_fit, tie_clocks
+
+
+class ClockOffsetLimits(Settings):
+    """Limits of the inter-system biases."""
+
+    #: Standard deviation of an offset about its mean; infinite leaves every constellation its own clock. On an urban
+    #: recording the spread was 1.0 m (Galileo, BeiDou).
+    stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
+    #: Epochs nearer to each other than this are not independent: errors of a standing train are correlated over tens of
+    #: seconds.
+    correlation_s: float = Field(default=30.0, gt=0)
+    #: Time constant of forgetting: offsets are stable to a metre over hours, so half an hour loses nothing, and the
+    #: effect of a receiver restart or of an undetected error fades.
+    window_s: float = Field(default=1800.0, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetState:
+    """Offsets estimated so far, by clock letter."""
+
+    information: Mapping[str, float] = field(default_factory=dict)  #: [1/m^2].
+    moment: Mapping[str, float] = field(default_factory=dict)  #: Information times offset [1/m].
+    #: Time of the last epoch, NaT before the first.
+    last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    age: float = 0.0  #: Window of the last epoch [windows].
+
+    def sums(self, letters: Sequence[str]) -> Floats:
+        """Return the information of some clocks, then their moments, in one array."""
+        of_each = (self.information, self.moment)
+        return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
+
+    def later(self, letters: Sequence[str], sums: Floats, last: Dated) -> OffsetState:
+        """Return the state with new sums of some clocks (`sums`); the others are unchanged."""
+        count = len(letters)
+        return OffsetState(
+            information={**self.information, **dict(zip(letters, sums[:count], strict=True))},
+            moment={**self.moment, **dict(zip(letters, sums[count:], strict=True))},
+            last=last[0],
+            age=last[1],
+        )
+
+
+def tie_clocks(
+    time: Datetimes,
+    clocks: tuple[str, ...],
+    reference: str,
+    ranges: Ranges,
+    free: SinglePoint,
+    states: Sequence[OffsetState],
+    *,
+    parts: Sequence[slice] = (EVERY,),
+    limits: ClockOffsetLimits | None = None,
+) -> tuple[InterSystemBiases, list[OffsetState]]:
+    """Return the inter-system biases (P1 3.3: constellations) known from the epochs before each, and new states.
+
+    `ranges`: without ties, those that agree with each other alone, with the letter of each of its groups in `clocks`;
+    `free`: position with every clock on its own and a redundant range; `parts`: rows of each receiver.
+    """
+    limits = limits or ClockOffsetLimits()
+    epochs = len(time)
+    offset, sigma = np.zeros((epochs, len(clocks))), np.full((epochs, len(clocks)), UNTIED_M)
+    freedom = np.maximum(ranges.space_redundancy, 1)
+    misfit = np.maximum(1.0, free.wsse / freedom)
+    others = [g for g, letter in enumerate(clocks) if letter != reference]
+    letters = [clocks[g] for g in others]
+    sample = np.zeros((epochs, 2 * len(others)))
+    if reference in clocks:
+        base = [clocks.index(reference)]
+        sigma[:, base] = 0.0
+        used = ranges.weight > 0
+        total = np.maximum(np.add.reduceat(ranges.weight, ranges.starts, axis=1), 1e-12)
+        two = np.add.reduceat(used, ranges.starts, axis=1, dtype=np.intp) >= 2
+        known = np.isfinite(free.wsse) & (ranges.space_redundancy > 0)
+        usable = two[:, others] & two[:, base] & known[:, None]
+        variance = misfit[:, None] * (1.0 / total[:, others] + 1.0 / total[:, base])
+        weight = np.where(usable, 1.0 / variance, 0.0)
+        difference = np.where(usable, free.clock_m[:, others] - free.clock_m[:, base], 0.0)
+        sample = np.concatenate([weight, weight * difference], axis=1)
+    before, _, sums, last = correlated_sums(
+        time, sample, np.array([state.sums(letters) for state in states]), parts,
+        [(state.last, state.age) for state in states], window_s=limits.window_s, correlation_s=limits.correlation_s,
+    )  # fmt: skip
+    after = [state.later(letters, *ended) for state, *ended in zip(states, sums, last, strict=True)]
+    of_information, of_moment = before[:, : len(others)], before[:, len(others) :]
+    has = of_information > 0.0
+    safe = np.where(has, of_information, 1.0)
+    offset[:, others] = np.where(has, of_moment / safe, 0.0)
+    spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
+    sigma[:, others] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
+    return InterSystemBiases(offset_m=offset, sigma_m=sigma), after
 
 
 class PointPositions(NamedTuple):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Indices, patch_rows
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.normal_equations import (
     Constrained,

@@ -17,8 +17,8 @@ from pydantic import Field
 
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Masks, kernel_array
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
-from railfix.core.tables import NotebookTable
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.noise_windows import correlated_sums
 from railfix.positioning.normal_equations import SinglePoint
@@ -139,7 +139,7 @@ def map_offset(
 ) -> tuple[MapOffset, list[MapOffsetState]]:
     """Compute the mean offset of 3-D positions from the line, each epoch's included; states are by antenna."""
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
-    usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
+    usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.space_redundancy > 0)
     arc = np.where(usable, arc_m, 0.0)
     axes, place = antennas.get_axes(antennas.segment_at(arc))[:, 1:], antennas.at_arc(arc)
     at = np.where(usable[:, None], point.ecef_m, place)

@@ -22,8 +22,8 @@ from pydantic import Field
 from railfix import kernels
 from railfix.core.arrays import Floats, Indices, Integers, RowArrays, kernel_array
 from railfix.core.epoch_rows import EVERY
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
-from railfix.core.tables import NotebookTable
 from railfix.positioning.antenna_rows import AntennaRows, Line
 from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
@@ -110,7 +110,7 @@ def position_on_line(
     """
     limits = limits or ConstrainedLimits()
     lines = ((line, EVERY),) if isinstance(line, Trajectory) else AntennaRows.on(line).lines
-    enough = ranges.n_used - ranges.n_clocks >= 1
+    enough = ranges.redundancy >= 0
     parts = []
     for trajectory, rows in lines:
         start = np.full(len(vertex), -1, dtype=np.intp)
@@ -208,7 +208,7 @@ def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePoin
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = kernels.ranges.iterate_points(
         ranges.arrays, kernel_array(np.broadcast_to(near_ecef_m, (len(ranges), 3))),
-        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        ranges.space_redundancy >= 0,
         limits.tolerance_m, limits.max_iterations,
     )  # fmt: skip
     return SinglePoint(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Floats, Indices, Integers, Masks, RowArrays, Strings, kernel_array
 from railfix.core.constants import CLOCK_GROUP
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.gnss.orbits import SatelliteStates
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.corrected import ORBITS_M, is_orbit, is_pseudorange
@@ -111,6 +111,11 @@ class Ranges:
     def redundancy(self) -> Integers:
         """Ranges beyond the clocks and the distance along the line, shape (T,)."""
         return np.asarray(self.n_used - self.n_clocks - 1, dtype=np.int64)
+
+    @property
+    def space_redundancy(self) -> Integers:
+        """Ranges beyond the clocks and a 3-D position, shape (T,)."""
+        return np.asarray(self.n_used - self.n_clocks - 3, dtype=np.int64)
 
 
 #: Satellite position of ranges without weight: any finite value will do [m].

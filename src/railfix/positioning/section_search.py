@@ -107,7 +107,7 @@ def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: Sect
     limits, antennas = limits or SectionLimits(), AntennaRows.on(line)
     epochs = len(ranges)
     weight_norm = np.sqrt(ranges.weight.sum(axis=1))
-    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 1, 1)
+    freedom = np.maximum(ranges.redundancy, 1)
     vertex, other = np.full((2, epochs), -1, dtype=np.intp)
     q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
     evaluations = np.zeros(epochs, dtype=np.int64)

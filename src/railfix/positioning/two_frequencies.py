@@ -21,8 +21,8 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.epoch_rows import EVERY
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
-from railfix.core.tables import NotebookTable
 from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.second_codes import SecondCodes
 

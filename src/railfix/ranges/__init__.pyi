@@ -1,12 +1,13 @@
 # The names of `railfix.ranges`, imported at their first use (lazy-loader).
 
-from .base_station import BaseErrors, BaseLimits
+from .base_station import BaseErrors, BaseLimits, BaseStationSource
 from .channels import DEFAULT_SIGNALS, SECOND_SIGNALS, Channels, select_channels
+from .cn0_curve import Cn0Curve
 from .corrected import AntennaRanges, CorrectedRanges, SatelliteRanges, corrected_ranges, find_satellites
 from .range_sigma import CodeNoise, NominalErrors, code_sigma_m
 from .sbas.sbas_sources import DfmcSource, SbasSource
 from .second_codes import SecondCodes
-from .sources import BaseStationSource, BroadcastSource, CorrectionSource, SourceDelays, SourceSatellites
+from .sources import BroadcastSource, CorrectionSource, SourceDelays, SourceSatellites
 
 __all__ = [
     "DEFAULT_SIGNALS",
@@ -17,6 +18,7 @@ __all__ = [
     "BaseStationSource",
     "BroadcastSource",
     "Channels",
+    "Cn0Curve",
     "CodeNoise",
     "CorrectedRanges",
     "CorrectionSource",

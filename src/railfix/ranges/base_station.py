@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -12,6 +12,10 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Strings
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
+from railfix.gnss.navigation import Navigation
+from railfix.ranges.atmosphere import SeenFrom
+from railfix.ranges.channels import Channels
+from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDelays, SourceSatellites
 
 Values = TypeVar("Values", Floats, Integers)
 #: An epoch of the base station is used for epochs of the train up to this time before it [s]: receiver clocks differ.
@@ -32,18 +36,6 @@ class BaseLimits(Settings):
     sigma_m: float = Field(default=0.3, gt=0)
     #: Random walk of the differences of phases, which replaces `PhaseLimits.drift_m` [m/sqrt(s)].
     drift_m: float = Field(default=0.001, ge=0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaseDifferences:
-    """Corrections from a base station to the ranges of a train, T epochs by K channels."""
-
-    #: NaN where the station has none that is new enough, shape (T, K).
-    code_m: Floats
-    phase_m: Floats
-    arc: Integers  #: Number of the arc of the station's phase, shape (T, K).
-    #: Standard deviation of the errors of satellite and atmosphere that the difference of codes keeps, shape (T, K).
-    sigma_m: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,3 +126,34 @@ def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str
     full = np.full((len(values), len(keys)), blank, dtype=values.dtype)
     full[:, columns] = values
     return full
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseStationSource:
+    """Another source, and the errors of the codes that a base station at a known position has measured with it."""
+
+    other: CorrectionSource
+    errors: BaseErrors
+    limits: BaseLimits
+    floor_sigma_m: float  #: Error floor of codes that the station does not correct (`CodeNoise`) [m].
+    second: Literal["none", "optional", "required"] = "none"
+
+    @property
+    def navigation(self) -> Navigation:
+        """Navigation records of the satellites."""
+        return self.other.navigation
+
+    def satellites(
+        self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
+    ) -> SourceSatellites:
+        """Return the satellites of the other source."""
+        return self.other.satellites(time, channels, code_m, max_age_s=max_age_s)
+
+    def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
+        """Return the delays of the other source and the station's errors, whose sigma replaces that of the source."""
+        given = self.other.delays(time, channels, satellites, seen)
+        base = self.errors.at(time, channels.satellite, channels.signal, seen.receiver_ecef_m, self.limits)
+        differenced = np.isfinite(base.code_m)
+        nominal, beyond = (np.where(differenced, base.sigma_m, each) for each in (given.nominal_m, given.sigma_m))
+        beyond = np.where(differenced, beyond, np.hypot(beyond, self.floor_sigma_m))
+        return SourceDelays(given.delays, beyond, nominal, given.nominal_elevation_sigma_m, base, "included")

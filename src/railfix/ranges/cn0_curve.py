@@ -9,41 +9,22 @@ below the lowest bin there is no curve. The file is TOML.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, field_validator
+from numpy.typing import ArrayLike
+from pydantic import Field
 
 from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
-from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath
-from railfix.core.settings import Settings, read_model_file, write_toml
+from railfix.core.settings import Settings
 from railfix.gnss.observations import ObservationHeader
 
 if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
 
-__all__ = [
-    "KINDS",
-    "Cn0Curve",
-    "Cn0CurveSource",
-    "Cn0Mean",
-    "Cn0Samples",
-    "CurveFit",
-    "SourceFile",
-    "fit_cn0_curve",
-    "read_cn0_curve",
-    "satellite_kind",
-    "write_cn0_curve",
-]
 
-
-#: Standard deviation of a normal variable against its median absolute deviation.
-_NORMAL_MAD: Final = 1.482_602_218_505_602
 #: Numbers of BeiDou satellites 36 000 km above (GEO C01-C05, C59-C63; IGSO: CSNO, constellation status).
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
 _QZSS_GEO: Final = frozenset({7, 8})  #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
@@ -70,16 +51,6 @@ def satellite_kind(satellite: str) -> str:
     if letter == "J" and number in _QZSS_GEO:
         return "J-GEO"
     return letter
-
-
-class CurveFit(Settings):
-    """Settings of the fit of a curve."""
-
-    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
-    least_samples: int = Field(default=30, ge=1)  #: A bin of fewer samples is left out.
-    least_bins: int = Field(default=4, ge=2)  #: A kind and signal of fewer bins gets no curve.
-    #: Samples farther from their bin's median, in robust standard deviations, are left out.
-    clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,157 +164,3 @@ class Cn0Curve:
 def _plain(text: str) -> str:
     """Type of an antenna or receiver with its blanks evened out."""
     return " ".join(text.split())
-
-
-class Cn0Samples:
-    """C/N0 and elevation collected piece by piece, by kind and signal, in single precision."""
-
-    def __init__(self) -> None:
-        self._parts: dict[tuple[str, str], list[NDArray[np.float32]]] = defaultdict(list)
-
-    def add(self, cn0_dbhz: ArrayLike, elevation_deg: ArrayLike, satellite: Strings, signal: Strings) -> None:
-        """Add samples of shape (T, M); those with NaN in either are left out."""
-        cn0, elevation = np.asarray(cn0_dbhz), np.asarray(elevation_deg)
-        finite = np.isfinite(cn0) & np.isfinite(elevation) & (elevation >= 0.0)
-        for m, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
-            rows = finite[:, m]
-            if rows.any():
-                pair = np.stack([elevation[rows, m], cn0[rows, m]]).astype(np.float32)
-                self._parts[satellite_kind(name), code].append(pair)
-
-    def keys(self) -> list[tuple[str, str]]:
-        """Kinds and signals of which there are samples."""
-        return sorted(self._parts)
-
-    def of(self, kind: str, signal: str) -> tuple[Floats, Floats]:
-        """Return the elevation [deg] and C/N0 [dB-Hz] of one kind and signal."""
-        joined = np.concatenate(self._parts[kind, signal], axis=1).astype(np.float64)
-        return joined[0], joined[1]
-
-
-def fit_cn0_curve(
-    samples: Cn0Samples | Iterable[tuple[ArrayLike, ArrayLike, Strings, Strings]],
-    *,
-    fit: CurveFit | None = None,
-    source: Cn0CurveSource | None = None,
-) -> Cn0Curve:
-    """Fit the mean C/N0 over elevation, one curve a kind and signal with bins enough.
-
-    `samples` are collected ones, or C/N0 (T, M), elevation (T, M), satellite and signal (M,), from a position with open
-    sky. ValueError: no kind and signal has samples enough.
-    """
-    fit = fit or CurveFit()
-    if not isinstance(samples, Cn0Samples):
-        collected = Cn0Samples()
-        for part in samples:
-            collected.add(*part)
-        samples = collected
-    means = [_fit_mean(key, *samples.of(*key), fit) for key in samples.keys()]  # noqa: SIM118 (no mapping)
-    fitted = tuple(mean for mean in means if mean is not None)
-    if not fitted:
-        raise ValueError(
-            f"no constellation and signal has {fit.least_bins} bins of {fit.least_samples} samples over elevation"
-        )
-    return Cn0Curve(means=fitted, source=source or Cn0CurveSource())
-
-
-def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
-    """Return the curve of one kind and signal, None with too few bins."""
-    which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
-    bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
-    if len(bins) < fit.least_bins:
-        return None
-    rows = [_robust(cn0[which == b], fit.clip_sigma) for b in bins]
-    return Cn0Mean(
-        kind=key[0],
-        signal=key[1],
-        elevation_deg=(np.array(bins, dtype=np.float64) + 0.5) * fit.bin_deg,
-        mean_dbhz=np.array([row[0] for row in rows]),
-        spread_db=np.array([row[1] for row in rows]),
-        count=np.array([np.count_nonzero(which == b) for b in bins], dtype=np.int64),
-    )
-
-
-def _robust(values: Floats, clip_sigma: float) -> tuple[float, float]:
-    """Return the mean without outliers, and robust standard deviation."""
-    middle = float(np.median(values))
-    spread = _NORMAL_MAD * float(np.median(np.abs(values - middle)))
-    # C/N0 is reported in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish
-    kept = values[np.abs(values - middle) <= clip_sigma * max(spread, 0.5)]
-    return float(kept.mean()), spread
-
-
-FORMAT: Final = "railfix C/N0 curve 1"
-#: Columns of a curve, and the digits that they are written with.
-_DIGITS: Final = {"elevation_deg": 3, "mean_dbhz": 2, "spread_db": 2, "count": 0}
-
-
-def _number(low: float, high: float) -> object:
-    return Field(ge=low, le=high, strict=True, allow_inf_nan=False)
-
-
-class _Curve(Settings):
-    """`Cn0Mean` as columns."""
-
-    kind: str
-    signal: str = Field(min_length=2, max_length=2)
-    elevation_deg: tuple[Annotated[float, _number(0.0, 90.0)], ...]
-    mean_dbhz: tuple[Annotated[float, _number(0.0, 100.0)], ...]
-    spread_db: tuple[Annotated[float, _number(0.0, 50.0)], ...]
-    count: tuple[Annotated[int, Field(ge=1, strict=True)], ...]
-
-    @field_validator("kind")
-    @classmethod
-    def _known_kind(cls, value: str) -> str:
-        if value not in KINDS:
-            raise ValueError(f"one of {', '.join(KINDS)} was expected")
-        return value
-
-
-class _CurveFile(Settings):
-    """Content of the file."""
-
-    format: Literal["railfix C/N0 curve 1"]
-    source: Cn0CurveSource
-    curve: tuple[_Curve, ...] = Field(min_length=1)
-
-
-def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
-    """Write a curve; the file appears whole or not at all. OutputError: it cannot be written."""
-    curves = [
-        {
-            "kind": mean.kind,
-            "signal": mean.signal,
-            **{name: np.round(getattr(mean, name), digits).tolist() for name, digits in _DIGITS.items()},
-        }
-        for mean in curve.means
-    ]
-    comment = "Mean C/N0 over elevation, measured under open sky; belongs to this antenna and receiver only."
-    source = {**curve.source.model_dump(), "position_ecef_m": np.round(curve.source.position_ecef_m, 3).tolist()}
-    values = {"format": FORMAT, "source": source, "curve": curves}
-    write_toml(path, values, what="curve", comment=comment)
-
-
-def read_cn0_curve(path: FilePath) -> Cn0Curve:
-    """Read a curve.
-
-    InputFileError: the file is missing, unreadable, no curve, or an entry of it is unknown, missing or out of range.
-    """
-    file = read_model_file(_CurveFile, path, what="a C/N0 curve", format_name=FORMAT, command="railfix cn0-curve")
-    means = tuple(
-        _mean(path, curve, f"curve {i + 1} ({curve.kind} {curve.signal})") for i, curve in enumerate(file.curve)
-    )
-    try:
-        return Cn0Curve(means=means, source=file.source)
-    except ValueError as error:
-        raise InputFileError(path, f"{error}; each kind and signal stands once") from None
-
-
-def _mean(path: FilePath, curve: _Curve, where: str) -> Cn0Mean:
-    columns = {name: np.array(getattr(curve, name)) for name in _DIGITS}
-    if len({len(values) for values in columns.values()}) != 1:
-        raise InputFileError(path, f"{where}: {', '.join(_DIGITS)} must have the same number of values")
-    try:
-        return Cn0Mean(kind=curve.kind, signal=curve.signal, **columns)
-    except ValueError as error:
-        raise InputFileError(path, f"{where}: {error}") from None

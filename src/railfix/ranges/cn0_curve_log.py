@@ -19,7 +19,8 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.gnss.orbits import satellite_states
 from railfix.io.logs import read_navigation, scan_observations
-from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Samples, CurveFit, SourceFile, fit_cn0_curve
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
+from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
 _SHORT_S: Final = 12 * 3600.0  #: P1 2.3(1) requires about a day; below this a note is made [s].
 _DEFICIT_DBHZ: Final = 10.0  #: P1 table 6: signals this far below the mean are rejected [dB-Hz].

@@ -10,16 +10,15 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.epoch_rows import OnDemand
+from railfix.core.notebook import NotebookTable
 from railfix.core.reasons import Reason
-from railfix.core.tables import NotebookTable
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates
 from railfix.ranges.atmosphere import SeenFrom
-from railfix.ranges.base_station import BaseDifferences
 from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.second_codes import SecondCodes, second_codes
-from railfix.ranges.sources import CorrectionSource, SourceSatellites
+from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSatellites
 
 #: Distances from the centre of the Earth at which navigation satellites are [m].
 ORBITS_M: Final = (2e7, 6e7)

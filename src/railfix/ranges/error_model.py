@@ -16,8 +16,9 @@ from pydantic import Field, field_validator
 
 from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath
-from railfix.core.settings import Settings, option, read_model_file, write_toml
+from railfix.core.settings import Settings, option
+from railfix.core.settings_files import read_model_file, write_toml
+from railfix.core.staged_files import FilePath
 
 __all__ = [
     "LARGEST_PRIOR",

@@ -1,4 +1,6 @@
-"""Sources of corrections behind one protocol: broadcast or precise orbits, a base station (SBAS: `sbas.sources`).
+"""Sources of corrections behind one protocol: broadcast or precise orbits.
+
+`base_station` has a base station, `sbas.sbas_sources` SBAS.
 
 A source gives the satellites at the times of transmission, then the delays of their signals as seen from an
 approximate position of the antenna.
@@ -11,11 +13,10 @@ from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Datetimes, Floats
+from railfix.core.arrays import Bits, Datetimes, Floats, Integers
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, Delays, SeenFrom, model_delays
-from railfix.ranges.base_station import BaseDifferences, BaseErrors, BaseLimits
 from railfix.ranges.channels import Channels
 from railfix.ranges.range_sigma import NominalErrors
 
@@ -27,6 +28,18 @@ class SourceSatellites(NamedTuple):
     fast_m: Floats | None  #: Correction of the codes in addition to the satellite clocks, shape (T, K).
     reason: Bits  #: Reasons of those that the source does not correct, shape (T, K).
     fixes: object = None  #: Corrections of the satellites, for the delays of the same source.
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseDifferences:
+    """Corrections from a base station to the ranges of a train, T epochs by K channels."""
+
+    #: NaN where the station has none that is new enough, shape (T, K).
+    code_m: Floats
+    phase_m: Floats
+    arc: Integers  #: Number of the arc of the station's phase, shape (T, K).
+    #: Standard deviation of the errors of satellite and atmosphere that the difference of codes keeps, shape (T, K).
+    sigma_m: Floats
 
 
 class SourceDelays(NamedTuple):
@@ -131,34 +144,3 @@ class BroadcastSource:
         beyond = np.hypot(delays.sigma_m, self.nominal.unusual_sigma_m(satellites.states.accuracy_m))
         unmodelled = self.nominal.sigma_m(seen.elevation_deg)
         return SourceDelays(delays, beyond, np.hypot(unmodelled, beyond), unmodelled)
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaseStationSource:
-    """Another source, and the errors of the codes that a base station at a known position has measured with it."""
-
-    other: CorrectionSource
-    errors: BaseErrors
-    limits: BaseLimits
-    floor_sigma_m: float  #: Error floor of codes that the station does not correct (`CodeNoise`) [m].
-    second: Literal["none", "optional", "required"] = "none"
-
-    @property
-    def navigation(self) -> Navigation:
-        """Navigation records of the satellites."""
-        return self.other.navigation
-
-    def satellites(
-        self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
-    ) -> SourceSatellites:
-        """Return the satellites of the other source."""
-        return self.other.satellites(time, channels, code_m, max_age_s=max_age_s)
-
-    def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the other source and the station's errors, whose sigma replaces that of the source."""
-        given = self.other.delays(time, channels, satellites, seen)
-        base = self.errors.at(time, channels.satellite, channels.signal, seen.receiver_ecef_m, self.limits)
-        differenced = np.isfinite(base.code_m)
-        nominal, beyond = (np.where(differenced, base.sigma_m, each) for each in (given.nominal_m, given.sigma_m))
-        beyond = np.where(differenced, beyond, np.hypot(beyond, self.floor_sigma_m))
-        return SourceDelays(given.delays, beyond, nominal, given.nominal_elevation_sigma_m, base, "included")

@@ -13,8 +13,9 @@ import polars as pl
 import polars.selectors as cs
 
 from railfix.core.errors import RailfixError
-from railfix.core.files import write_whole
-from railfix.core.tables import Column, Table, count, listing, number, percent, plural, signed
+from railfix.core.notebook import plural
+from railfix.core.staged_files import write_whole
+from railfix.core.tables import Column, Table, count, listing, number, percent, signed
 from railfix.evaluate import RunAndReference, evaluate_runs
 from railfix.evaluate.evaluation_inputs import POSITIONS_TABLE, floats, list_position_tables, read_table
 from railfix.report.charts_page import Block, Notes, Sentence, charts_page

@@ -22,8 +22,10 @@ from plotly.offline import get_plotlyjs
 from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_json_object, write_whole
-from railfix.core.tables import Table, number, plural, share
+from railfix.core.files import read_json_object
+from railfix.core.notebook import plural
+from railfix.core.staged_files import write_whole
+from railfix.core.tables import Table, number, share
 from railfix.core.timescale import seconds
 from railfix.report.plots.chart import Cells, Chart, Layer, Points, SkyEpochs
 from railfix.report.plots.network import network_frame, network_plan

@@ -19,8 +19,8 @@ import polars as pl
 from railfix.core.arrays import Floats, Strings
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import write_whole
 from railfix.core.geodesy import enu_axes
+from railfix.core.staged_files import write_whole
 from railfix.core.tables import number, reading_table
 from railfix.core.timescale import gps_time
 from railfix.evaluate.evaluation_inputs import RunFolder, read_run

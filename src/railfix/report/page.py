@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from railfix.core.arrays import Floats
-from railfix.core.files import path_names, write_whole
+from railfix.core.files import path_names
+from railfix.core.staged_files import write_whole
 from railfix.core.tables import Table, count, number, share
 from railfix.evaluate import Evaluation, EvaluationOptions
 from railfix.evaluate.evaluation_inputs import flat_settings

@@ -24,7 +24,8 @@ from railfix.evaluate.evaluation_inputs import (
 )
 from railfix.evaluate.place import read_run_track
 from railfix.pipeline.config import Config
-from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
+from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.cn0_curve_file import read_cn0_curve
 from railfix.screens import SCREENS
 from railfix.track import Track
 

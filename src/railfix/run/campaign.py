@@ -20,8 +20,9 @@ from typing import Any, Final, Protocol
 import polars as pl
 
 from railfix.core.errors import InputFileError, MismatchError, OutputError, RailfixError, RailfixWarning, SettingsError
-from railfix.core.files import write_whole
-from railfix.core.settings import Settings, load_settings
+from railfix.core.settings import Settings
+from railfix.core.settings_files import load_settings
+from railfix.core.staged_files import write_whole
 from railfix.pipeline.config import Config, load_config
 from railfix.run.driver import run_files
 from railfix.run.inputs import LogReading, RunInputs, RunOptions

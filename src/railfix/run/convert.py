@@ -19,7 +19,7 @@ import polars.selectors as cs
 
 from railfix import __version__
 from railfix.core.errors import NoPositionError, OutputError, needs_extra
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import gpst_to_utc
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations

@@ -16,7 +16,7 @@ import numpy as np
 from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import NoPositionError, check_type, warn_of
-from railfix.core.tables import html_list
+from railfix.core.notebook import html_list
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.logs import read_navigation

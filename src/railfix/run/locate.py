@@ -13,8 +13,8 @@ import polars as pl
 
 from railfix.core.arrays import Floats, join_rows
 from railfix.core.errors import InputFileError, MismatchError, NoPositionError
-from railfix.core.files import write_whole
 from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.staged_files import write_whole
 from railfix.core.tables import reading_table
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations

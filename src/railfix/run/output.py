@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
 from railfix.core.errors import OutputError
-from railfix.core.files import write_error
+from railfix.core.staged_files import write_error
 
 if TYPE_CHECKING:
     import polars as pl

@@ -26,7 +26,7 @@ import railfix.track
 from railfix import __version__
 from railfix.core.arrays import read_only
 from railfix.core.errors import OutputError
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 from railfix.track import Track
 from railfix.track.track import Provenance
 from railfix.track.trajectory import Trajectory

@@ -19,7 +19,7 @@ from railfix.pipeline.base_station_stage import Stations
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.range_stage import Models
-from railfix.ranges.cn0_curve import read_cn0_curve
+from railfix.ranges.cn0_curve_file import read_cn0_curve
 from railfix.ranges.error_model import read_error_model
 from railfix.run.inputs import RunOptions
 from railfix.run.sources import Log

@@ -16,7 +16,8 @@ import polars as pl
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import GRAVITY_MPS2
 from railfix.core.timescale import gpst_minus_utc, seconds, timedelta
-from railfix.motion.samples import GroundUnits, InertialSamples, RadarSpeeds, RadarWatch, SensorSamples, StationRanges
+from railfix.motion.radar_watch import RadarWatch
+from railfix.motion.samples import GroundUnits, InertialSamples, RadarSpeeds, SensorSamples, StationRanges
 from railfix.motion.tachometer import SpeedCheck, TachometerLimits, check_speeds, pulse_speeds
 from railfix.pipeline.sensor_epochs import SensorLimits, ranging_lever_m
 from railfix.track.trajectory import Trajectory

@@ -19,9 +19,10 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import read_json_object, write_whole
+from railfix.core.files import read_json_object
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, option
+from railfix.core.staged_files import write_whole
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.logs import read_navigation
 from railfix.pipeline.config import Config
@@ -287,13 +288,8 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
             origin[None], network.frame, codes[0].time[0], **reading.motion,
             named=network.named,
         )  # fmt: skip
-        origin, size = place[0], float(np.hypot(shift.east_m, shift.north_m))
-        notes += shift.notes
-        if size > 0.0:
-            notes.append(
-                f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
-                f"{shift.used}, the frame of the train's position"
-            )
+        origin = place[0]
+        notes += shift.sentences
     tracks = yard_tracks(network, origin)
     prior, unmapped = _prior(inputs, options, network)
     if not any(prior[track.name] > 0.0 for track in tracks):

@@ -31,17 +31,9 @@ from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.ranges.corrected import AntennaRanges
-from railfix.screens.base import (
-    ObservationPicture,
-    PairedEpochs,
-    PairScreen,
-    ScreenColumn,
-    Screened,
-    Verdict,
-    clock_medians,
-    on_pairs,
-    pair_channels,
-)
+from railfix.screens.base import ObservationPicture, ScreenColumn, Screened, Verdict
+from railfix.screens.medians import clock_medians
+from railfix.screens.pairs import PairedEpochs, PairScreen, on_pairs, pair_channels
 
 #: Treatments of the receiver clocks, as named in the output.
 CLOCKS: Final = {

@@ -11,15 +11,8 @@ from pydantic import Field
 from railfix.core.arrays import Floats
 from railfix.core.reasons import Status
 from railfix.core.settings import Settings
-from railfix.screens.base import (
-    FilteredMotion,
-    PairedEpochs,
-    PositionScreen,
-    RunTables,
-    ScreenColumn,
-    Screened,
-    ScreenPicture,
-)
+from railfix.screens.base import RunTables, ScreenColumn, Screened, ScreenPicture
+from railfix.screens.pairs import FilteredMotion, PairedEpochs, PositionScreen
 
 
 class AntennaSpacingLimits(Settings):

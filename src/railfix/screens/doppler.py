@@ -27,15 +27,8 @@ from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.ranges.corrected import AntennaRanges
-from railfix.screens.base import (
-    ObservationPicture,
-    ObservationScreen,
-    ScreenColumn,
-    Screened,
-    ScreenSetup,
-    Verdict,
-    clock_medians,
-)
+from railfix.screens.base import ObservationPicture, ObservationScreen, ScreenColumn, Screened, ScreenSetup, Verdict
+from railfix.screens.medians import clock_medians
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
 _FINEST_M: Final = 1e-3  #: Smallest change used for the receiver's scale [m].

@@ -8,7 +8,8 @@ from importlib.metadata import entry_points
 from typing import Any, Final
 
 from railfix.core.errors import SettingsError
-from railfix.screens.base import ObservationScreen, PairScreen, PositionScreen, Screen
+from railfix.screens.base import ObservationScreen, Screen
+from railfix.screens.pairs import PairScreen, PositionScreen
 
 #: Group of entry points.
 GROUP: Final = "railfix.screens"

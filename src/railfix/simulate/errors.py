@@ -19,8 +19,9 @@ from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
-from railfix.ranges.atmosphere import rtca_mapping, thin_shell_obliquity
+from railfix.ranges.atmosphere import thin_shell_obliquity
 from railfix.ranges.sbas.ionosphere import EARTH_RADIUS_KM, pierce_point
+from railfix.ranges.sbas.troposphere import rtca_mapping
 from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 

@@ -13,7 +13,7 @@ import polars as pl
 
 from railfix.core.errors import OutputError, check_type
 from railfix.core.files import FilePath
-from railfix.core.settings import write_toml
+from railfix.core.settings_files import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import write_navigation, write_observations

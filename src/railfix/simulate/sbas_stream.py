@@ -11,7 +11,8 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
-from railfix.core.files import FilePath, write_whole
+from railfix.core.files import FilePath
+from railfix.core.staged_files import write_whole
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta, to_week
 from railfix.gnss.orbits.prepared_records import group_delay_s
 from railfix.ranges.sbas import SbasMessages

@@ -31,8 +31,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import FilePath, check_path
-from railfix.core.settings import read_toml, validate
+from railfix.core.files import FilePath
+from railfix.core.settings import validate
+from railfix.core.settings_files import read_toml
+from railfix.core.staged_files import check_path
 from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario
@@ -158,7 +160,7 @@ def load_scenario(name: FilePath) -> Scenario:
 
 
 def scenario_table(scenario: Scenario) -> dict[str, Any]:
-    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings.write_toml`.
+    """Return all settings of a scenario in the form of a scenario file, for `railfix.core.settings_files.write_toml`.
 
     None is the word "none"; `multipath` is not in it.
     """

@@ -50,6 +50,16 @@ class FrameShift:
     notes: tuple[str, ...] = ()
 
     @property
+    def sentences(self) -> tuple[str, ...]:
+        """Notes on the transformation, and on the shift in plan where there is one."""
+        size = float(np.hypot(self.east_m, self.north_m))
+        moved = (
+            f"map: {self.frame} moved by {size:.2f} m (east {self.east_m:+.2f}, north {self.north_m:+.2f}) to "
+            f"{self.used}, the frame of the positions (--same-frame: they are in that of the map)"
+        )
+        return (*self.notes, moved) if size > 0.0 else self.notes
+
+    @property
     def facts(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {

@@ -14,8 +14,8 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, NoPositionError
 from railfix.core.geodesy import axes_at
+from railfix.core.notebook import plural
 from railfix.core.settings import Settings
-from railfix.core.tables import plural
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog, qualities_in_words
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track

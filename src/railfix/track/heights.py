@@ -158,15 +158,37 @@ def _undulation(transformer: Transformer, place: Georeference) -> Floats:
     return np.asarray(transformer.transform(place.longitude_deg, place.latitude_deg, zeros)[2], np.float64)
 
 
-def heights_of_file(heights_m: Floats, place: Georeference, reading: MapReading, *, path: str) -> EllipsoidalHeights:
-    """Return ellipsoidal heights of a file without a datum of its own, which must be given."""
+def heights_of_file(
+    heights_m: Floats,
+    place: Georeference,
+    reading: MapReading,
+    *,
+    path: str,
+    datum: str | None = None,
+    geoid: str | None = None,
+    geoid_m: Floats | None = None,
+) -> EllipsoidalHeights:
+    """Return ellipsoidal heights of a file, whose own datum, geoid and `geoid_m` count where `reading` gives none.
+
+    InputFileError: the file names an unknown datum. SettingsError: none is known, or two contradict each other.
+    """
     check_height_datum(reading.height_datum)
-    datum, geoid = own_height_datum(reading.crs, reading.height_datum, reading.geoid, path=path)
-    if datum is None:
+    if datum is not None and datum not in HEIGHT_DATUMS:
+        raise InputFileError(path, f"height_datum is {datum!r}; expected 'ellipsoidal' or 'orthometric'")
+    if None not in (reading.height_datum, datum) and reading.height_datum != datum:
+        raise SettingsError(f"{path}: height_datum {reading.height_datum!r} contradicts the file's own {datum!r}")
+    used, model = own_height_datum(reading.crs, reading.height_datum or datum, reading.geoid, path=path)
+    if used is None:
         raise SettingsError(
             f"{path}: the height datum is missing; give height_datum (--height-datum): ellipsoidal or orthometric"
         )
-    return ellipsoidal_heights(heights_m, place, datum=datum, geoid=geoid, path=path)
+    if used == "ellipsoidal":
+        geoid_m = None
+    elif geoid_m is not None and not isinstance(model, str):
+        model = None  # of the compound CRS, which is replaced by the map's own
+    elif model is None:
+        model = geoid
+    return ellipsoidal_heights(heights_m, place, datum=used, geoid=model, geoid_m=geoid_m, path=path)
 
 
 def own_height_datum(

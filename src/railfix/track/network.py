@@ -18,7 +18,7 @@ import scipy
 from railfix.core.arrays import Floats, Indices, Integers, RowArrays, join_rows, places_in_groups, read_only
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.track.route import Segment, one_frame, sigma_of_files
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, UNNAMED, interpolate_kilometrage
 from railfix.track.trajectory import NearestOnPolyline, project_on_segments

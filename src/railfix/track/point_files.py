@@ -12,13 +12,14 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError, check_type
-from railfix.core.files import FilePath, read_text, write_whole
+from railfix.core.files import FilePath, read_text
+from railfix.core.notebook import plural
 from railfix.core.settings import misspelt
-from railfix.core.tables import plural
+from railfix.core.staged_files import write_whole
 from railfix.io.named_columns import NamedColumns, read_named_columns, with_usual_names
 from railfix.track.crs import choose_crs, find_crs, unit_of_heights
-from railfix.track.georeference import EllipsoidalHeights, Georeference, georeference
-from railfix.track.heights import HEIGHT_DATUMS, check_height_datum, ellipsoidal_heights, own_height_datum
+from railfix.track.georeference import Georeference, georeference
+from railfix.track.heights import check_height_datum, heights_of_file
 from railfix.track.route import RINF_NAMES, RINF_SECTIONS, MapReading, Segment, make_segment
 from railfix.track.track import Track
 from railfix.track.vector_file import (
@@ -33,9 +34,6 @@ from railfix.track.vector_file import (
 
 #: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"
-_DATUM_HELP: Final = (
-    "give height_datum 'ellipsoidal' or 'orthometric', as an option (--height-datum) or as a member of the file"
-)
 #: Property of features that are connections of tracks, no tracks (`railfix.track.network_read`).
 RELATION: Final = "netelementA"
 #: All properties of the feature of a line, and its id.
@@ -224,37 +222,21 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
             raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
     place = _in_frame(line.source, crs, line.coordinates)
     of_way = get_metadata(line.feature)
+    heights = None
+    if line.coordinates[:, 2:].any():  # heights that are all 0 count as missing, as in files of other formats
+        heights = heights_of_file(
+            line.coordinates[:, 2] * unit_of_heights(crs), place, replace(reading, crs=crs), path=line.source,
+            datum=line.text("height_datum"), geoid=line.text("geoid"), geoid_m=line.array("geoid_m", np.nan),
+        )  # fmt: skip
     return make_segment(
         place,
-        # heights that are all 0 count as missing, as in files of other formats
-        _heights(line, crs, place, reading) if line.coordinates[:, 2:].any() else None,
+        heights,
         source=f"{line.path} ({of_way['name']})" if "name" in of_way else line.source,
         file=line.path,
         crs=crs,
         metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties} | of_way,
         attributes=attributes(line.array),
     )
-
-
-def _heights(line: _GeojsonLine, crs: str, place: Georeference, reading: MapReading) -> EllipsoidalHeights:
-    """Return the ellipsoidal heights of a line."""
-    stated = line.text("height_datum")
-    if stated is not None and stated not in HEIGHT_DATUMS:
-        raise line.error(f"height_datum is {stated!r}; expected 'ellipsoidal' or 'orthometric'")
-    if None not in (reading.height_datum, stated) and reading.height_datum != stated:
-        raise SettingsError(
-            f"{line.source}: height_datum {reading.height_datum!r} contradicts the file's own {stated!r}"
-        )
-    datum, geoid = own_height_datum(crs, reading.height_datum or stated, reading.geoid, path=line.source)
-    if datum is None:
-        raise line.error(f"the height datum is missing; {_DATUM_HELP}")
-    geoid_m = line.array("geoid_m", np.nan) if datum == "orthometric" else None
-    if geoid_m is not None and not isinstance(geoid, str):
-        geoid = None  # of the compound CRS, which is replaced by the map's own
-    if geoid is None and datum == "orthometric" and geoid_m is None:
-        geoid = line.text("geoid")
-    stated_m = line.coordinates[:, 2] * unit_of_heights(crs)
-    return ellipsoidal_heights(stated_m, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source)
 
 
 #: Attribute of the track, factor, and value of an empty cell, by column of the file.
@@ -295,13 +277,13 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
         raise InputFileError(path, f"{plural(table, 'point')}; a track needs at least two")
     crs = choose_crs(path, reading.crs, table.metadata.get("crs"))
     place = _place(crs, latitude, longitude, path=table.path)
-    geoid, geoid_m, above = reading.geoid, None, None
-    if datum == "orthometric" and "geoid_m" in table:
-        geoid_m = table.numbers("geoid_m")
-    elif datum == "orthometric" and geoid is None:
-        geoid = table.metadata.get("geoid")
+    geoid_m = table.numbers("geoid_m") if datum == "orthometric" and "geoid_m" in table else None
+    above = None
     if heights.any():  # heights that are all 0 are none, as in files of other formats
-        above = ellipsoidal_heights(heights, place, datum=datum, geoid=geoid, geoid_m=geoid_m, path=table.path)
+        above = heights_of_file(
+            heights, place, replace(reading, crs=None, height_datum=datum), path=table.path,
+            geoid=table.metadata.get("geoid"), geoid_m=geoid_m,
+        )  # fmt: skip
     return make_segment(
         place,
         above,

@@ -14,9 +14,10 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.errors import check_type
+from railfix.core.notebook import NotebookTable, plural
 from railfix.core.settings import Settings
-from railfix.core.tables import NotebookTable, plural
-from railfix.track.track import HEIGHTS_M, Geometry, Track, compute_geometry, kilometrage_breaks, mean_gradients
+from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
+from railfix.track.track import HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
 _COARSE_DEG: Final = 1e-5  #: Coordinates rounded to this are up to half of it off [deg]: 0.6 m.

@@ -13,7 +13,7 @@ import numpy as np
 from railfix.core.arrays import take_rows
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, ending, path_names
-from railfix.core.tables import plural
+from railfix.core.notebook import plural
 from railfix.io.file_kind import GDAL, find_kind, wrong_kind
 from railfix.track.height_source import RASTERS, HeightSource, check_raster, with_heights
 from railfix.track.heights import GEOIDS, check_height_datum

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats, FrozenArrays, Indices, Masks, freeze_arrays, places_in_groups, read_only
 from railfix.core.errors import check_type
 from railfix.core.geodesy import axes_at
-from railfix.core.tables import NotebookTable, plural
+from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
 _FIRST_CANDIDATES = 6  #: Samples examined in the first round; four times as many for positions not yet proven.

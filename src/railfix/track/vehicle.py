@@ -14,9 +14,10 @@ from pydantic import ConfigDict, Field, model_validator
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError, check_type
-from railfix.core.files import FilePath
 from railfix.core.geodesy import axes_at, enu_axes
-from railfix.core.settings import Settings, load_settings
+from railfix.core.settings import Settings
+from railfix.core.settings_files import load_settings
+from railfix.core.staged_files import FilePath
 from railfix.track.curves import centre_curve, with_breaks
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.track import Track

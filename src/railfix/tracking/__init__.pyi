@@ -1,11 +1,11 @@
 # The names of `railfix.tracking`, imported at their first use (lazy-loader).
 
 from .epochs import BaliseEpochs, GnssEpochs, Kind, RangeEpochs, SensorEpochs
-from .filter import track
+from .filter import Step, track
 from .limits import TrackingLimits
 from .line import Line
 from .result import Tracked, TrackStatus
-from .smoother import BackwardInformation, Smoothed, Step, smooth_steps
+from .smoother import BackwardInformation, Smoothed, smooth_steps
 from .state import TrackState
 
 __all__ = [

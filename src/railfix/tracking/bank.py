@@ -52,6 +52,13 @@ OTHERS: Final = {
     "map": SourceKind.MAP,
     "all in view": SourceKind.ALL_IN_VIEW,
 }
+#: Kind of each source that is no satellite.
+KINDS: Final = {
+    **dict.fromkeys(ix.CLOCKS, SourceKind.CONSTELLATION),
+    **dict.fromkeys(SENSORS.values(), SourceKind.SENSOR),
+    **dict.fromkeys((SENSORS[Kind.BALISE], SENSORS[Kind.NEXT_BALISE]), SourceKind.BALISE),
+    **OTHERS,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,19 +106,3 @@ def budget(limits: TrackingLimits) -> Budget:
         k_speed=float(-scipy.special.ndtri(0.5 * of_speed)),
         k_speed_fault=sigmas(of_speed),
     )
-
-
-def classify_source(name: str) -> SourceKind:
-    """Return the kind of a source: `G12` is a satellite, `G` a constellation, `wheel` a sensor."""
-    if name in ix.CLOCKS:
-        return SourceKind.CONSTELLATION
-    if name in OTHERS:
-        return OTHERS[name]
-    if name in (SENSORS[Kind.BALISE], SENSORS[Kind.NEXT_BALISE]):
-        return SourceKind.BALISE
-    return SourceKind.SENSOR if name in SENSORS.values() else SourceKind.SATELLITE
-
-
-def get_clock(satellite: str) -> str:
-    """Return the letter of the clock of a satellite's codes."""
-    return "G" if satellite[:1] in ("J", "S") else satellite[:1]

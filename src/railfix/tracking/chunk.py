@@ -39,7 +39,6 @@ class Chunk:
     satellite: Strings  #: Of each channel; shape (K,).
     epoch: Records  #: `railfix.kernels.tracking.layout.EPOCH`; shape (T,).
     channel: Records  #: `railfix.kernels.tracking.layout.CHANNEL`; shape (T, K).
-    apart: Masks  #: Epochs so long after the one before that they restart; shape (T,).
     off_map: Masks  #: The train is away from the line; shape (T,).
     fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
     within_memory: Masks  #: Satellites whose error lasts from before an epoch; shape (T, S).
@@ -48,7 +47,7 @@ class Chunk:
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
     """Return the chunk, and give the state an error for each satellite measured in it."""
     state.origin = epochs.time[0] if np.isnat(state.origin) else state.origin
-    phase, before = _previous(epochs, state.previous)
+    phase, before = _previous(epochs.channel, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
     placed = np.isfinite(epochs.sat_ecef_m).all(axis=2)
     before = np.concatenate([before[None], epochs.sat_ecef_m])[:-1]
@@ -70,7 +69,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
         interval[:1] = 1.0
 
     any_kind = np.asarray(has.any(axis=0), dtype=np.bool_)
-    slot = _with_satellites(state, epochs, np.asarray(any_kind.any(axis=0)))
+    slot = _with_satellites(state, epochs.satellite, np.asarray(any_kind.any(axis=0)))
     seen = np.full((len(epochs) + 1, len(state.satellite)), np.datetime64("NaT", "ns"), dtype="datetime64[ns]")
     seen[0] = state.seen
     used = (slot >= 0).nonzero()[0]
@@ -81,7 +80,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * constants.CODE_CORRELATION_S
     state.seen = seen[-1]
 
-    variance = _compute_variance(epochs, limits)
+    variance = _compute_variance(epochs.cn0_dbhz, epochs.code_sigma_m, limits)
     epoch = np.zeros(len(epochs), dtype=EPOCH)
     epoch["time_s"], epoch["interval_s"], epoch["velocity_mps"] = seconds(epochs.time - state.origin), interval, np.nan
     for dt in np.unique(interval).tolist():
@@ -98,18 +97,18 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     if epochs.near_ecef_m is not None:
         _write_velocities(epoch, channel, epochs.near_ecef_m)
     return Chunk(
-        time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, apart=apart, off_map=epochs.off_map,
+        time=epochs.time, satellite=epochs.satellite, epoch=epoch, channel=channel, off_map=epochs.off_map,
         fresh=present & ~kept, within_memory=kept,
     )  # fmt: skip
 
 
-def _compute_variance(epochs: GnssEpochs, limits: TrackingLimits) -> Floats:
+def _compute_variance(cn0_dbhz: Floats, code_sigma_m: Floats, limits: TrackingLimits) -> Floats:
     """Return the variances of the white errors of codes, phases and Dopplers, the last two by C/N0; shape (3, T, K)."""
-    cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
+    cn0 = np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
     return np.array(
         [
-            (limits.code_white_share * epochs.code_sigma_m) ** 2,
+            (limits.code_white_share * code_sigma_m) ** 2,
             limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
             limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
         ]
@@ -141,23 +140,23 @@ def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
         state.rearrange(kept.nonzero()[0], ())
 
 
-def _previous(epochs: GnssEpochs, previous: Previous | None) -> tuple[Floats, Floats]:
+def _previous(channels: Strings, previous: Previous | None) -> tuple[Floats, Floats]:
     """Return the phase and satellites of the epoch before the first, in the order of the channels."""
-    if previous is not None and np.array_equal(epochs.channel, previous.channel):
+    if previous is not None and np.array_equal(channels, previous.channel):
         return previous.phase_m, previous.sat_ecef_m
-    size = len(epochs.satellite)
+    size = len(channels)
     phase, sat = np.full(size, np.nan), np.full((size, 3), np.nan)
     if previous is not None:
-        _, here, there = np.intersect1d(epochs.channel, previous.channel, return_indices=True)
+        _, here, there = np.intersect1d(channels, previous.channel, return_indices=True)
         phase[here], sat[here] = previous.phase_m[there], previous.sat_ecef_m[there]
     return phase, sat
 
 
-def _with_satellites(state: TrackState, epochs: GnssEpochs, measured: Masks) -> Indices:
+def _with_satellites(state: TrackState, satellite: Strings, measured: Masks) -> Indices:
     """Give the state a place for the error of each satellite measured; return the place of each channel's."""
     place = {name: k for k, name in enumerate(state.satellite.tolist())}
-    names = epochs.satellite.tolist()
-    new = [name for name in dict.fromkeys(epochs.satellite[measured].tolist()) if name not in place]
+    names = satellite.tolist()
+    new = [name for name in dict.fromkeys(satellite[measured].tolist()) if name not in place]
     if new:
         state.rearrange(np.arange(len(state.satellite)), tuple(new))
         place |= {name: len(place) + k for k, name in enumerate(new)}

@@ -5,25 +5,37 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from railfix.core.arrays import copy_with
+from railfix.core.arrays import Floats, Indices, Strings, copy_with
 from railfix.kernels.tracking import constants, layout
 from railfix.kernels.tracking import index as ix
+from railfix.kernels.tracking.layout import Trace
 from railfix.tracking.chunk import Chunk, finish_chunk, prepare_chunk
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.packing import pack_parameters, pack_sensors, pack_state, unpack_state
 from railfix.tracking.result import Tracked, TrackStatus, new_results
-from railfix.tracking.search import Sought, begin, seek
-from railfix.tracking.smoother import Step
+from railfix.tracking.search import Sought, SplitHypothesis, begin, seek
 from railfix.tracking.state import TrackState
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+
+@dataclass(kw_only=True)
+class Step:
+    """One epoch of the filter with H hypotheses, as it was left."""
+
+    dt: float  #: Since the epoch before [s].
+    satellite: Strings  #: Shape (N - ix.SATELLITES,).
+    trace: Trace | None = None  #: Measurements and restarts; None without a hypothesis.
+    #: After the epoch; shapes (H, N), (H, N, N).
+    mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
+    #: Hypothesis of the epoch before; -1 where one began; shape (H,).
+    parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+    splits: list[SplitHypothesis | None] | None = None
 
 
 class Recursion:
@@ -39,7 +51,9 @@ class Recursion:
         *,
         levels: bool,
     ) -> None:
-        self.kernel = _kernel()
+        from railfix.kernels.tracking.recursion import advance  # numba: what runs no filter does without
+
+        self.kernel = advance
         self.chunk, self.line, self.limits, self.levels = chunk, line, limits, levels
         self.results = new_results(len(chunk.time), len(chunk.satellite))
         vertex, whole = line.records
@@ -51,54 +65,43 @@ class Recursion:
             start_variance=np.diagonal(unknown[0]).copy(),
         )  # fmt: skip
 
-    def advance(self, state: TrackState, first: int, trace: list[Step] | None) -> tuple[int, int]:
+    def seek(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> Sought | None:
+        """Seek places for an epoch that hypotheses are predicted to; None where there is none, which ends the epoch."""
+        if not state.hypotheses:
+            state.code_bias = np.where(self.chunk.fresh[epoch], 0.0, state.code_bias)
+        found = seek(state, self.chunk, epoch, self.line, self.limits, reasons)
+        state.time = self.chunk.time[epoch]
+        if state.hypotheses:
+            state.bank = None if found.lost else state.bank
+            return found
+        if trace is not None:
+            trace.append(self.make_step(state, epoch))
+        return None
+
+    def run(self, state: TrackState, first: int, found: Sought | None, trace: list[Step] | None) -> tuple[int, int]:
         """Do epochs from `first` on and change the state; return the next, and why places have to be sought there or 0.
 
-        One at a time where the smoother needs something of each.
+        That epoch alone where places have been `found` in it, and where the smoother needs something of each.
         """
-        last = len(self.chunk.time) if trace is None else first + 1
-        parents = Sought(lost=False, parent=np.arange(state.hypotheses), splits=None)
-        return self._run(state, (first, last), ix.WHOLE, parents, trace)
-
-    def search(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> None:
-        """Do an epoch before which places have to be sought, for the reasons of `advance`."""
-        chunk = self.chunk
-        if state.hypotheses:
-            packed = pack_state(state, self.limits, levels=self.levels)
-            self.kernel(self.given, packed, self.results, _new_trace(0, 0, 0), (epoch, epoch + 1), ix.PREDICTION)
-            unpack_state(state, packed)
-        else:
-            state.code_bias = np.where(chunk.fresh[epoch], 0.0, state.code_bias)
-        found = seek(state, chunk, epoch, self.line, self.limits, reasons)
-        state.time = chunk.time[epoch]
-        if not state.hypotheses:
-            if trace is not None:
-                trace.append(self.make_step(state, epoch))
-            return
-        if found.lost:
-            state.bank = None
-        self._run(state, (epoch, epoch + 1), ix.REST_LOST if found.lost else ix.REST, found, trace)
-
-    def _run(
-        self, state: TrackState, span: tuple[int, int], part: int, found: Sought, trace: list[Step] | None
-    ) -> tuple[int, int]:
-        """Run the recursion over a span of epochs and change the state; return what `recursion.advance` does."""
         count, width = state.mean.shape
+        last = len(self.chunk.time) if trace is None and found is None else first + 1
+        sought = ix.NOT_SOUGHT if found is None else ix.SOUGHT_AS_LOST if found.lost else ix.SOUGHT
         rows = 3 * len(self.chunk.satellite) + self.given.sensor.shape[1]
         traced = _new_trace(0, 0, 0) if trace is None else _new_trace(count, rows, width)
         packed = pack_state(state, self.limits, levels=self.levels)
-        done, reasons = self.kernel(self.given, packed, self.results, traced, span, part)
-        if done > span[0]:
-            unpack_state(state, packed)
+        done, reasons = self.kernel(self.given, packed, self.results, traced, (first, last), sought)
+        unpack_state(state, packed)
+        if done > first:
             state.time = self.chunk.time[done - 1]
-            if trace is not None:
-                step = self.make_step(state, span[0])
-                traced.restarted[:, ix.SATELLITES + self.chunk.fresh[span[0]].nonzero()[0]] = True
-                kept = traced.kept[: state.hypotheses]
-                step.trace = layout.Trace._make([values[kept] for values in traced])
-                step.mean, step.covariance, step.parent = state.mean, state.covariance, found.parent[kept]
-                step.splits = None if found.splits is None else [found.splits[k] for k in kept.tolist()]
-                trace.append(step)
+        if done > first and trace is not None:
+            step, kept = self.make_step(state, first), traced.kept[: state.hypotheses]
+            traced.restarted[:, ix.SATELLITES + self.chunk.fresh[first].nonzero()[0]] = True
+            step.trace = layout.Trace._make([values[kept] for values in traced])
+            step.mean, step.covariance = state.mean, state.covariance
+            step.parent = kept if found is None else found.parent[kept]
+            if found is not None and found.splits is not None:
+                step.splits = [found.splits[k] for k in kept.tolist()]
+            trace.append(step)
         return done, reasons
 
     def make_step(self, state: TrackState, epoch: int) -> Step:
@@ -115,13 +118,6 @@ def _new_trace(hypotheses: int, rows: int, unknowns: int) -> layout.Trace:
     )  # fmt: skip
 
 
-def _kernel() -> Callable[..., tuple[int, int]]:
-    """Return the compiled recursion; numba is imported here, for what runs no filter does without."""
-    from railfix.kernels.tracking.recursion import advance
-
-    return advance
-
-
 def track(
     epochs: GnssEpochs,
     line: Line,
@@ -132,10 +128,10 @@ def track(
     levels: bool = False,
     trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
-    """Return places along the trajectory, each from its own and earlier epochs.
+    """Return places along the trajectory, each from its own and earlier epochs (model: R. A. Singer, 1970).
 
-    The recursion is compiled (`railfix.kernels.tracking.recursion`); with ``NUMBA_DISABLE_JIT=1`` in the environment
-    the same code runs as plain Python, for a debugger.
+    The equations are in docs/filter-equations.md, the compiled recursion in `railfix.kernels.tracking.recursion`. With
+    ``NUMBA_DISABLE_JIT=1`` in the environment the same code runs as plain Python, for a debugger.
 
     Parameters
     ----------
@@ -166,7 +162,7 @@ def track(
     epoch, reasons = 0, 0
     while epoch < len(epochs):
         lost = not np.isfinite(state.mean[:, ix.ARC]).all()
-        if lost or chunk.apart[epoch] or chunk.off_map[epoch]:
+        if lost or chunk.epoch["begins"][epoch]:
             state.reset()
         if chunk.off_map[epoch]:
             state.time, recursion.results.epoch["status"][epoch] = chunk.time[epoch], TrackStatus.OFF_MAP
@@ -174,11 +170,13 @@ def track(
                 trace.append(recursion.make_step(state, epoch))
             epoch += 1
             continue
-        if state.hypotheses and not reasons:
-            epoch, reasons = recursion.advance(state, epoch, trace)
+        found = None
+        if reasons or not state.hypotheses:
+            found, reasons = recursion.seek(state, epoch, reasons, trace), 0
+        if state.hypotheses:
+            epoch, reasons = recursion.run(state, epoch, found, trace)
         else:
-            recursion.search(state, epoch, reasons, trace)
-            epoch, reasons = epoch + 1, 0
+            epoch += 1
     finish_chunk(chunk, epochs, state)
     result = Tracked.from_records(epochs.time, recursion.results)
     np.add(result.arc_m, line.round_m(result.arc_m), out=result.arc_m)

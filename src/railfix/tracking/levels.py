@@ -100,17 +100,13 @@ def decimate_epochs(
     share = np.where(_MEAN, 1.0 / np.maximum(size, 1)[:, None], 1.0)
     total, square = (np.add.reduceat(values[:end], first, axis=0) * share for values in (total, square))
     sensed = SensorEpochs(
-        wheel_sign=sensors.wheel_sign, balises=balises, place_m=_take(sensors.place_m, taken),
-        place_sigma_m=_take(sensors.place_sigma_m, taken), ranges=sensors.ranges and sensors.ranges.take(taken),
+        wheel_sign=sensors.wheel_sign, balises=balises, place_m=take_epochs(sensors.place_m, taken),
+        place_sigma_m=take_epochs(sensors.place_sigma_m, taken), ranges=sensors.ranges and sensors.ranges.take(taken),
     )  # fmt: skip
     for column, names in enumerate(_SUMMED):
         if getattr(sensors, names[0]) is not None:
             sensed = replace(sensed, **{names[0]: total[:, column], names[1]: np.sqrt(square[:, column])})
     return taken, some, sensed, left
-
-
-def _take(values: Floats | None, rows: Indices) -> Floats | None:
-    return None if values is None else values[rows]
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
@@ -167,13 +163,12 @@ def track_with_levels(
     else:
         tracked, track_state = track(epochs, line, track_state, limits=limits, sensors=sensors)
     state = copy_with(state, track=after, since=since, every=every)
-    tracked, state = carried_levels(tracked, epochs, taken, place, line, state, limits)
+    tracked, state = carried_levels(tracked, taken, place, line, state, limits)
     return tracked, track_state, state
 
 
 def carried_levels(
     tracked: Tracked,
-    epochs: GnssEpochs,
     taken: Indices,
     place: Tracked | None,
     line: Line,
@@ -185,7 +180,7 @@ def carried_levels(
     `tracked` has the places of the filter, `taken` the epochs that the one with sub-filters took, `place` its places
     there, None without any, and `state` its last epoch before these.
     """
-    number = taken.searchsorted(np.arange(len(epochs)), side="right")
+    number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
     if place is not None:
         columns = np.array([getattr(place, name) for name in _KEPT], dtype=np.float64).T

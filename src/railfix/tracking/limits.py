@@ -20,18 +20,14 @@ class Tails(NamedTuple):
     #: typical length. The weight of a small error is the same on both sides.
     late: float
 
-    def degrees(self, residual: Floats, codes: int) -> Floats:
-        """Return the degrees of freedom of M rows, the first of codes, by the sign of the residual; shape (H, M)."""
-        return np.where((np.arange(residual.shape[1]) < codes) & (residual > 0.0), self.late, self.usual)
-
-    def weight(self, residual: Floats, square: Floats, codes: int) -> Floats:
-        """Return the weights of rows with residuals, and mean squares of them over their variances; shape (H, M)."""
-        degrees = self.degrees(residual, codes)
+    def weight(self, residual: Floats, square: Floats) -> Floats:
+        """Return the weights of codes with residuals, and mean squares of them over their variances; any shape."""
+        degrees = np.where(residual > 0.0, self.late, self.usual)
         return np.asarray((self.usual + 1.0) / self.usual * degrees / (degrees + square))
 
-    def log_density(self, residual: Floats, square: Floats, codes: int) -> Floats:
+    def log_density(self, residual: Floats, square: Floats) -> Floats:
         """Return the logarithm of the density whose weights are `weight`, 0 at its maximum; parameters the same."""
-        degrees = self.degrees(residual, codes)
+        degrees = np.where(residual > 0.0, self.late, self.usual)
         return np.asarray(-0.5 * (self.usual + 1.0) / self.usual * degrees * np.log1p(square / degrees))
 
 
@@ -104,8 +100,3 @@ class TrackingLimits(Settings):
     #: Probability that the ionosphere is tilted over the sky by more than `slow_code_m`: a storm, or the equatorial
     #: anomaly (`tracking.line.TILT_M` has the size). An assumption.
     level_tilt_prior: float = Field(default=1e-3, ge=0, lt=1)
-
-    @property
-    def tails(self) -> Tails:
-        """Degrees of freedom on both sides."""
-        return Tails(self.degrees_of_freedom, self.late_degrees_of_freedom)

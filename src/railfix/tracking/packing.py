@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Datetimes
+from railfix.core.constants import CLOCK_GROUP
 from railfix.core.timescale import seconds
 from railfix.kernels.tracking import constants, layout
 from railfix.kernels.tracking import index as ix
@@ -90,13 +91,11 @@ def _pack_sources(names: list[str], limits: TrackingLimits) -> Records:
     """Return the sources with their probabilities and factors, `layout.SOURCE`; shape (B,)."""
     source = np.zeros(len(names), dtype=layout.SOURCE)
     if names:
-        given, kinds = bank.budget(limits), [bank.classify_source(name) for name in names]
+        given, kinds = bank.budget(limits), [bank.KINDS.get(name, bank.SourceKind.SATELLITE) for name in names]
+        satellites = names[: kinds.count(bank.SourceKind.SATELLITE)]
         for field, values in (("prior", given.prior), ("k", given.k_fault), ("k_speed", given.k_speed_fault)):
             source[field] = np.array(values)[kinds]
-        source["clock"] = [
-            ix.CLOCKS.index(bank.get_clock(name)) if kind == bank.SourceKind.SATELLITE else 0
-            for name, kind in zip(names, kinds, strict=True)
-        ]
+        source["clock"][: len(satellites)] = [ix.CLOCKS.index(CLOCK_GROUP[name[0]]) for name in satellites]
     return source
 
 

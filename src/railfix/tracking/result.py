@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.kernels.tracking.index import TrackStatus as TrackStatus
 from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind

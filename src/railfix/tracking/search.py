@@ -13,7 +13,7 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Records
 from railfix.tracking.chunk import Chunk
-from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.limits import Tails, TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 
@@ -57,7 +57,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floa
     arc = np.linspace(line.arc_m[0], line.arc_m[-1], 1 + int(np.ceil((line.arc_m[-1] - line.arc_m[0]) / _SPACING_M)))
     points, _ = line.at(arc)
     likelihood = np.zeros(len(arc))
-    tails = limits.tails
+    tails = Tails(limits.degrees_of_freedom, limits.late_degrees_of_freedom)
     for group in groups:
         distance, _ = range_with_rotation(channel["sat_ecef_m"][group], points[:, None, :])
         residual = channel["measured"][group, ix.CODE] - distance
@@ -65,10 +65,10 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floa
         clock = np.median(residual, axis=1, keepdims=True)
         for _ in range(constants.PASSES):
             away = residual - clock
-            weight = tails.weight(away, away**2 / variance, away.shape[1]) / variance
+            weight = tails.weight(away, away**2 / variance) / variance
             clock = (weight * residual).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
         away = residual - clock
-        likelihood += tails.log_density(away, away**2 / variance, away.shape[1]).sum(axis=1)
+        likelihood += tails.log_density(away, away**2 / variance).sum(axis=1)
     order = np.argsort(-likelihood, kind="stable")
     order = order[likelihood[order] > likelihood[order[0]] - _WORSE]
     chosen: list[int] = []

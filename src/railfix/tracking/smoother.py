@@ -12,55 +12,41 @@ began, nothing of what comes later reaches the epochs before.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Strings
+from railfix.core.arrays import Floats, Strings
 from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
-from railfix.kernels.tracking.layout import EPOCH, Trace
+from railfix.kernels.tracking.layout import EPOCH
 from railfix.tracking.chunk import compute_singer_step
+from railfix.tracking.filter import Step
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.search import SplitHypothesis
 from railfix.tracking.state import TrackState
 
 
-@dataclass(kw_only=True)
-class Step:
-    """One epoch of the filter with H hypotheses, as it was left."""
+def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
+    """Carry the information of later epochs on hypothesis h of an epoch backward through its measurements."""
+    from railfix.kernels.tracking.backward import before_measurements
 
-    dt: float  #: Since the epoch before [s].
-    satellite: Strings  #: Shape (N - ix.SATELLITES,).
-    trace: Trace | None = None  #: Measurements and restarts; None without a hypothesis.
-    #: After the epoch; shapes (H, N), (H, N, N).
-    mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
-    covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
-    #: Hypothesis of the epoch before; -1 where one began; shape (H,).
-    parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    splits: list[SplitHypothesis | None] | None = None
-
-    def before(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-        """Carry the information of later epochs on hypothesis h backward through its measurements."""
-        from railfix.kernels.tracking.backward import before_measurements
-
-        made = self.trace
-        if made is not None:
-            vector, matrix = before_measurements(
-                made.prior[h], made.row[h], made.value[h], made.variance[h], vector, matrix
-            )
-        part = None if self.splits is None else self.splits[h]
-        if part is not None:
-            # The density of the narrower one over the wide one, as if its place had been measured.
-            place = ix.ARC
-            wide = part.covariance[place, place]
-            back = np.eye(len(vector))
-            share = (1.0 - constants.START_SIGMA_M**2 / wide) / wide
-            back[place] -= share * part.covariance[place]
-            vector, matrix = back @ vector, back @ matrix @ back.T
-            vector[place] += (part.place_m - part.mean[place]) / wide
-            matrix[place, place] += share
-        return vector, matrix
+    made = step.trace
+    if made is not None:
+        vector, matrix = before_measurements(
+            made.prior[h], made.row[h], made.value[h], made.variance[h], vector, matrix
+        )
+    part = None if step.splits is None else step.splits[h]
+    if part is not None:
+        # The density of the narrower one over the wide one, as if its place had been measured.
+        place = ix.ARC
+        wide = part.covariance[place, place]
+        back = np.eye(len(vector))
+        share = (1.0 - constants.START_SIGMA_M**2 / wide) / wide
+        back[place] -= share * part.covariance[place]
+        vector, matrix = back @ vector, back @ matrix @ back.T
+        vector[place] += (part.place_m - part.mean[place]) / wide
+        matrix[place, place] += share
+    return vector, matrix
 
 
 def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
@@ -96,7 +82,7 @@ class Smoothed:
 def smooth_steps(
     steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
 ) -> tuple[Smoothed, BackwardInformation]:
-    """Smooth the epochs of a chunk.
+    """Return places from both directions of a chunk (adjoint smoother: G. J. Bierman, 1973).
 
     Parameters
     ----------
@@ -134,7 +120,7 @@ def smooth_steps(
         if covariance[ix.ARC, ix.ARC] <= constants.EXPIRED_SIGMA_M**2:
             arc[t], sigma[t] = mean[ix.ARC] + row @ vector, np.sqrt(max(variance, 0.0))
             speed[t] = mean[ix.SPEED] + covariance[ix.SPEED] @ vector
-        vector, matrix = step.before(index, vector, matrix)
+        vector, matrix = _carry_through_measurements(step, index, vector, matrix)
         parent, restarted = int(step.parent[index]), step.trace.restarted[index]
         earlier = steps[t - 1].mean if t else before.mean
         if parent < 0 or parent >= len(earlier):

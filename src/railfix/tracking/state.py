@@ -122,14 +122,7 @@ class TrackState:
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:
-        """Keep the errors of some satellites, and begin those of new ones.
-
-        Parameters
-        ----------
-        kept : ndarray of int
-            Among `satellite`.
-        new : tuple of str
-        """
+        """Keep the errors of some satellites, indices into `satellite`, and begin those of new ones."""
         index = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + kept]).astype(np.intp)
         self.mean, self.covariance = _rearrange(self.mean, self.covariance, index, len(new))
         if self.bank is not None:

@@ -26,8 +26,9 @@ from pydantic import Field, model_validator
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
-from railfix.core.settings import Settings, read_toml, validate
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
+from railfix.core.settings import Settings, validate
+from railfix.core.settings_files import read_toml
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
 #: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railfix import kernels
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings, over_blocks
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 
@@ -359,7 +359,9 @@ class LevelStatus(IntEnum):
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """LevelStatus of epochs, int8 of shape (T,), from protection levels [m], NaN without a position.
+    """Return the `LevelStatus` of epochs by their levels and an alarm limit (P1 2.4), int8 of shape (T,).
+
+    Levels [m] are NaN without a position.
 
     An epoch with a position and without consistency (`ProtectionLevel.consistent`) alarms.
     """

@@ -18,7 +18,8 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.errors import OutputError, check_type
-from railfix.core.files import FilePath, hatanaka_program, stage_file
+from railfix.core.files import FilePath, hatanaka_program
+from railfix.core.staged_files import stage_file
 from railfix.gnss.observations import ObservationHeader, Observations, signals_by_system
 from railfix.io.rinex.observations_lines import KINDS
 

@@ -96,10 +96,6 @@ NOMINAL_M: Final = 0.8
 #: map or a constellation is wrong, or reflections pull the clock.
 BIAS_SATELLITES: Final = 2
 BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out: innovations show when the fault ends.
-#: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
-INFLATED_M: Final = 15.0
-#: Not where all codes imply another place by more standard deviations: they may have stepped together.
-INFLATED_SIGMAS: Final = 3.0
 
 # Lengths of the map.
 #: Time over which codes are to contradict the length (`TrackingLimits.map_misfit_sigmas`), and within which a larger
@@ -110,7 +106,6 @@ MISFIT_CODES: Final = 4  #: Fewer codes of an epoch do not tell a shift from clo
 #: A single epoch counts with at most so many standard deviations; beyond `STEP_SIGMAS` it is a step of all codes and
 #: shows nothing of the map.
 MISFIT_CLIPPED: Final = 3.0
-MISFIT_MOST: Final = 20.0
 #: Time constant of learning [s], and the largest logarithm: beyond 1.6 m in the square root of a metre nothing changes.
 MISFIT_LEARNT_S: Final = 5.0
 MISFIT_LARGEST: Final = 8.0

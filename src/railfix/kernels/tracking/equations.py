@@ -31,7 +31,7 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Given, Record, Rows
 from railfix.kernels.tracking.line import gradient_at, nearest_arc, wrap_arc, write_point
-from railfix.kernels.tracking.update import Equations
+from railfix.kernels.tracking.update import Equations, find_quantity
 
 
 class Geometry(NamedTuple):
@@ -48,13 +48,17 @@ class Geometry(NamedTuple):
 
 #: Unknowns of the distance run since the epoch before: s - s' + q_a.
 DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
+#: Quantities of the motion that are one unknown each.
+OWN_UNKNOWNS = (
+    (ix.M_CLOCK, ix.PHASE_CLOCK), (ix.M_RIGHT, ix.STEP_RIGHT), (ix.M_UP, ix.STEP_UP), (ix.M_DRIFT, ix.DRIFT),
+)  # fmt: skip
 
 
 @inner
 def new_equations(rows: Rows) -> Equations:
     """Return equations of an epoch's measurements, to be written."""
     size = rows.code.stop + ix.MOTION + rows.sensor.stop - rows.sensor.start
-    count = rows.sensor.stop
+    count = len(rows.variance)
     return Equations(
         np.zeros((size, ix.TERMS), dtype=np.intp),
         np.zeros((size, ix.TERMS)),
@@ -117,12 +121,7 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
     unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(ix.MOTION)
     unknown[first + ix.M_DISTANCE, :3], coefficient[first + ix.M_DISTANCE, :3] = DISTANCE, (1.0, -1.0, 1.0)
     unknown[first + ix.M_SPEED, :2], coefficient[first + ix.M_SPEED, :2] = (ix.SPEED, ix.DOPPLER_SPEED), (1.0, 1.0)
-    for q, i in (
-        (ix.M_CLOCK, ix.PHASE_CLOCK),
-        (ix.M_RIGHT, ix.STEP_RIGHT),
-        (ix.M_UP, ix.STEP_UP),
-        (ix.M_DRIFT, ix.DRIFT),
-    ):
+    for q, i in OWN_UNKNOWNS:
         unknown[first + q, 0], coefficient[first + q, 0], motion[q] = i, 1.0, x[i]
     motion[ix.M_DISTANCE] = x[ix.ARC] - at[0] - (x[ix.PREVIOUS_ARC] - at[1]) + x[ix.MAP_LENGTH_ERROR]
     motion[ix.M_SPEED] = x[ix.SPEED] + x[ix.DOPPLER_SPEED]
@@ -209,7 +208,7 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: floa
     """Write the sensors."""
     dt, vertex, line, value = given.epoch[t].interval_s, given.vertex, given.line[0], equations.value
     for j in range(rows.sensor.start, rows.sensor.stop):
-        column, q = rows.channel[j], rows.code.stop + ix.MOTION + j - rows.sensor.start
+        column, q = rows.channel[j], find_quantity(rows, j)
         sensor, unknown, coefficient = given.sensor[t, column], equations.unknown[q], equations.coefficient[q]
         measured, age = sensor.value, sensor.age_s
         if column in (ix.WHEEL_COLUMN, ix.RADAR_COLUMN):

@@ -60,9 +60,8 @@ ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0,
 #: Why places have to be sought before an epoch, bits: the track is lost, there were no measurements for long, or motion
 #: contradicts the place.
 LOST_TRACK, GAP, CONTRADICTED = 1, 2, 4
-#: Parts of an epoch: all of it; the prediction alone; what follows a prediction, places having been sought in between;
-#: the same where the track was lost.
-WHOLE, PREDICTION, REST, REST_LOST = 0, 1, 2, 3
+#: Whether the first epoch of a call is predicted, and its places have been sought; the same where the track was lost.
+NOT_SOUGHT, SOUGHT, SOUGHT_AS_LOST = 0, 1, 2
 
 
 class TrackStatus(IntEnum):

@@ -41,22 +41,20 @@ class Alternatives(NamedTuple):
 @inner
 def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
     """Return the hypotheses but the first, and the probability of those further along the line than a bound reaches."""
-    count, far = state.monitors[0].hypotheses, 0.0
-    along, straight = np.empty(count - 1), np.empty(count - 1)
-    sigma, probability, forward = np.empty(count - 1), np.empty(count - 1), np.zeros(count - 1)
+    others = slice(1, state.monitors[0].hypotheses)
+    along = np.abs(state.x[others, ix.ARC] - state.x[0, ix.ARC])
+    sigma = np.sqrt(state.P[others, ix.ARC, ix.ARC])
+    probability = np.exp(state.hypothesis["log_probability"][others])
+    straight, forward = np.empty(len(along)), np.empty(len(along))
     here, there, axes = np.empty(3), np.empty(3), np.empty((3, 3))
     write_point(given.vertex, given.line[0], state.x[0, ix.ARC], here, axes)
-    for h in range(1, count):
-        write_point(given.vertex, given.line[0], state.x[h, ix.ARC], there, axes)
-        along[h - 1] = abs(state.x[h, ix.ARC] - state.x[0, ix.ARC])
-        straight[h - 1] = math.sqrt(((there - here) ** 2).sum())
-        forward[h - 1] = abs(((there - here) * axes[0]).sum())
-        sigma[h - 1] = math.sqrt(state.P[h, ix.ARC, ix.ARC])
-        probability[h - 1] = math.exp(state.hypothesis[h].log_probability)
-        if along[h - 1] > given.parameters[0].start_separation_m:
-            far += probability[h - 1]
-            along[h - 1] = 0.0
-    return Alternatives(along, straight, forward, sigma, probability), far
+    for h in range(len(along)):
+        write_point(given.vertex, given.line[0], state.x[1 + h, ix.ARC], there, axes)
+        straight[h] = math.sqrt(((there - here) ** 2).sum())
+        forward[h] = abs(((there - here) * axes[0]).sum())
+    beyond = along > given.parameters[0].start_separation_m
+    along[beyond] = 0.0
+    return Alternatives(along, straight, forward, sigma, probability), probability[beyond].sum()
 
 
 @inner
@@ -162,10 +160,8 @@ def find_unchecked(state: State) -> float:
     """Return the probability of a fault common to a constellation in view without a sub-filter: the only one."""
     source, satellites, total = state.source, len(state.code_bias), 0.0
     for g in range(ix.CLOCK_COUNT):
-        in_view = False
-        for k in range(satellites):
-            in_view = in_view or (source[k].running and source[k].clock == g)
-        if in_view and not source[satellites + g].running:
+        in_view = source["running"][:satellites] & (source["clock"][:satellites] == g)
+        if in_view.any() and not source[satellites + g].running:
             total += source[satellites + g].prior
     return total
 
@@ -177,8 +173,8 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
     Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
     `constants.LEVEL_DOUBT_S`: it has settled somewhere else, or began where the fault of its source had led the
     filter, and bounds nothing; and where pairs of satellites that nothing bounds are more probable than the risk. Along
-    the line it is infinite where another place of it, further away than a bound may
-    reach, is more probable than the risk; the straight distance is bounded with all branches and a map that lies aside.
+    the line it is infinite where another place of it, further away than a bound may reach, is more probable than the
+    risk; the straight distance is bounded with all branches and a map that lies aside.
     """
     parameters, source, first, others = given.parameters[0], state.source, len(state.hypothesis), find_others(state)
     sigma = math.sqrt(state.P[0, ix.ARC, ix.ARC])

@@ -54,17 +54,13 @@ def choose_measurements(given: Given, t: int, state: State) -> Rows:
     channel, variance = np.empty(most, dtype=np.intp), np.empty(most)
     left_out, ends, size = np.zeros(most, dtype=np.bool_), np.zeros(3, dtype=np.intp), 0
     code_s = _code_interval_s(given, t, state)
+    scale = 1.0, math.exp(monitors.log_phase_scale), math.exp(monitors.log_doppler_scale)
     for kind in range(3):
-        scale = 1.0
-        if kind == ix.PHASE:
-            scale = math.exp(monitors.log_phase_scale)
-        elif kind == ix.DOPPLER:
-            scale = math.exp(monitors.log_doppler_scale)
         for k in range(channels):
             record = given.channel[t, k]
             if not record.has[kind] or (kind == ix.CODE and code_s == 0.0):
                 continue
-            channel[size], variance[size] = k, record.variance[kind] * scale
+            channel[size], variance[size] = k, record.variance[kind] * scale[kind]
             if kind == ix.CODE:
                 variance[size] /= min(code_s, 1.0)
                 known = not given.fresh[t, record.satellite]
@@ -118,9 +114,7 @@ def _start_code_clocks(
     At the first epoch the first constellation is that of the clock. Returns whether it is the first epoch.
     """
     codes, value = rows.code.stop, equations.value
-    clock_of = np.empty(codes, dtype=np.intp)
-    for j in range(codes):
-        clock_of[j] = given.channel[t, rows.channel[j]].clock
+    clock_of = given.channel[t]["clock"][rows.channel[:codes]]
     first, begins = clock_of[0], not known.any()
     if begins:
         P[ix.OFFSETS + first, ix.OFFSETS + first] = constants.FIRST_OFFSET_M2

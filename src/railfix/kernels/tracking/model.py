@@ -1,21 +1,7 @@
-r"""Process model: transition F and noise Q of all unknowns from one epoch to the next, for filter, bank and smoother.
+"""Process model: transition F and noise Q of all unknowns from one epoch to the next, for filter, bank and smoother.
 
-With dt the interval, v the speed and ``D = |v| dt`` the travel::
-
-    s, v, a             Singer's model: the acceleration is correlated over `TrackingLimits.acceleration_s`
-    s', v'              arc length and speed before: copies
-    phase clock, drift  B = dt f', f = f' + walk
-    code clock          new at every epoch
-    map right, up       Gauss-Markov over `MAP_ABSOLUTE_M` of travel
-    map displacement    new at every epoch: right, up with `MAP_ROUGHNESS_M` over `MAP_CORRELATION_M`, along with
-                        `MAP_SCALE_M` a square root of a metre; the bend of the line where the place is uncertain
-    Doppler speed error Gauss-Markov over `DOPPLER_CORRELATION_S`
-    slow code           Gauss-Markov over `SLOW_CODE_S`
-    clock offsets, sensors' scales and offset    random walks
-    satellite's code error    Gauss-Markov over `CODE_CORRELATION_S` and `CODE_CORRELATION_M`, of variance 1
-
-The prediction's own standard deviation of the speed grows with every epoch without redundancy, so that reflections off
-one wall, which agree with each other, can give a wrong speed; `narrow_speed_range` follows what a train can do.
+docs/filter-equations.md has both as a table. The standard deviation of the speed grows with every epoch without
+redundancy: reflections off one wall, which agree, can then give a wrong speed. `narrow_speed_range` limits it.
 """
 
 from __future__ import annotations
@@ -46,12 +32,18 @@ class Transition(NamedTuple):
 
 
 @inner
+def identity(unknowns: int) -> Transition:
+    """Return the transition that changes nothing."""
+    unknown, coefficient = np.zeros((unknowns, 3), dtype=np.intp), np.zeros((unknowns, 3))
+    unknown[:, 0], coefficient[:, 0] = np.arange(unknowns), 1.0
+    return Transition(unknown, coefficient)
+
+
+@inner
 def compute_transition(speed: float, epoch: Record, unknowns: int) -> Transition:
     """Return the transition to an epoch from a state of some speed [m/s]."""
     dt, travel = epoch.interval_s, abs(speed) * epoch.interval_s
-    unknown, coefficient = np.zeros((unknowns, 3), dtype=np.intp), np.zeros((unknowns, 3))
-    for i in range(unknowns):
-        unknown[i, 0], coefficient[i, 0] = i, 1.0
+    unknown, coefficient = identity(unknowns)
     for i in range(3):
         for k in range(3):
             unknown[i, k], coefficient[i, k] = k, epoch.step[i, k]
@@ -82,6 +74,18 @@ def _multiply(F: Transition, matrix: Floats, product: Floats) -> None:
 
 
 @inner
+def carry(F: Transition, x: Floats, P: Floats, scratch: Floats) -> None:
+    """Carry a Gaussian through a transition, in place: ``F x``, ``F P F'``; `scratch`, shape (N, N), is overwritten."""
+    before = x.copy()
+    for i in range(len(x)):
+        x[i] = 0.0
+        for k in range(3):
+            x[i] += F.coefficient[i, k] * before[F.unknown[i, k]]
+    _multiply(F, P, scratch)  # (F P)' = P F'
+    _multiply(F, scratch, P)  # (F P F')' = F P F'
+
+
+@inner
 def predict(
     given: Given, t: int, x: Floats, P: Floats, map_log_variance: float, wrong_map_m: float, scratch: Floats
 ) -> None:
@@ -90,14 +94,9 @@ def predict(
     `map_log_variance` is that of `Monitors`, `wrong_map_m` a standard deviation of the map beside the line's own [m];
     `scratch`, shape (N, N), is overwritten.
     """
-    epoch, speed, before = given.epoch[t], x[ix.SPEED], x.copy()
+    epoch, speed = given.epoch[t], x[ix.SPEED]
     F = compute_transition(speed, epoch, len(x))
-    for i in range(len(x)):
-        x[i] = 0.0
-        for k in range(3):
-            x[i] += F.coefficient[i, k] * before[F.unknown[i, k]]
-    _multiply(F, P, scratch)  # (F P)' = P F'
-    _multiply(F, scratch, P)  # (F P F')' = F P F'
+    carry(F, x, P, scratch)
     _add_noise(epoch, given.line[0], given.parameters[0], speed, (map_log_variance, wrong_map_m), F, P)
 
 
@@ -163,13 +162,9 @@ def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
     write_point(given.vertex, given.line[0], at[1], point, before)
     length = P[ix.MAP_LENGTH_ERROR, ix.MAP_LENGTH_ERROR] - _LEAST_M2
     position_variance = min(P[ix.ARC, ix.ARC] - length, constants.START_SIGMA_M**2)
-    right = up = 0.0
-    for c in range(3):
-        change = axes[0, c] - before[0, c]
-        right += change * axes[1, c]
-        up += change * axes[2, c]
-    P[ix.STEP_RIGHT, ix.STEP_RIGHT] += position_variance * right**2
-    P[ix.STEP_UP, ix.STEP_UP] += position_variance * up**2
+    change = axes[0] - before[0]
+    P[ix.STEP_RIGHT, ix.STEP_RIGHT] += position_variance * (change * axes[1]).sum() ** 2
+    P[ix.STEP_UP, ix.STEP_UP] += position_variance * (change * axes[2]).sum() ** 2
 
 
 @inner

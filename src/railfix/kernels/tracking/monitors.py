@@ -62,12 +62,9 @@ def update_monitors(state: State, square: float, shift: float, beyond_m: float, 
     hold = 0.0
     if _is_doubtful(monitors) or beyond_m > 0.0:
         hold = constants.LEVEL_HOLD_S
-    if monitors.branch_s < constants.LEVEL_START_S:
-        largest = -math.inf
-        for h in range(monitors.hypotheses):
-            largest = max(largest, state.hypothesis[h].log_probability)
-        if largest < math.log(constants.YOUNG):
-            hold = constants.YOUNG_HOLD_S
+    largest = state.hypothesis["log_probability"][: monitors.hypotheses].max()
+    if monitors.branch_s < constants.LEVEL_START_S and largest < math.log(constants.YOUNG):
+        hold = constants.YOUNG_HOLD_S
     drift = monitors.code_shift**2 > constants.DRIFT_SIGMAS**2 * monitors.code_shift_variance
     if drift or monitors.map_log_variance > constants.DRIFT_LOG or _is_contradicted_by_subfilter(state):
         hold = constants.LEVEL_HOLD_S
@@ -90,9 +87,8 @@ def _is_doubtful(monitors: Record) -> bool:
 @inner
 def _is_contradicted_by_subfilter(state: State) -> bool:
     """Return whether a sub-filter is contradicted by its measurements, or that of the map lies aside."""
-    for b in range(len(state.source)):
-        if state.source[b].running and state.source[b].contradicted_s > constants.LEVEL_DOUBT_S:
-            return True
+    if (state.source["running"] & (state.source["contradicted_s"] > constants.LEVEL_DOUBT_S)).any():
+        return True
     wrong = find_others(state) + ix.WRONG_MAP
     if wrong < 0 or not state.source[wrong].running:
         return False

@@ -16,7 +16,6 @@ from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.adaptation import adapt, compute_code_shift
 from railfix.kernels.tracking.equations import find_wheel_sign, linearise, new_equations
-from railfix.kernels.tracking.evidence import compute_evidence, refit_inflated_prior
 from railfix.kernels.tracking.hypotheses import find_leading, prune, reweigh
 from railfix.kernels.tracking.layout import Given, Results, Rows, State, Trace
 from railfix.kernels.tracking.level import bound_speed, find_branches, write_level
@@ -27,10 +26,12 @@ from railfix.kernels.tracking.monitors import compute_contradiction, update_moni
 from railfix.kernels.tracking.subfilters import advance_subfilters, find_others
 from railfix.kernels.tracking.update import (
     Correction,
+    compute_evidence,
     correct_state,
     mean_weights,
     new_fit,
     predict_quantities,
+    refit_inflated_prior,
     reweight,
     write_first_weights,
 )
@@ -173,11 +174,9 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
     leads = find_leading(state.hypothesis, len(corrections))
     best = corrections[leads]
     implied = 0.0 if leads else shift
-    excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
+    adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leads)
-    if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have led the place so far
-        state.P[:, ix.ARC, ix.ARC] += constants.INFLATED_M**2
     square = compute_contradiction(given, t, state, leads)
     beyond_m = excess_beyond_end(given.line[0], best.x[ix.ARC], math.sqrt(best.P[ix.ARC, ix.ARC]))
     update_monitors(state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
@@ -209,7 +208,7 @@ def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, res
 def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> None:
     """Write the record of the corrections for the smoother."""
     for h, one in enumerate(corrections):
-        codes, count, equations = rows.code.stop, rows.sensor.stop, one.equations
+        codes, count, equations = rows.code.stop, len(rows.variance), one.equations
         H = np.zeros((len(equations.unknown), len(one.x)))  # of the quantities
         for q in range(len(H)):
             for k in range(ix.TERMS):
@@ -288,7 +287,7 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
     """Do an epoch whose state is predicted."""
     monitors, dt, leads = state.monitors[0], given.epoch[t].interval_s, 0
     rows = choose_measurements(given, t, state)
-    believed = rows.sensor.stop > 0
+    believed = len(rows.variance) > 0  # of an epoch without measurements the prediction is all there is
     if believed:
         corrections, shift = _correct_hypotheses(given, t, state, rows)
         if len(corrections) > 1:
@@ -318,23 +317,24 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
 
 @kernel
 def advance(
-    given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], part: int
+    given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], sought: int
 ) -> tuple[int, int]:
-    """Do the epochs of a span; return the first before which places have to be sought, and why, or its end and 0.
+    """Do the epochs of a span; return the first in which places have to be sought, and why, or its end and 0.
 
-    `part` says what of an epoch is done: `index.WHOLE`, or of the first alone the `PREDICTION`, or the `REST`.
+    That epoch is left predicted; a call for it alone with `index.SOUGHT` does the rest of it. An epoch that begins anew
+    is returned with 0.
     """
     for t in range(span[0], span[1]):
-        if part < ix.REST:
-            reasons = _find_search_reasons(given, t, state) if part == ix.WHOLE else 0
-            if given.epoch[t].begins or reasons:
-                return t, reasons
+        if sought == ix.NOT_SOUGHT:
+            if given.epoch[t].begins:
+                return t, 0
+            reasons = _find_search_reasons(given, t, state)
             _reset_code_errors(given, t, state)
             _wrap_closed_line(given, state)
             _predict_all(given, t, state)
-            if part == ix.PREDICTION:
-                return t, 0
-        _advance_epoch(given, t, state, results, trace, part == ix.REST_LOST)
+            if reasons:
+                return t, reasons
+        _advance_epoch(given, t, state, results, trace, sought == ix.SOUGHT_AS_LOST)
         if not math.isfinite(state.x[0, ix.ARC]):
             return t + 1, 0
     return span[1], 0

@@ -18,7 +18,7 @@ from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.equations import find_wheel_sign, linearise, new_equations
 from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.line import write_point
-from railfix.kernels.tracking.model import add_bend, restart
+from railfix.kernels.tracking.model import add_bend, carry, identity, restart
 from railfix.kernels.tracking.update import (
     Correction,
     Equations,
@@ -72,9 +72,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
     all_in_view = find_others(state) + ix.ALL_IN_VIEW
-    before = False
-    for b in range(len(source)):
-        before = before or (source[b].running and leads == 0)
+    before = leads == 0 and source["running"].any()
     needed = _find_needed(given, t, rows, state)
     needed[all_in_view] = not before
     absorbed = np.zeros(len(source), dtype=np.bool_)
@@ -160,21 +158,12 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     write_point(given.vertex, given.line[0], x[ix.ARC], point, axes)
     write_point(given.vertex, given.line[0], x[ix.PREVIOUS_ARC], point, before)
-    along = right = 0.0
-    for c in range(3):
-        along += before[1, c] * axes[0, c]
-        right += before[1, c] * axes[1, c]
-    x[ix.ARC] += along * x[ix.MAP_RIGHT]
-    x[ix.MAP_LENGTH_ERROR] -= along * x[ix.MAP_RIGHT]
-    x[ix.MAP_RIGHT] *= right
-    for c in range(len(x)):
-        P[ix.ARC, c] += along * P[ix.MAP_RIGHT, c]
-        P[ix.MAP_LENGTH_ERROR, c] -= along * P[ix.MAP_RIGHT, c]
-        P[ix.MAP_RIGHT, c] *= right
-    for c in range(len(x)):
-        P[c, ix.ARC] += along * P[c, ix.MAP_RIGHT]
-        P[c, ix.MAP_LENGTH_ERROR] -= along * P[c, ix.MAP_RIGHT]
-        P[c, ix.MAP_RIGHT] *= right
+    along, right = (before[1] * axes[0]).sum(), (before[1] * axes[1]).sum()
+    F = identity(len(x))
+    for i, share in ((ix.ARC, along), (ix.MAP_LENGTH_ERROR, -along)):
+        F.unknown[i, 1], F.coefficient[i, 1] = ix.MAP_RIGHT, share
+    F.coefficient[ix.MAP_RIGHT, 0] = right
+    carry(F, x, P, np.empty_like(P))
     P[ix.MAP_RIGHT, ix.MAP_RIGHT] += (along * given.parameters[0].level_map_m) ** 2
 
 

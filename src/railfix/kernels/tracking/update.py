@@ -70,9 +70,21 @@ class Correction(NamedTuple):
 
 
 @inner
+def find_row(rows: Rows, q: int) -> int:
+    """Return the row that measures a quantity alone: that of a code or a sensor. The six of the motion have none."""
+    return q if q < rows.code.stop else q - rows.code.stop - ix.MOTION + rows.sensor.start
+
+
+@inner
+def find_quantity(rows: Rows, j: int) -> int:
+    """Return the quantity of a code or a sensor by its row: codes first, then the six of the motion, then sensors."""
+    return j if j < rows.code.stop else j - rows.sensor.start + rows.code.stop + ix.MOTION
+
+
+@inner
 def new_fit(rows: Rows) -> Fit:
     """Return the fit of an epoch's measurements, to be written."""
-    count = rows.sensor.stop
+    count = len(rows.variance)
     return Fit(np.ones(count), np.zeros(count), np.zeros(count), np.zeros(1), np.zeros(1))
 
 
@@ -165,14 +177,7 @@ def compute_weight(rows: Rows, square: float, late: bool) -> float:
 @inner
 def median(values: Floats) -> float:
     """Return the median of values; NaN of none."""
-    ordered, size = np.empty(len(values)), len(values)
-    for a in range(size):  # by insertion
-        b = a
-        while b > 0 and ordered[b - 1] > values[a]:
-            ordered[b] = ordered[b - 1]
-            b -= 1
-        ordered[b] = values[a]
-    return float(0.5 * (ordered[(size - 1) // 2] + ordered[size // 2])) if size else math.nan
+    return float(np.median(values)) if len(values) else math.nan
 
 
 @inner
@@ -202,7 +207,7 @@ def write_first_weights(
         away = value[j] - middle
         weight[j] = compute_weight(rows, away * away / (without_clock[j] + variance[j]), away > 0.0)
     for j in range(rows.sensor.start, rows.sensor.stop):
-        spread = without_clock[codes + ix.MOTION + j - rows.sensor.start]
+        spread = without_clock[find_quantity(rows, j)]
         weight[j] = compute_weight(rows, value[j] * value[j] / (spread + variance[j]), False)
 
 
@@ -226,7 +231,7 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
             for c in range(r, ix.MOTION):
                 S += T[r, c] * g[codes + c]
         else:
-            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
+            j = find_row(rows, q)
             if variance[j] == math.inf:
                 continue
             g[:], noise = C[q], variance[j] / weight[j]
@@ -247,7 +252,7 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
 def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, variance: Floats, found: Fit) -> float:
     """Write residuals and variances of the fitted quantities; return the weighted square sum of codes and sensors."""
     design, value, codes, square = equations.design, equations.value, rows.code.stop, 0.0
-    for j in range(rows.sensor.stop):
+    for j in range(len(rows.variance)):
         residual, fitted = value[j], 0.0
         if codes <= j < rows.sensor.start:
             for a in range(ix.MOTION):
@@ -255,7 +260,7 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
                 for b in range(ix.MOTION):
                     fitted += design[j, a] * design[j, b] * C[codes + a, codes + b]
         else:
-            q = j if j < codes else j - rows.sensor.start + codes + ix.MOTION
+            q = find_quantity(rows, j)
             residual, fitted = residual - mean[q], C[q, q]
             if variance[j] < math.inf:
                 square += found.weight[j] * residual * residual / variance[j]
@@ -266,7 +271,7 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
 @inner
 def write_weights(rows: Rows, variance: Floats, found: Fit) -> None:
     """Write the weights that follow from the residuals of a fit and their variances."""
-    for j in range(rows.sensor.stop):
+    for j in range(len(rows.variance)):
         relative = (found.residual[j] ** 2 + found.fitted[j]) / variance[j]
         late = j < rows.code.stop and found.residual[j] > 0.0
         found.weight[j] = compute_weight(rows, relative, late)
@@ -303,7 +308,7 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
             for c in range(r, ix.MOTION):
                 S += T[r, c] * _project(equations, codes + c, g)
         else:
-            j = q if q < codes else q - codes - ix.MOTION + rows.sensor.start
+            j = find_row(rows, q)
             if variance[j] == math.inf:
                 continue
             y = value[j] - _add_quantity(equations, q, 1.0, P, change, g)
@@ -338,7 +343,7 @@ def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: 
 def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
     """Return the logarithm of the evidence of the measurements of finite variance, by Laplace with Student's t."""
     usual, density = rows.degrees, 0.0
-    for j in range(rows.sensor.stop):
+    for j in range(len(rows.variance)):
         own = rows.late_degrees if j < rows.code.stop and found.residual[j] > 0.0 else usual
         density += own * math.log1p(found.residual[j] ** 2 / (own * variance[j]))
     return float(-0.5 * (usual + 1.0) / usual * density - 0.5 * found.distance[0] - 0.5 * found.log_determinant[0])
@@ -355,3 +360,38 @@ def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, f
             else:
                 motion, motions = motion + weight[j], motions + 1
     return code / codes if codes else math.nan, motion / motions if motions else math.nan
+
+
+@inner
+def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
+    """Return the logarithms of the evidence of all measurements but the codes, and of the codes beside them.
+
+    0 for too few of them: they fit any speed and place.
+    """
+    joint = compute_log_evidence(rows, rows.variance, one.fit)
+    without_codes, found = rows.variance.copy(), new_fit(rows)
+    without_codes[rows.code] = math.inf
+    found.weight[:] = one.fit.weight
+    reweight(rows, one.equations, one.covariance, without_codes, found)
+    motion = compute_log_evidence(rows, without_codes, found)
+    codes = joint - motion if rows.code.stop >= constants.MOTION_SATELLITES else 0.0
+    satellites = max(rows.phase.stop - rows.phase.start, rows.doppler.stop - rows.doppler.start)
+    if satellites < constants.MOTION_SATELLITES and rows.sensor.stop == rows.sensor.start:
+        motion = 0.0
+    return motion, codes
+
+
+@inner
+def refit_inflated_prior(rows: Rows, one: Correction) -> None:
+    """Fit again with weights from innovations with place and speed set free; keep the fit with more evidence."""
+    inflated, found = one.P_prior.copy(), new_fit(rows)
+    inflated[ix.ARC, ix.ARC] += constants.FREEDOM_PLACE_M2
+    inflated[ix.SPEED, ix.SPEED] += constants.FREEDOM_SPEED_M2PS2
+    expected = predict_quantities(inflated, one.equations)
+    write_first_weights(rows, one.equations, expected, rows.variance, found.weight)
+    reweight(rows, one.equations, expected[0], rows.variance, found)
+    reweight(rows, one.equations, one.covariance, rows.variance, found)
+    first = compute_log_evidence(rows, rows.variance, one.fit)
+    if compute_log_evidence(rows, rows.variance, found) > first:
+        for k in range(len(found)):
+            one.fit[k][:] = found[k]

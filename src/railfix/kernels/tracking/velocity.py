@@ -55,11 +55,8 @@ def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: 
                 distance, u[0], u[1], u[2] = sight(sat[0], sat[1], sat[2], point[0], point[1], point[2])
                 if kind == ix.PHASE:
                     distance -= sight(before[0], before[1], before[2], point[0], point[1], point[2])[0]
-                    h[count, :3], y[count], r[count] = (
-                        -u,
-                        (from_.measured[kind] - distance) / dt,
-                        from_.variance[kind] / dt**2,
-                    )
+                    h[count, :3], y[count] = -u, (from_.measured[kind] - distance) / dt
+                    r[count] = from_.variance[kind] / dt**2
                 else:
                     y[count] = from_.measured[kind] - write_range_rate(from_, point, u, h[count, :3])
                     r[count] = from_.variance[kind]

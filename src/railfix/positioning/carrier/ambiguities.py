@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
-from railfix.core.tables import NotebookTable
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.observation_model import IntegerChannels, Linearised, OwnUnknowns, PhaseClocks, Phases
 from railfix.positioning.range_arrays import Ranges

@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, freeze_rows, join_rows
 from railfix.core.checksums import crc24q
-from railfix.core.tables import NotebookTable
+from railfix.core.notebook import NotebookTable
 
 Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections.
 #: First bits of successive messages: eight, three in turn (DO-229D, A.4.3.1); on L5 four, six in turn.

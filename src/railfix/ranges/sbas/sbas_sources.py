@@ -16,10 +16,11 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.ranges.atmosphere import Delays, SeenFrom, rtca_troposphere_m, rtca_troposphere_sigma_m
+from railfix.ranges.atmosphere import Delays, SeenFrom
 from railfix.ranges.channels import DFMC_SIGNALS, Channels
 from railfix.ranges.sbas import DfmcService, IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections
 from railfix.ranges.sbas.dfmc import DfmcCorrections, DfmcState, residual_ionosphere_m
+from railfix.ranges.sbas.troposphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.sources import BroadcastSource, SourceDelays, SourceSatellites
 
 

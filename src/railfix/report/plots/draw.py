@@ -14,7 +14,7 @@ import polars as pl
 from polars.exceptions import ColumnNotFoundError
 
 from railfix.core.errors import SettingsError
-from railfix.core.files import stage_file
+from railfix.core.staged_files import stage_file
 from railfix.core.timescale import timedelta
 from railfix.report.plots.chart import (
     BLUE,

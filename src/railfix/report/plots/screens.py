@@ -17,7 +17,8 @@ from railfix.core.errors import InputFileError, OutputError
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
 from railfix.pipeline.config import Config
-from railfix.ranges.cn0_curve import Cn0Curve, Cn0Samples
+from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.ranges.cn0_curve_fit import Cn0Samples
 from railfix.report.plots.chart import (
     BLACK,
     RED,
