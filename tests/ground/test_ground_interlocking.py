@@ -281,6 +281,20 @@ def test_the_age_of_an_authority_is_that_of_the_report_it_answers() -> None:
     assert (train.brake_reason(62.0), train.end_m) == (None, 500.0)  # never shortened
 
 
+def test_an_authority_that_lapsed_on_the_way_is_not_taken() -> None:
+    """A unit that reports every second takes none whose report was sent more than 45 s before the newest."""
+    train = OnBoard(direction=1, end_m=100.0)
+    for second in range(46):
+        train.note_report(second + 1, float(second))
+    assert train.receive(authority(1, report=1))
+    train.note_report(47, 46.0)
+    assert not train.receive(authority(2, report=1, end_m=900.0))
+    for second in range(46, 700):
+        train.note_report(second + 1, float(second))
+    assert not train.receive(authority(3, report=20, end_m=900.0))  # so old that it is forgotten
+    assert (train.end_m, train.number) == (500.0, 1)
+
+
 def test_bytes_of_an_authority() -> None:
     data = authority(9, report=3, end_m=-12.34, direction=-1).encode()
     assert Authority.decode(data) == authority(9, report=3, end_m=-12.34, direction=-1)

@@ -136,7 +136,10 @@ def run_rows(folder: Path, around: Around, driven: Driven) -> Iterator[str]:
         rows = rows.filter(pl.col("antenna") == "front") if "antenna" in rows.columns else rows
         true = true_names(driven, chainages(folder, rows["time_gpst"].to_numpy()))
         names = np.array([str(name).split("/")[0] for name in rows["track"]], dtype=object)
-        good, certain = (rows["status"] == passed).to_numpy(), (rows["track_probability"] > 0.999).to_numpy()
+        good, certain = (
+            (rows["status"] == passed).to_numpy(),
+            (rows["track_probability"].fill_null(0.0) > 0.999).to_numpy(),
+        )
         wrong = good & (names != true)
         counts = f"{wrong.sum()} of them wrong, {(wrong & certain).sum()} above 0.999"
         yield f"{table}: {len(rows)} rows, {good.sum()} {passed}, {counts}"

@@ -209,6 +209,24 @@ def test_canted_circle_in_closed_form(side: float) -> None:
     np.testing.assert_allclose(path.roll_deg, side * np.degrees(roll), atol=1e-9)
 
 
+@pytest.mark.requirement("A2")
+def test_the_roll_of_a_closed_line_goes_on_beyond_its_ends() -> None:
+    """A ring of 600 m whose cant rises to its end: beyond an end it is that of the other one."""
+    radius, count = 600.0 / (2.0 * np.pi), 240
+    angle = 2.0 * np.pi * np.arange(count + 1) / count
+    enu = np.stack([radius * (1.0 - np.cos(angle)), radius * np.sin(angle), 0 * angle], axis=1)
+    cant = 0.05 + 0.05 * np.sin(0.5 * angle) ** 2 + 0.02 * np.sin(angle)
+    line = _VehicleLine(Track.from_ecef(to_ecef(enu), cant_m=cant, radius_m=0 * angle + radius), 1.5)
+    length = line.chainage[-1]
+    assert line.open_ends == (False, False)
+    beyond, within = (
+        np.array([-40.0, -5.0, length + 5.0, length + 40.0]),
+        np.array([length - 40.0, length - 5.0, 5.0, 40.0]),
+    )
+    np.testing.assert_allclose(line.roll_at(beyond), line.roll_at(within), atol=1e-9)
+    assert np.ptp(line.roll_at(within)) > 0.01
+
+
 def _reversed(track: Track) -> Track:
     return Track.from_ecef(track.ecef_m[::-1], cant_m=track.cant_m[::-1], radius_m=-track.radius_m[::-1])
 

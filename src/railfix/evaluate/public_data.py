@@ -153,7 +153,7 @@ def _compute_rtk(program: str, folder: Path) -> PositionLog:
 
 def _write_truth(log: PositionLog, path: Path) -> None:
     """Write the positions of a log that are good enough as ground truth."""
-    good = (log.sigma_m < _LARGEST_SIGMA_M).all(axis=1)
+    good = np.asarray((log.sigma_m < _LARGEST_SIGMA_M).all(axis=1))
     latitude, longitude, height = log.geodetic
     columns = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}
     columns |= dict(zip(SIGMA_COLUMNS, log.sigma_m.T, strict=True))

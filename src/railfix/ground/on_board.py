@@ -179,8 +179,9 @@ class OnBoard:
         """Return whether an authority answers a report of this start and end, at most `LONGEST_FRESH_S` old."""
         if authority.session != self.session or authority.report <= self.before_turn:
             return False
-        remembered = authority.report >= next(iter(self._sent), -1)
-        sent_s = self._sent.get(authority.report, math.inf if remembered else -math.inf)
+        if len(self._sent) == REMEMBERED and authority.report < next(iter(self._sent)):
+            return False
+        sent_s = self._sent.get(authority.report, math.inf)
         return self._sent.get(self._newest, -math.inf) - sent_s <= LONGEST_FRESH_S
 
     def _begins(self) -> bool:
