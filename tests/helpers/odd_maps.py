@@ -277,7 +277,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("above_ground.kml", kml("relativeToGround"), "refused", "relativeToGround, no height of the track"),
     Odd("decimal_commas.gpx", gpx(","), "refused", '11,00000000 has a comma in a number'),
     Odd("decimal_commas.osm", osm().replace('lat="48.', 'lat="48,'), "refused", "has a comma in a number"),
-    Odd("nodes_not_sorted.osm", osm().replace('id="5"', 'id="555"'), "refused", "have no height; give --heights"),
+    Odd("nodes_not_sorted.osm", osm().replace('id="5"', 'id="555"'), "refused", "have no height; give heights"),
     Odd("platform.osm", osm("platform"), "refused", "1 railway=platform"),
     # -- railML
     Odd("clean.railml", railml(), "right"),
