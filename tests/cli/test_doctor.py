@@ -60,7 +60,7 @@ def test_a_log_without_a_date_is_a_log_that_needs_one(recordings: Path, tmp_path
     path.write_bytes(b"".join(content[a:b] for (a, b), n in zip(spans, numbers, strict=True) if 1070 < n < 1140))
     (finding,) = examine_files([path]).findings
     assert finding.kind == "observations"
-    assert "its observations (RTCM 3) carry no date; give one with --date" in finding.problems[0]
+    assert "its observations (RTCM 3) carry no date; give one (date, --date)" in finding.problems[0]
     result = RUNNER.invoke(app, ["doctor", str(path), "--date", "2024-08-18T12:00", "--json"])
     (found,) = json.loads(result.stdout)["files"]
     assert found["first"].startswith("2024-08-18T21:14:25")
@@ -84,6 +84,23 @@ def test_networks_orbits_and_maps_without_heights_are_no_problem(desk: Path, tmp
     )
     assert all("km from the place in the header" in problem for problem in found.problems)
     assert "--heights log" in found.command
+
+
+@pytest.mark.requirement("A6")
+@pytest.mark.parametrize(("name", "datum"), [("a.kml", "orthometric --geoid egm96"), ("a.geojson", "ellipsoidal")])
+def test_heights_are_taken_as_the_format_defines_them(tmp_path: Path, name: str, datum: str) -> None:
+    """KML's altitudes are above EGM96 (OGC KML 2.3, 13.9); other formats leave it open."""
+    points = [[135.45, 35.05, 120.0], [135.451, 35.05, 120.0], [135.452, 35.05, 120.0]]
+    line = {"type": "Feature", "properties": {}, "geometry": {"type": "LineString", "coordinates": points}}
+    text = json.dumps({"type": "FeatureCollection", "features": [line]})
+    if name.endswith("kml"):
+        places = " ".join(",".join(map(str, point)) for point in points)
+        text = f"<kml xmlns='http://www.opengis.net/kml/2.2'><Placemark><LineString><coordinates>{places}"
+        text += "</coordinates></LineString></Placemark></kml>"
+    (tmp_path / name).write_text(text)
+    found = examine_files([tmp_path / name])
+    assert " ".join(found.findings[0].options) == f"--height-datum {datum}"
+    assert f"takes them as {datum.split()[0]}" in found.problems[0]
 
 
 @pytest.mark.requirement("A6")

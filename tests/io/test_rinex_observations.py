@@ -286,7 +286,11 @@ def test_events_of_rinex_2(tmp_path: Path) -> None:
     lines += event_2(4, [record("     6    L1    C1    P1    S1    D1    S2", "# / TYPES OF OBSERV")])
     lines += epoch_2(" 0  0  3.0000000", {"G05": [field(float(k)) for k in range(1, 7)]})
     lines += epoch_2(" 0  0  3.5000000", {"G05": [field(float(k)) for k in range(1, 7)]}, flag=6)
-    lines += [" 05  4  2  0  0  3.7000000  5  0", *epoch_2(" 0  0  4.0000000", {"G05": [field(9.0)] * 6})]
+    lines += [
+        " 05  4  2  0  0  3.7000000  5  1",
+        record("a door opens", "COMMENT"),
+        *epoch_2(" 0  0  4.0000000", {"G05": [field(9.0)] * 6}),
+    ]
     observations = read_observations(write(tmp_path / "log", lines))
     assert observations.break_before.tolist() == [False, True, True, False, False]
     assert observations.skipped == {"cycle-slip records": 1, "external events": 1}

@@ -251,6 +251,42 @@ def test_a_computer_too_busy_to_skip_is_no_step_of_the_tags() -> None:
     assert not any(skipped[105:])
 
 
+def test_a_clock_of_100_ppm_beside_the_receivers_is_no_lag() -> None:
+    """An hour at 1 Hz, the computer's clock 100 ppm fast: the delay grows by 0.36 s, of which none is a lag."""
+    lag = Lag(behind_s=0.3)
+    assert not any(lag.skips(k * 1000 * MS, round(k * 1000 * MS * (1.0 + 1e-4))) for k in range(3600))
+
+
+def test_the_wait_ends_when_a_message_is_due(logs: dict[str, tuple[Observations, ...]]) -> None:
+    """An epoch that came too early waits for the end of a period; the next is due one and a half later, then one."""
+    engine = LiveEngine(processor("front"), LiveSettings(period_s=0.2))
+    engine.push("front", logs["front"][0], now_ns=0)
+    sent: list[tuple[int, MessageStatus]] = []
+    for now_ms, wait_ms in ((0, 200), (50, 150), (200, 200), (440, 60), (500, 200), (650, 50)):
+        outputs = engine.poll(now_ns=now_ms * MS, sent_ns=now_ms * MS)
+        sent += [(now_ms, output.message.status) for output in outputs if output.part != "rows"]
+        assert engine.wait_s(now_ns=now_ms * MS) == pytest.approx(wait_ms / 1e3)
+    assert [now_ms for now_ms, _ in sent] == [200, 500]
+    assert sent[1][1] is MessageStatus.NO_INPUT
+
+
+def test_numbers_are_reserved_for_ten_times_between_two_states(
+    logs: dict[str, tuple[Observations, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A crash after a state is written may follow messages that have been sent: the next session begins beyond them."""
+
+    async def arrivals(*_: Any, **__: Any) -> AsyncIterator[ReceivedData]:
+        for epoch in logs["front"][:3]:
+            yield ReceivedData(epochs=(epoch,), after=ReceiverState())
+
+    saved: list[Any] = []
+    monkeypatch.setattr(session, "arrivals", arrivals)
+    engine = LiveEngine(processor("front"), LiveSettings(period_s=0.1, state_every_s=2.0))
+    asyncio.run(run_session(engine, {"front": "tcp://127.0.0.1:1"}, [], speed=None, hooks=Hooks(save=saved.append)))
+    assert saved[0].engine.sequence == 10 * 20
+    assert saved[-1].engine.sequence < 4  # of an orderly end, that of the last message
+
+
 def test_duplicates_order_and_restart(logs: dict[str, tuple[Observations, ...]]) -> None:
     engine = LiveEngine(processor("front"), LiveSettings(restart_epochs=3))
     first = list(logs["front"][60:90])

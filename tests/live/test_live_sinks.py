@@ -30,6 +30,7 @@ import railfix
 from railfix.cli import app
 from railfix.core.errors import OutputError, SettingsError
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
+from railfix.live import sinks
 from railfix.live.console import Metrics, SessionLog
 from railfix.live.engine import LiveOutput
 from railfix.live.forms import etcs_form, forms
@@ -68,6 +69,17 @@ def test_a_slow_reader_delays_nothing_and_loses_what_does_not_fit() -> None:
     outlet.close()
     assert len(taken) + outlet.dropped == 5000
     assert taken == sorted(taken)
+
+
+def test_what_a_stuck_target_has_not_taken_at_the_end_is_lost_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sinks, "_CLOSE_S", 0.05)
+    release = threading.Event()
+    outlet = Outlet("stuck", lambda _: bool(release.wait(20)), waiting=100)
+    for k in range(5):
+        outlet.send(k)
+    outlet.close()
+    release.set()
+    assert outlet.dropped == 5
 
 
 def test_a_replay_waits_and_loses_nothing() -> None:

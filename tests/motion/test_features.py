@@ -83,6 +83,19 @@ def test_error_of_the_place_within_its_own_sigma() -> None:
 
 
 @pytest.mark.requirement("E3")
+@pytest.mark.parametrize("off_m", [-3.9, 2.1, 0.09])
+def test_a_place_between_two_steps_of_the_search_is_found(off_m: float) -> None:
+    line = _line()
+    way = np.arange(-60.0, 60.5, 1.0)
+    series = {
+        name: np.interp(POINTS[1] + way, line.arc_m, getattr(line, name)) for name in ("gradient", "curvature_1pm")
+    }
+    measured = LineSeries(arc_m=way, **series)
+    found = locate(measured, line, POINTS[1] + off_m, 8.0, quantity="gradient", noise=NOISE)
+    assert found.arc_m == pytest.approx(POINTS[1], abs=0.05)
+
+
+@pytest.mark.requirement("E3")
 def test_two_equal_features_in_the_window_are_refused() -> None:
     line = _line(repeated=True)
     measured = _measured(line, 510.0, 3, half=15.0)

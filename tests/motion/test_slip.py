@@ -120,6 +120,18 @@ def test_noiseless_pitch_is_that_of_the_line() -> None:
 
 
 @pytest.mark.requirement("E1")
+@pytest.mark.parametrize("drift_mps2", [0.015, -0.015])
+def test_half_of_the_final_gap_of_wheel_and_inertia_is_taken_off_the_distance(drift_mps2: float) -> None:
+    """The accelerometer's offset changes as a slip of 10 s begins: carried too far by 0.75 m, and put back."""
+    case = even_motion(90.0, 60.0, 10.0, 6.0)
+    found = replace(case, force=np.where(case.time_s >= 60.0, drift_mps2, 0.0)).run()
+    slips = np.isin(found.state, SLIPPING)
+    assert slips[(case.time_s > 61.0) & (case.time_s < 69.0)].all()
+    assert not slips[case.time_s > 75.0].any()
+    assert abs(case.way_error_m(found, 55.0, 80.0)) < 0.4
+
+
+@pytest.mark.requirement("E1")
 def test_the_other_way_gives_the_same_flags() -> None:
     case = motion(300.0, SLIPS[:5], noise=0.02)
     mirrored = Motion(case.time_s, -case.speed, -case.wheel, -case.force + 0.04, -case.sine)

@@ -66,6 +66,16 @@ def read(*readings: tuple[float, str]) -> BaliseReadings:
     return BaliseReadings(time=times, balise=np.array([n for _, n in readings]), sigma_m=np.full(len(readings), np.nan))
 
 
+def test_a_reading_has_the_errors_of_its_antenna_and_of_its_place_in_the_list() -> None:
+    """3 m of the list and 4 m of the reader are 5 m; a reader without a figure has that of the settings."""
+    marks = replace(listed(100.0, 200.0, virtual=False), sigma_m=np.array([3.0, 3.0]))
+    readings = replace(read((1.0, "B1"), (2.0, "B2")), sigma_m=np.array([4.0, np.nan]))
+    edges = np.array([at(float(t)) for t in range(4)], dtype="datetime64[ns]")
+    epochs, _ = balise_epochs(readings, edges, marks, line(), BaliseState(), BaliseLimits(sigma_m=1.25))
+    sigma = epochs.sigma_m[np.isfinite(epochs.sigma_m)]
+    np.testing.assert_allclose(sigma, [5.0, 3.25])
+
+
 def found(tracked: Tracked, marks: ListedBalises, readings: BaliseReadings | None = None, cuts: tuple[int, ...] = ()):
     state: PassingState | None = None
     passings: list[Passing] = []

@@ -90,6 +90,23 @@ def test_the_force_and_the_place_of_the_ranging_unit_turn_with_the_front() -> No
     np.testing.assert_allclose(ranging_lever_m(behind, limits), [-2.0, -1.2, -1.0])
 
 
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("pitch_rad", [0.01, -0.01])
+def test_a_pitch_of_the_body_is_no_acceleration(pitch_rad: float) -> None:
+    """On a level line the body pitches within half a second, as on its springs; the gyro shows it."""
+    given = _samples()
+    t = (given.inertial.time - START) / np.timedelta64(1, "s")
+    pitch = pitch_rad * np.clip((t - 12.0) / 0.5, 0.0, 1.0)
+    force, rate = np.zeros((len(t), 3)), np.zeros((len(t), 3))
+    force[:, 0], force[:, 2], rate[:, 1] = 9.80665 * pitch, -9.80665, np.gradient(pitch, t)
+    samples = replace(given, inertial=InertialSamples(time=given.inertial.time, force_mps2=force, rate_radps=rate))
+    found, _, _ = sensor_epochs(
+        samples, EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS, sine_at=lambda arc_m: np.zeros(arc_m.shape)
+    )
+    assert found.force_mps2 is not None
+    np.testing.assert_allclose(found.force_mps2[13:17], 0.0, atol=0.03)
+
+
 @pytest.mark.requirement("E2")
 def test_a_wheel_without_direction_is_so_called_and_a_slow_one_says_nothing() -> None:
     found, _, _ = sensor_epochs(_samples(direction=0), EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS)

@@ -135,6 +135,18 @@ def test_equals_a_dense_least_squares(limits, clocks, tied):
 
 
 @pytest.mark.requirement("A5")
+@pytest.mark.parametrize("gap_s", [0, 9])
+def test_ambiguities_walk_on_through_a_gap(gap_s: int):
+    """The position after a gap, of the past alone, and its noise are those of a dense solution of all epochs."""
+    arc, time = moving(8), carrier_cases.times(8)
+    time = time + np.where(np.arange(8) < 5, 0, gap_s).astype("timedelta64[s]")
+    ranges, phases = carrier_cases.observed(LINE, arc, noise=0.3)
+    live, _ = phase_positions(time, ranges, phases, LINE, arc + 4.0, limits=WALKING)
+    expected, _ = dense(ranges, phases, time, arc + 4.0, LINE, WALKING)
+    assert live.arc_m[-1] == pytest.approx(expected[-1], abs=1e-5)
+
+
+@pytest.mark.requirement("A5")
 @pytest.mark.parametrize("limits", [CONSTANT, WALKING])
 def test_the_last_epoch_of_a_run_is_that_of_the_past_alone(limits):
     arc, time = moving(20), carrier_cases.times(20)

@@ -179,6 +179,16 @@ def test_an_error_that_lasts_a_minute_is_one_sample_from_the_start(epochs: int, 
     assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.2
 
 
+def test_the_noise_of_a_code_is_as_large_as_its_stated_change_makes_it() -> None:
+    """White noise of a metre in both codes, as is assumed: drawn errors have the variance that is stated."""
+    time, code, second, _ = made(2400, noise_m=1.0)
+    found, _ = combine(time, code, second)
+    late = slice(1500, None)
+    drawn = found.code_m[late].var(axis=0).mean()
+    assert drawn == pytest.approx(1.0 + float(found.variance_m2[late].mean()), rel=0.05)
+    assert drawn < 0.75
+
+
 def test_what_the_means_have_told_is_not_told_again() -> None:
     """Codes of equal noise are averaged once the ionosphere is known; before, less of the second."""
     time, code, second, _ = made(1800, noise_m=0.05)

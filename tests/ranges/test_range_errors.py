@@ -34,6 +34,7 @@ from railfix.ranges.error_model_fit import ErrorModelFit
 from railfix.run import RunOptions, read_record, run_files
 from railfix.run.driver import open_inputs
 from railfix.run.processor_setup import make_processor
+from railfix.screens import Screened
 from railfix.simulate import Scenario, Simulation, demo_files
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import from_positions
@@ -108,6 +109,17 @@ def test_an_error_put_into_a_code_comes_back_and_touches_no_other_satellite() ->
     # Huber's weight holds a sixtyfold outlier down to a share of a few per cent of the clock.
     assert np.median(changed[itself]) == pytest.approx(60.0, abs=4.0)
     assert np.abs(np.median(changed[~itself])) < 1.0
+
+
+@pytest.mark.parametrize("screen", ["doppler", "antenna_pair"])
+def test_a_range_that_a_screen_suspects_does_not_count_for_its_clock(screen: str) -> None:
+    processor, obs, reference = _demo(parse_config({"filter": "off", "screens": ["elevation"]}), slice(0, 5))
+    found, path = processor.process({"front": obs})[0].antennas["front"], processor.trajectories["front"]
+    reject = np.zeros(found.corrected.reason.shape, dtype=bool)
+    reject[:, np.flatnonzero((found.corrected.reason == 0).all(axis=0))[0]] = True
+    suspected = replace(found, screens={screen: Screened(reject=reject, metric=np.zeros(reject.shape))})
+    before, after = (range_errors(result, path, reference).samples for result in (found, suspected))
+    assert before.used.sum() - after.used.sum() == 5
 
 
 def test_the_errors_of_a_simulated_run_have_the_noise_that_was_put_in() -> None:

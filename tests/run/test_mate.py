@@ -89,7 +89,7 @@ def test_a_folder_without_its_tables_is_refused(folder: Path, tmp_path: Path) ->
     (tmp_path / "S_GNSS_SAT.parquet").write_bytes((folder / "S_GNSS_SAT.parquet").read_bytes())
     with pytest.raises(InputFileError, match="has no table S_DM_TRACK_SEGMENT_POSITION or S_DM_TRACKPOINT"):
         find_inputs(tmp_path)
-    with pytest.raises((SettingsError, ValueError), match="--front is missing"):
+    with pytest.raises((SettingsError, ValueError), match=r"front \(--front\) is missing"):
         RunInputs(nav=(tmp_path / "n",), track=(tmp_path / "t",))
 
 
@@ -173,6 +173,9 @@ def test_a_run_on_the_tables_gives_the_positions_of_its_rinex_and_the_result_tab
     last = etcs.tail(1).to_dicts()[0]
     assert last["NID_LRBG_C"] == 493
     assert last["D_LRBG"] < 61.0
+    assert (last["Q_DLRBG"], last["Q_DIRTRAIN"]) == (1, 1)  # it has passed the balise, and runs on
+    first = etcs.head(1).to_dicts()[0]
+    assert (first["NID_LRBG_C"], first["D_LRBG"], first["Q_DLRBG"]) == (None, None, 2)
 
 
 def test_every_table_that_is_read_has_its_device_or_edge() -> None:

@@ -218,7 +218,7 @@ def test_an_openstreetmap_extract_and_a_log_give_positions(tmp_path: Path) -> No
     words = ["run", *logs, "--track", str(path), "--out", str(tmp_path / "results")]
     missing = CliRunner().invoke(app, words)
     assert missing.exit_code == 3
-    assert "--heights log" in missing.output
+    assert "(--heights): log" in missing.output
     result = CliRunner().invoke(app, [*words, "--heights", "log"])
     assert result.exit_code == 0, result.output
     record = json.loads((tmp_path / "results" / "run.json").read_text())

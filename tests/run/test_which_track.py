@@ -318,6 +318,11 @@ def test_command_prints_the_track_and_draws_it(recordings: Path, tmp_path: Path)
     assert (tmp_path / "p.png").stat().st_size > 10_000
 
 
+def test_errors_of_satellites_and_atmosphere_are_small_beside_a_base_station(roof: dict[str, StandstillCodes]) -> None:
+    np.testing.assert_array_equal(roof["base"].common_m, 0.05)
+    assert (roof["alone"].common_m > 0.5).all()
+
+
 def test_a_moving_train_is_an_error(recordings: Path) -> None:
     folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
     with pytest.raises(MismatchError, match="standstill"):

@@ -22,6 +22,7 @@ from railfix.io import read_observations, write_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.result_tables import observations_table, positions_table, train_table
 from railfix.pipeline.results import Result
+from railfix.report.figures import _assumptions
 from railfix.report.page import budget, summary
 from railfix.report.runs import ReportedRun
 from railfix.run import RunOptions, RunSummary, run_files
@@ -252,6 +253,16 @@ def test_a_reason_alone_is_counted_apart_from_one_among_others() -> None:
     assert told["observations_rejected_by_one_reason_alone"] == {"elevation_mask": 1, "cn0_floor": 2}
 
 
+@pytest.mark.requirement("B7")
+def test_a_rate_is_of_the_epochs_with_observations_and_ok_of_that_status_alone() -> None:
+    tally = AntennaTally()
+    statuses = [Status.OK, Status.MAP_OFFSET, Status.MAP_OFFSET, Status.TOO_FEW_SATELLITES, Status.NO_OBSERVATION]
+    tally.add(result_of([[0]] * 5, ["G01"], statuses))
+    told = tally.as_dict()
+    assert (told["epochs"], told["epochs_with_observations"]) == (5, 4)
+    assert told["ok_rate"] == 0.25
+
+
 @pytest.mark.requirement("B6")
 def test_span_and_offset_of_the_map_are_of_all_chunks() -> None:
     """Of the map the window that contradicts it most, and the least and the largest that any finds."""
@@ -294,6 +305,24 @@ def test_the_report_states_both_rates() -> None:
     assert epochs["positioning rate"] == "90.00 %"
     assert epochs["rate of ok"] == "60.00 %"
     assert [epochs[name] for name in ("epochs", "with observations", "with coordinates")] == ["200", "100", "90"]
+
+
+@pytest.mark.requirement("D2")
+def test_assumptions_of_the_level_have_each_its_own_figure() -> None:
+    stated = {
+        "risk_per_hour": 1e-7, "samples_per_hour": 360.0, "risk_per_sample": 2.5e-10, "k_of_whole_risk": 6.25,
+        "alarm_limit_m": 20.0, "local_prior": 1e-5, "side_prior": 2e-5, "map_prior": 3e-5, "false_alarm": 4e-3,
+        "satellite_prior": {"G": 5e-5, "E": 6e-5},
+    }  # fmt: skip
+    run = cast("ReportedRun", SimpleNamespace(record={"protection": stated}, config=Config()))
+    shown = {str(row[0]): str(row[1]) for row in _assumptions(run, "separation").rows}
+    assert shown["risk per hour"] == "1e-07"
+    assert shown["independent samples per hour"] == "360"
+    assert shown["risk per sample"] == "2.5e-10"
+    assert shown["K of the whole risk"].startswith("6.25 ")
+    assert [shown[f"prior of a {name}"] for name in ("local fault", "wrong map")] == ["1e-05", "3e-05"]
+    assert shown["prior of one side of the track"] == "2e-05"
+    assert shown["prior of a satellite fault"] == "5e-05 (G); 6e-05 (E)"
 
 
 @pytest.mark.requirement("D2")

@@ -20,7 +20,7 @@ from railfix.io import read_navigation, read_observations
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean, satellite_kind
 from railfix.ranges.cn0_curve_file import read_cn0_curve, write_cn0_curve
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
-from railfix.ranges.cn0_curve_log import cn0_curve_from_log, satellite_elevation_deg
+from railfix.ranges.cn0_curve_log import _notes, cn0_curve_from_log, satellite_elevation_deg
 from railfix.report.plots.screens import draw_cn0_curve, draw_screen
 from railfix.screens import ScreenPicture, cn0_screen
 
@@ -64,6 +64,17 @@ def test_outliers_do_not_move_the_mean_and_nan_is_left_out() -> None:
     curve = fit_cn0_curve([(cn0, elevation, satellite, signal)])
     mean = curve.means[2]
     np.testing.assert_allclose(mean.mean_dbhz, 35 + 15 * np.sin(np.radians(mean.elevation_deg)), atol=0.2)
+
+
+@pytest.mark.parametrize(("away_dbhz", "noted"), [(-14.0, True), (14.0, False)])
+def test_a_sky_that_is_not_open_is_noted_and_one_that_is_too_good_is_not(away_dbhz: float, noted: bool) -> None:
+    """A fiftieth of the samples lie 14 dB-Hz below the others, or above."""
+    elevation = np.tile(np.linspace(5.0, 85.0, 400), 25)[:, None]
+    cn0 = np.where(np.arange(len(elevation)) % 50 == 0, 45.0 + away_dbhz, 45.0)[:, None]
+    samples = Cn0Samples()
+    samples.add(cn0, elevation, np.array(["G01"]), np.array(["1C"]))
+    notes = _notes(fit_cn0_curve(samples), samples, 86_400.0)
+    assert [("of this open sky lie" in note) for note in notes] == ([True] if noted else [])
 
 
 def test_pieces_give_the_same_curve() -> None:

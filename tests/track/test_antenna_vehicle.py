@@ -18,7 +18,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Provenance, Track
-from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.map_from_positions import ANTENNA_PATH
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import (
     PATH_TOLERANCE_M,
@@ -207,6 +207,24 @@ def test_canted_circle_in_closed_form(side: float) -> None:
     np.testing.assert_allclose(np.hypot(found[:, 0] - side * radius, found[:, 1]), radius - inward, atol=2e-3)
     np.testing.assert_allclose(found[:, 2], 4.0 * np.cos(roll), atol=2e-3)
     np.testing.assert_allclose(path.roll_deg, side * np.degrees(roll), atol=1e-9)
+
+
+@pytest.mark.requirement("A2")
+def test_the_roll_of_a_closed_line_goes_on_beyond_its_ends() -> None:
+    """A ring of 600 m whose cant rises to its end: beyond an end it is that of the other one."""
+    radius, count = 600.0 / (2.0 * np.pi), 240
+    angle = 2.0 * np.pi * np.arange(count + 1) / count
+    enu = np.stack([radius * (1.0 - np.cos(angle)), radius * np.sin(angle), 0 * angle], axis=1)
+    cant = 0.05 + 0.05 * np.sin(0.5 * angle) ** 2 + 0.02 * np.sin(angle)
+    line = _VehicleLine(Track.from_ecef(to_ecef(enu), cant_m=cant, radius_m=0 * angle + radius), 1.5)
+    length = line.chainage[-1]
+    assert line.open_ends == (False, False)
+    beyond, within = (
+        np.array([-40.0, -5.0, length + 5.0, length + 40.0]),
+        np.array([length - 40.0, length - 5.0, 5.0, 40.0]),
+    )
+    np.testing.assert_allclose(line.roll_at(beyond), line.roll_at(within), atol=1e-9)
+    assert np.ptp(line.roll_at(within)) > 0.01
 
 
 def _reversed(track: Track) -> Track:

@@ -119,7 +119,7 @@ def test_a_crs_against_the_files_own_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     rows = "".join(f"{y},{x},{z}\n" for x, y, z in LINE)
     path.write_text("# crs: EPSG:4258\nlatitude_deg,longitude_deg,height_m\n" + rows)
-    with pytest.raises(SettingsError, match=r"--crs EPSG:4326 contradicts the file's own CRS EPSG:4258"):
+    with pytest.raises(SettingsError, match=r"crs EPSG:4326 \(--crs\) contradicts the file's own CRS EPSG:4258"):
         read_track(path, crs="EPSG:4326")
     assert read_track(path, crs="EPSG:4258").provenance.frame == "EPSG:4258"
     with pytest.raises(SettingsError, match="contradicts"):

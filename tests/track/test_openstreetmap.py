@@ -205,7 +205,7 @@ def test_all_that_a_map_without_heights_needs_is_asked_for_at_once(tmp_path: Pat
     rasterio = pytest.importorskip("rasterio")
     path = tmp_path / "area.osm"
     path.write_text(_xml())
-    with pytest.raises(InputFileError, match=r"--heights log .*FILE.*--height-datum.*--height-sigma.*--geoid"):
+    with pytest.raises(InputFileError, match=r"--heights.* log.*file.*--height-datum.*--height-sigma.*--geoid"):
         track_of_segments(read_segments(path, MapReading())[:1])
     raster = tmp_path / "ground.tif"
     with rasterio.open(
@@ -213,7 +213,7 @@ def test_all_that_a_map_without_heights_needs_is_asked_for_at_once(tmp_path: Pat
         transform=rasterio.transform.from_bounds(4.99, 49.99, 5.02, 50.02, 40, 40),
     ) as file:  # fmt: skip
         file.write(np.full((1, 40, 40), 100.0, dtype=np.float32))
-    with pytest.raises(SettingsError, match=r"--height-datum .*--geoid.*egm96 of the world.*--height-sigma"):
+    with pytest.raises(SettingsError, match=r"--height-datum.*--geoid.*egm96 of the world.*--height-sigma"):
         track_of_segments(read_segments(path, MapReading())[:1], heights=raster)
     track = track_of_segments(
         read_segments(path, MapReading())[:1],

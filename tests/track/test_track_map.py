@@ -302,7 +302,7 @@ def test_geojson_with_an_unknown_crs(tmp_path: Path) -> None:
     document = feature(LINE, height_datum="ellipsoidal")
     assert "'EPSG:0' is unknown" in refused(geojson(tmp_path, document | member), SettingsError)
     assert "'EPSG:0' is unknown" in refused(geojson(tmp_path, document | member), SettingsError, crs="EPSG:6677")
-    assert "give --crs" in refused(geojson(tmp_path, document | {"crs": {"type": "name"}}))
+    assert "give crs (--crs)" in refused(geojson(tmp_path, document | {"crs": {"type": "name"}}))
 
 
 def test_geojson_that_is_no_json_names_the_line(tmp_path: Path) -> None:

@@ -26,11 +26,11 @@ from railfix.core.timescale import GPS_EPOCH, gps_now_ns
 from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.field import SimulatedPoints
+from railfix.ground.fixes_at_stations import stream_fixes
 from railfix.ground.keys import check_keys
 from railfix.ground.layout import Gradient, Layout, LoopStation, PointName, derive_layout
 from railfix.ground.links import BEARERS, CentreLinks, LinkName
 from railfix.ground.state import HEAD, InterlockingLimits, TrainInterval, from_documents
-from railfix.ground.station_fixes import stream_fixes
 from railfix.ground.store import MOST_LINES, Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.triangle import MonitorLimits, TriangleLimits, TriangleVerdict, judge_fixes

@@ -211,7 +211,7 @@ def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | No
         return used
     one, other = (find_crs(name, path=path).to_2d() for name in (given, named))
     if not one.equals(other, ignore_axis_order=True):
-        raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
+        raise SettingsError(f"{path}: crs {given} (--crs) contradicts the file's own CRS {named}")
     return given if find_crs(given).is_compound else named  # with its height datum, where it has one
 
 

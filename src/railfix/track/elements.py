@@ -302,7 +302,7 @@ def segment_of_design(
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
     crs = reading.crs
     if crs is None:
-        raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give --crs")
+        raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give crs (--crs)")
     points, joints = alignment_points(plan, profile, design.cant, at_m=() if stations is None else stations.places_m)
     xy, up, scale = points.xy_m, 0.0, 1.0
     unit = unit_of_grid(crs, path=path)
@@ -350,7 +350,7 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
     left_out = max(low, 0.0) + max(length - high, 0.0)
     where = f"the profile runs from {low:.0f} to {high:.0f} m of an alignment of {length:.0f} m"
     if left_out > _PROFILE_BEYOND_M:
-        raise InputFileError(path, f"{where}; mend its stations, or remove it and give --heights")
+        raise InputFileError(path, f"{where}; mend its stations, or remove it and give heights (--heights)")
     return (f"{path}: {where}; its last gradients go on",) if left_out > 1.0 else ()
 
 
@@ -362,7 +362,7 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
     if abs(found - designed) > LARGEST_SCALE * designed + 0.5:
         raise InputFileError(
             path,
-            f"the design is {designed:.0f} m long, on the map {found:.0f} m; give the right --crs, or mend the "
+            f"the design is {designed:.0f} m long, on the map {found:.0f} m; give the right crs (--crs), or mend the "
             "elements that do not meet",
         )
 

@@ -246,7 +246,7 @@ def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
         _, shift = points_at(ecef_m[None], code, time)
         size = float(np.hypot(np.hypot(shift.east_m, shift.north_m), shift.up_m))
         parts = f"east {shift.east_m:+.2f}, north {shift.north_m:+.2f}, up {shift.up_m:+.2f} m"
-        found.append(f"in {name}, it is {size:.2f} m off ({parts}); give --crs {code}")
+        found.append(f"in {name}, it is {size:.2f} m off ({parts}); give crs {code} (--crs)")
     if found:
         choices = "; if ".join(found)
         return (f"map: no reference frame is named, WGS 84 is assumed; if the map is, as is usual there, {choices}",)

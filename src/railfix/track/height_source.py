@@ -18,9 +18,9 @@ from railfix.io.file_kind import find_kind
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
-from railfix.track.from_positions import SIGMA_OF_QUALITY
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference, to_map
 from railfix.track.heights import GEOIDS, ellipsoidal_heights, own_height_datum
+from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 from railfix.track.track import SIGMA_HEIGHT_M, Track
 from railfix.track.trajectory import NearestOnPolyline
 
@@ -48,11 +48,11 @@ def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None,
         own = crs.is_compound
     asked = []
     if height_datum is None and not own:
-        asked.append("--height-datum (orthometric: above the sea, as most are; or ellipsoidal)")
+        asked.append("height_datum (--height-datum; orthometric: above the sea, as most are; or ellipsoidal)")
     if height_datum != "ellipsoidal" and geoid is None and not own:
-        asked.append(f"--geoid, where they are orthometric ({GEOIDS})")
+        asked.append(f"geoid (--geoid), where they are orthometric ({GEOIDS})")
     if sigma_m is None:
-        asked.append("--height-sigma (their accuracy in metres)")
+        asked.append("sigma_height_m (--height-sigma), their accuracy in metres")
     if asked:
         raise SettingsError(f"{path}: a raster does not state all that its heights need; give {', '.join(asked)}")
 

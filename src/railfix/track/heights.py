@@ -179,7 +179,9 @@ def heights_of_file(
         raise SettingsError(f"{path}: height_datum {reading.height_datum!r} contradicts the file's own {datum!r}")
     used, model = own_height_datum(reading.crs, reading.height_datum or datum, reading.geoid, path=path)
     if used is None:
-        raise SettingsError(f"{path}: the height datum is missing; give --height-datum ellipsoidal or orthometric")
+        raise SettingsError(
+            f"{path}: the height datum is missing; give height_datum (--height-datum): ellipsoidal or orthometric"
+        )
     if used == "ellipsoidal":
         geoid_m = None
     elif geoid_m is not None and not isinstance(model, str):

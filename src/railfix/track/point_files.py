@@ -158,7 +158,7 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
     try:
         return str(member["properties"]["name"])
     except (TypeError, KeyError):
-        raise InputFileError(path, "the 'crs' member has no properties.name; give --crs") from None
+        raise InputFileError(path, "the 'crs' member has no properties.name; give crs (--crs)") from None
 
 
 def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
@@ -170,7 +170,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
             raise InputFileError(
                 path,
                 f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; are they swapped, or is the CRS a "
-                "projected one (give --crs)?",
+                "projected one (give crs, --crs)?",
             )
     return georeference(crs, values[:, 0], values[:, 1], path=path)
 
@@ -305,8 +305,8 @@ def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColum
         return places
     if height_datum is None:
         raise table.header_error(
-            f"the column {theirs!r} does not say above what its heights are; give --height-datum ellipsoidal or "
-            "orthometric, or name it height_m (ellipsoidal) or elevation_m (orthometric)"
+            f"the column {theirs!r} does not say above what its heights are; give height_datum (--height-datum): "
+            "ellipsoidal or orthometric, or name it height_m (ellipsoidal) or elevation_m (orthometric)"
         )
     cells = {("elevation_m" if height_datum == "orthometric" and name == "height_m" else name): column
              for name, column in named.cells.items()}  # fmt: skip

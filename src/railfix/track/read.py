@@ -128,12 +128,13 @@ def check_heights(
     if flat and heights is None:
         raise InputFileError(
             flat[0].source,
-            "the coordinates have no height; give --heights log (railfix run: those of the log's own positions), or "
-            "--heights FILE: a raster with --height-datum, --height-sigma and, of orthometric heights, --geoid "
+            "the coordinates have no height; give heights (--heights): log, in railfix run those of the log's own "
+            "positions, or a file: a raster with height_datum (--height-datum), sigma_height_m (--height-sigma) and, "
+            "of orthometric heights, geoid (--geoid) "
             f"({GEOIDS}); a profile by chainage; or a log of 3-D positions",
         )
     if heights is not None and len(flat) < len(segments):
-        raise SettingsError(f"{segments[0].source} has heights itself; --heights is for maps without")
+        raise SettingsError(f"{segments[0].source} has heights itself; heights (--heights) are for maps without")
     if isinstance(heights, str | PathLike) and ending(heights) in RASTERS:
         check_raster(heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
 
@@ -146,7 +147,7 @@ def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
     if unknown := [s for s in segments if np.isnan(s.datum_plan_m)]:
         raise SettingsError(
             f"{unknown[0].source}: the accuracy of the transformation from its CRS is unknown; give that of the map "
-            "with it (--plan-sigma)"
+            "with it (sigma_plan_m, --plan-sigma)"
         )
     return [s if "sigma_plan_m" in s.metadata else _with_usual_accuracy(s, Path(file).name) for s in segments]
 

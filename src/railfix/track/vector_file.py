@@ -320,7 +320,7 @@ def plan_segment(
         raise InputFileError(source, "a track needs at least two different points")
     crs = reading.crs
     if crs is None and (np.abs(values[:, :2]) > (360.0, 90.0)).any():
-        raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give --crs")
+        raise InputFileError(source, "names no CRS, and its coordinates are no degrees; give crs (--crs)")
     used = crs or "EPSG:4326"
     place = georeference(used, values[:, 0], values[:, 1], path=source)
     heights = None

@@ -180,7 +180,7 @@ def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None
                 break
     if not parts:
         why = (
-            "its positions (UBX) carry no date, and no NAV-PVT with one is in the log; give one with --date"
+            "its positions (UBX) carry no date, and no NAV-PVT with one is in the log; give one (date, --date)"
             if undated
             else "holds no position of the receiver (UBX NAV-PVT or NAV-HPPOSLLH, SBF PVTGeodetic or PVTCartesian)"
         )
@@ -426,7 +426,7 @@ def scan_receiver_log(
         raise InputFileError(path, "holds no UBX, RTCM 3, SBF or NMEA message with a valid checksum")
     if not epochs:
         why = (
-            "its observations (RTCM 3) carry no date; give one with --date"
+            "its observations (RTCM 3) carry no date; give one (date, --date)"
             if undated
             else "holds no observations (UBX RXM-RAWX, SBF MeasEpoch, RTCM 3 MSM4 to MSM7)"
         )

@@ -230,7 +230,9 @@ def _runs(
     if not epochs:
         last = readers[-1]
         if not any(reader.epochs for reader in readers):
-            raise InputFileError(last.path, "has no usable epoch; without --lenient the first fault is named")
+            raise InputFileError(
+                last.path, "has no usable epoch; with broken_lines='stop' (no --lenient) the first fault is named"
+            )
         begin, end = first_time(paths[0]), np.datetime64(max(reader.last_ns for reader in readers), "ns")
         what = f"is of {str(begin)[:19]} to {str(end)[:19]}"
         if begin > end or last.last_ns >= selection.end_ns:
