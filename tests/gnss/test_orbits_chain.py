@@ -12,7 +12,7 @@ import pytest
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.orbits import satellite_states
 from railfix.io import read_navigation, read_observations
-from railfix.io.rinex.write_navigation import write_navigation
+from railfix.io.rinex.navigation_writer import write_navigation
 
 #: Log, navigation file, signals of one channel a satellite.
 LOGS = {

@@ -19,7 +19,7 @@ from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations
 from railfix.ground.demo import PLAN_M, TIME, draw_fixes, points_ecef_m
-from railfix.ground.station_fixes import StationStreams, station_fixes
+from railfix.ground.fixes_at_stations import StationStreams, station_fixes
 from railfix.ground.triangle import (
     SIDES,
     STOPPING,

@@ -11,7 +11,7 @@ import polars as pl
 from railfix.core.timescale import gpst_to_utc, to_week
 from railfix.gnss.observations import concatenate
 from railfix.io.mate import READ
-from railfix.simulate.sensor_tables import sensor_tables
+from railfix.simulate.sensor_columns import sensor_tables
 from railfix.simulate.signals import Simulation
 
 #: Country of the balises, and names of signals, by constellation and RINEX code.

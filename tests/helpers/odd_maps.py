@@ -6,9 +6,11 @@ All are of one line of 1 km, or of one design. A file is `right` (its points are
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import struct
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -115,6 +117,21 @@ def kml(mode: str = "absolute") -> str:
         '<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>main</name>'
         f"<LineString>{inner}</LineString></Placemark></Document></kml>"
     )
+
+
+def zipped(name: str, content: str) -> bytes:
+    """An archive of one file."""
+    with zipfile.ZipFile(archive := io.BytesIO(), "w") as file:
+        file.writestr(name, content)
+    return archive.getvalue()
+
+
+def zipped_shapefile(path: Path) -> None:
+    """An archive of a Shapefile with the files beside it, as portals give it out."""
+    measured(13)(path.with_suffix(".shp"))
+    with zipfile.ZipFile(path, "w") as archive:
+        for part in (path.with_suffix(ending) for ending in (".shp", ".shx", ".prj")):
+            archive.write(part, part.name)
 
 
 def gpx(mark: str = ".") -> str:
@@ -263,6 +280,8 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("clean.fgb", written("FlatGeobuf", LINE), "right"),
     Odd("clean.gml", written("GML", LINE), "right"),
     Odd("clean.kml", kml(), "right"),
+    Odd("packed.kmz", zipped("doc.kml", kml()), "right"),
+    Odd("shapefile.zip", zipped_shapefile, "right"),
     Odd("grid.dxf", written("DXF", GRID), "right", asked={"crs": "EPSG:25832", "height_datum": "ellipsoidal"}),
     Odd("repeated.gpkg", written("GPKG", np.repeat(LINE, 2, axis=0)), "right"),
     Odd("swapped.fgb", written("FlatGeobuf", LINE[:, _SWAPPED]), "refused", "are swapped"),

@@ -23,7 +23,7 @@ from railfix.run.sensors import read_listed_balises, read_sensors, read_units
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensor_tables import sensor_tables
+from railfix.simulate.sensor_columns import sensor_tables
 from railfix.track import Track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 

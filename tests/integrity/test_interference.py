@@ -25,7 +25,7 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion_signs import MotionSigns
+from railfix.integrity.interference.motion import MotionSigns
 from railfix.integrity.interference.range_fits import MotionInputs
 from railfix.integrity.interference.time_tags import _explains_more
 from railfix.positioning.search_index import SearchIndex

@@ -17,7 +17,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.io.positions import read_positions
 from railfix.io.reference_log import read_reference
 from railfix.track import ThinningLimits, from_position_log, from_positions, read_track, thin
-from railfix.track.from_positions import ANTENNA_PATH, usable_rows
+from railfix.track.map_from_positions import ANTENNA_PATH, usable_rows
 from railfix.track.trajectory import Trajectory
 from recordings_truth import TRUTHS, write_truth_csv
 

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from railfix.core import files
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, MismatchError
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import read_observations
 from railfix.io.epoch_order import EpochOrder
@@ -303,3 +303,15 @@ def test_what_is_written_is_read(tmp_path: Path, epochs: list[dict], strip: bool
     for array, wanted in zip(arrays, expected, strict=True):
         np.testing.assert_array_equal(array, wanted)
     np.testing.assert_array_equal(observations.loss_of_lock, lock)
+
+
+@pytest.mark.requirement("G5")
+def test_logs_of_one_antenna_years_apart_are_not_one_run(tmp_path: Path) -> None:
+    epoch = epoch_3("02 33 13.0050000", {"G05": [field(2e7), field(1e8), field(1.0), field(40.0)]})
+    paths = [tmp_path / "first.obs", tmp_path / "later.obs"]
+    for path, year in zip(paths, (b"2021", b"2024"), strict=True):
+        path.write_bytes(text_of([*header_3(), *epoch]).replace(b"2021", year))
+    with pytest.raises(
+        MismatchError, match=r"first.obs begins at 2021-05-17T02:33:13 and .*later.obs at 2024.* 1,096 d"
+    ):
+        read_observations(paths)

@@ -125,6 +125,9 @@ def test_range_alone_on_its_clock_is_checked_by_the_known_bias() -> None:
     ranges = replace(ranges, code_m=code)
     clock = point_position(ranges, line.at_arc(np.array([300.0] * 3))).clock_m
     known = InterSystemBiases(offset_m=np.zeros((3, 2)), sigma_m=np.full((3, 2), 2.0))
-    assert np.array_equal(gross_alone(ranges, clock, known), np.eye(6, dtype=bool)[5] & np.array([[0], [1], [0]], bool))
+    assert np.array_equal(
+        gross_alone(ranges.weight, ranges.groups, clock, known),
+        np.eye(6, dtype=bool)[5] & np.array([[0], [1], [0]], bool),
+    )
     nothing = replace(known, sigma_m=np.array([[0.0, UNTIED_M]] * 3))
-    assert not gross_alone(ranges, clock, nothing).any()
+    assert not gross_alone(ranges.weight, ranges.groups, clock, nothing).any()

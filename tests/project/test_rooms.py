@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -129,6 +130,24 @@ def test_files_do_not_import_each_other_in_a_circle() -> None:
 def test_a_circle_of_files_is_found() -> None:
     assert find_circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [{"a", "b", "c"}]
     assert find_circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+def _exports(stub: Path) -> Iterator[str]:
+    """Names that a package imports at their first use, its own parts left out."""
+    for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            yield from (item.asname or item.name for item in node.names)
+
+
+def test_no_name_of_a_package_is_that_of_one_of_its_files() -> None:
+    """Otherwise the first import decides which of the two the name is."""
+    same = [
+        f"{stub.parent.relative_to(SOURCE)}: {name}"
+        for stub in sorted(SOURCE.rglob("__init__.pyi"))
+        for name in _exports(stub)
+        if (stub.parent / f"{name}.py").exists() or (stub.parent / name).is_dir()
+    ]
+    assert not same, same
 
 
 def test_files_stay_small() -> None:

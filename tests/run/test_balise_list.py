@@ -13,7 +13,7 @@ from railfix.pipeline.config import Config
 from railfix.run.sensors import load_balises, read_listed_balises, read_sensors
 from railfix.simulate import Simulation
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensor_tables import COLUMNS, sensor_tables
+from railfix.simulate.sensor_columns import COLUMNS, sensor_tables
 from railfix.simulate.settings import Balise, BaliseSettings, SensorSettings
 from railfix.track import Track, read_track, write_track_csv
 

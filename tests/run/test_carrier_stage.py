@@ -10,6 +10,7 @@ import pytest
 
 from railfix.evaluate import along_track_error
 from railfix.io import read_navigation, read_observations
+from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
 from railfix.run.processor_setup import make_processor
 from railfix.simulate import demo_files
@@ -70,3 +71,16 @@ def test_off_leaves_the_phase_alone():
     whole = run("off", EPOCHS)[0]
     assert whole.phase is None
     assert run("float", EPOCHS)[0].phase is not None
+
+
+@pytest.mark.requirement("A5")
+def test_a_phase_counts_by_the_sine_of_its_elevation(monkeypatch: pytest.MonkeyPatch):
+    given = []
+    positions = carrier_stage.phase_positions
+    monkeypatch.setattr(carrier_stage, "phase_positions", lambda *a, **k: given.append(a[2]) or positions(*a, **k))
+    (found,) = run("float", 5, 5)
+    weight, elevation = given[0].weight, found.corrected.elevation_deg
+    used = weight > 0.0
+    assert used.sum() > 50
+    sigma = parse_config({}).phase_sigma_m / np.sin(np.radians(elevation[used]))
+    np.testing.assert_allclose(weight[used], sigma**-2.0, rtol=1e-9)

@@ -16,7 +16,7 @@ from railfix.core.errors import SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate import RunSettings, Scenario, Simulation
 from railfix.simulate.body_sensors import gravity_mps2, wheel_slips
-from railfix.simulate.sensor_tables import COLUMNS, dropouts, sensor_tables
+from railfix.simulate.sensor_columns import COLUMNS, dropouts, sensor_tables
 from railfix.simulate.settings import (
     BaliseSettings,
     DrawnSlips,

@@ -22,7 +22,9 @@ from typer.testing import CliRunner
 import paths
 from network_around import Around, made, write_network
 from railfix.cli import app
+from railfix.core.arrays import take_rows
 from railfix.core.geodesy import axes_at
+from railfix.io import PositionLog
 from railfix.io.logs import read_navigation, read_observations
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
@@ -96,14 +98,16 @@ def matched_row(folder: Path, around: Around, driven: Driven) -> str:
     log = read_observations(folder / "front.crx.gz")
     step = max(1, round(1.0 / float(np.median(np.diff(log.time) / np.timedelta64(1, "s")))))
     place = locate(log[::step], known_from_start(config, navigation=navigation), config, ChannelBook(config))
-    rows = np.isfinite(place.ecef_m[:, 0])
+    place = take_rows(place, np.isfinite(place.ecef_m[:, 0]))
+    rows = np.arange(len(place.time))
+    positions = PositionLog(
+        path="made", time=place.time, ecef_m=place.ecef_m, quality=5 + 0 * rows, sigma_m=place.sigma_m, line=rows
+    )
     above = read_vehicle(folder / "vehicle.toml").antennas["front"].up_m
     network = made(around)
     network = replace(network, tracks=tuple(replace(t, metadata=t.metadata | _SIGMA) for t in network.tracks))
-    found = match(
-        network, plan_log("made", place.time[rows], place.ecef_m[rows], place.sigma_m[rows], antenna_up_m=above)
-    )
-    true = true_names(driven, chainages(folder, place.time[rows]))
+    found = match(network, plan_log(positions, antenna_up_m=above))
+    true = true_names(driven, chainages(folder, place.time))
     names = np.array([*(name.split("/")[0] for name in network.names), "none"], dtype=object)[found.track]
     wrong, there = (names != true) & (names != "none"), true != "none"
     largest = float(np.max(np.where(wrong, found.probability, 0.0)))

@@ -102,6 +102,7 @@ def mutated(text: str, mutant: Mutant) -> str:
 _PLUGIN: Final = """
 import os, coverage, pytest
 measured = coverage.Coverage(data_file=os.environ["MEASURED"], source_pkgs=["railfix"], config_file=False)
+measured.set_option("run:disable_warnings", ["module-not-measured", "already-imported"])
 measured.start()
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item): measured.switch_context(item.nodeid + "|setup")

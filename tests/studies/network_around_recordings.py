@@ -30,7 +30,7 @@ from network_around import SHAPES, Shape, made, network_around, write_network
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import timedelta
 from railfix.evaluate import interpolate_reference
-from railfix.io import read_navigation, read_observations
+from railfix.io import PositionLog, read_navigation, read_observations
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import known_from_start
@@ -140,7 +140,11 @@ def stated(errors: Errors, shape: Shape, seed: int) -> tuple[np.ndarray, np.ndar
     latitude, longitude, _ = geodetic_from_ecef(place)
     axes = enu_axes(latitude, longitude)[:, [1, 0, 2]]
     ecef = place + np.einsum("tij,ti->tj", axes, errors.error_m)
-    matched = match(network, plan_log("made", errors.time, ecef, errors.sigma_m))
+    rows = np.arange(len(ecef))
+    log = PositionLog(
+        path="made", time=errors.time, ecef_m=ecef, quality=5 + 0 * rows, sigma_m=errors.sigma_m, line=rows
+    )
+    matched = match(network, plan_log(log))
     known = np.isfinite(matched.probability)
     shares = np.column_stack([matched.probabilities, 1.0 - matched.probabilities.sum(axis=1)])[known]
     track = np.column_stack([matched.candidates.track, np.full(len(place), -1)])[known]

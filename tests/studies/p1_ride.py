@@ -33,7 +33,7 @@ from railfix.simulate.run import vehicle_table
 from railfix.simulate.sbas_stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ANTENNAS, RunSettings
 from railfix.simulate.scenario_file import load_recipe
-from railfix.simulate.sensor_tables import sensor_tables
+from railfix.simulate.sensor_columns import sensor_tables
 from railfix.simulate.signals import Piece
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 

@@ -14,7 +14,7 @@ import numpy as np
 
 import paths
 from railfix.core.arrays import Datetimes, Floats, Integers
-from railfix.ground.station_fixes import StationFixes, station_fixes, stream_fixes
+from railfix.ground.fixes_at_stations import StationFixes, station_fixes, stream_fixes
 from railfix.io import read_navigation, read_observations
 from railfix.io.receiver.log import read_receiver_positions
 

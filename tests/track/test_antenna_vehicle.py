@@ -18,7 +18,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Provenance, Track
-from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.map_from_positions import ANTENNA_PATH
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import (
     PATH_TOLERANCE_M,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
-from railfix.track.from_positions import thin
+from railfix.track.map_from_positions import thin
 
 
 @pytest.mark.requirement("A2")

@@ -11,7 +11,7 @@ import pytest
 from railfix.motion.samples import BaliseReadings
 from railfix.pipeline.balises import VERDICTS
 from railfix.pipeline.filter_result import AlongTrack
-from railfix.simulate.sensor_tables import sensor_tables
+from railfix.simulate.sensor_columns import sensor_tables
 from railfix.tracking import Kind
 from sensed_ride import Ride, ride
 

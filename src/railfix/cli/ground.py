@@ -23,7 +23,7 @@ from railfix.ground.triangle import MonitorLimits, TriangleLimits
 from railfix.run.output import Overwrite
 
 if TYPE_CHECKING:
-    from railfix.ground.station_fixes import StationFixes
+    from railfix.ground.fixes_at_stations import StationFixes
     from railfix.ground.triangle import Order
 
 app = command_group("ground")
@@ -165,7 +165,7 @@ def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits
 
 async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[StationFixes]:
     """Yield the fixes of the receivers: of logs at once, of streams epoch by epoch."""
-    from railfix.ground.station_fixes import read_fixes, stream_fixes
+    from railfix.ground.fixes_at_stations import read_fixes, stream_fixes
     from railfix.io import read_navigation
     from railfix.live.sources import check_source
     from railfix.run.processor_setup import parse_position

@@ -28,7 +28,7 @@ from railfix.io.position_log import SIGMA_COLUMNS, PositionLog
 from railfix.io.positions import read_positions
 from railfix.run.prepared import cache_folder
 from railfix.track import write_track_csv
-from railfix.track.from_positions import from_position_log
+from railfix.track.map_from_positions import from_position_log
 
 WHEEL: Final = "gnss-benchmark==2.3.0"
 WHEEL_SHA256: Final = "75a0a69642e5d5f863ac8e7d9bd2fc9c9d2444eb70b539a9da3ec93128054e0f"

@@ -281,17 +281,18 @@ def stack_parts(parts: Sequence[Observations]) -> Observations:
         signal=np.array([k[1] for k in keys], dtype="<U2"), loss_of_lock=lock,
         break_before=np.concatenate([p.break_before for p in parts]),
         receiver_alarm=np.concatenate([p.receiver_alarm for p in parts]),
-        front_end_gain=np.concatenate([p.front_end_gain for p in parts]), header=_join_header(parts),
+        front_end_gain=np.concatenate([p.front_end_gain for p in parts]),
+        header=_join_headers([p.header for p in parts]),
         problems=first_problems(chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=count),
         problem_count=count, skipped=dict(skipped), **floats,
     )  # fmt: skip
 
 
-def _join_header(parts: Sequence[Observations]) -> ObservationHeader:
-    first = parts[0].header
+def _join_headers(headers: Sequence[ObservationHeader]) -> ObservationHeader:
+    first = headers[0]
     signals = {system: set(names) for system, names in first.signals.items()}
     channels = dict(first.glonass_channel)
-    for header in {id(p.header): p.header for p in parts}.values():
+    for header in {id(header): header for header in headers}.values():
         for system, names in header.signals.items():
             signals.setdefault(system, set()).update(names)
         channels = {**header.glonass_channel, **channels}

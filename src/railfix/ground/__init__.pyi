@@ -3,11 +3,11 @@
 from .authority import Authority, BrakeOrder
 from .braking import BrakeLimits, Supervised, supervise
 from .centre import CentreLimits, ReferenceCurve, TrainRecord, TrainState, report_received, time_passed
+from .fixes_at_stations import StationFixes, station_fixes
 from .interlocking import extend_authorities, release_points, route_requested
 from .layout import Gradient, Layout, LoopStation
 from .on_board import OnBoard, OnBoardLimits
 from .state import Interlocking, InterlockingLimits, PointState, Restriction, TrainInterval
-from .station_fixes import StationFixes, station_fixes
 from .supervision import Supervision
 from .triangle import (
     MonitorLimits,

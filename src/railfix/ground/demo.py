@@ -23,10 +23,10 @@ from railfix.core.settings import Settings
 from railfix.ground.authority import Authority
 from railfix.ground.centre import ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
+from railfix.ground.fixes_at_stations import StationFixes, fixes_of_ranges
 from railfix.ground.keys import write_keys
 from railfix.ground.links import BEARERS, CentreLinks, LinkLimits, LinkName, TrainLinks, create_bearers, draw_coverage
 from railfix.ground.on_board import OnBoard
-from railfix.ground.station_fixes import StationFixes, fixes_of_ranges
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops

@@ -22,15 +22,15 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings
 from railfix.core.settings_files import load_settings
-from railfix.core.timescale import utc_to_gpst
+from railfix.core.timescale import GPS_EPOCH, gps_now_ns
 from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.field import SimulatedPoints
+from railfix.ground.fixes_at_stations import stream_fixes
 from railfix.ground.keys import check_keys
 from railfix.ground.layout import Gradient, Layout, LoopStation, PointName, derive_layout
 from railfix.ground.links import BEARERS, CentreLinks, LinkName
 from railfix.ground.state import HEAD, InterlockingLimits, TrainInterval, from_documents
-from railfix.ground.station_fixes import stream_fixes
 from railfix.ground.store import MOST_LINES, Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.triangle import MonitorLimits, TriangleLimits, TriangleVerdict, judge_fixes
@@ -361,7 +361,8 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
         points = triangle.points_ecef_m()
         async for fixes in stream_fixes(triangle.sources, points, navigation=navigation):
             result = judge_fixes(fixes, triangle.limits)
-            age_s = float((utc_to_gpst(np.datetime64(time.time_ns(), "ns")) - fixes.time[0]) / np.timedelta64(1, "s"))
+            tag_ns = int((fixes.time[0] - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64))
+            age_s = (gps_now_ns() - tag_ns) / 1e9
             control.judge(TriangleVerdict(int(result.verdict[0])), int(result.receiver[0]), age_s=age_s)
         control.log("triangle: every stream has ended")
     except (RailfixError, ValueError) as error:

@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from railfix.core.arrays import Codes, Floats, FrozenArrays, Integers, Masks
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option
-from railfix.ground.station_fixes import StationFixes
+from railfix.ground.fixes_at_stations import StationFixes
 
 #: Receivers of each side of the triangle.
 SIDES: Final = ((0, 1), (1, 2), (2, 0))

@@ -53,12 +53,16 @@ def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
     """Return the statistic of the residuals and its threshold (P4) without judging: every outcome is UNTESTABLE."""
-    found = _detect(fix, ranges.redundancy, scale, limits or RaimLimits())
+    return _untested(_detect(fix, ranges.redundancy, scale, limits or RaimLimits()), ranges.weight.shape, scale)
+
+
+def _untested(found: Detection, shape: tuple[int, ...], scale: ArrayLike) -> RaimResult:
+    """Return the statistic of T epochs by K channels without an outcome."""
     return RaimResult(
-        outcome=np.full(len(ranges), int(Outcome.UNTESTABLE), dtype=np.int8), statistic=found.statistic,
-        threshold=found.threshold, scale=np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),)),
-        excluded=np.zeros(ranges.code_m.shape, dtype=bool),
-        own_error_m=np.full(ranges.code_m.shape, np.nan), protection_level_m=np.full(len(ranges), np.nan),
+        outcome=np.full(shape[0], int(Outcome.UNTESTABLE), dtype=np.int8), statistic=found.statistic,
+        threshold=found.threshold, scale=np.broadcast_to(np.asarray(scale, dtype=np.float64), shape[:1]),
+        excluded=np.zeros(shape, dtype=bool), own_error_m=np.full(shape, np.nan),
+        protection_level_m=np.full(shape[0], np.nan),
     )  # fmt: skip
 
 
@@ -104,8 +108,8 @@ def exclude_faults(
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),))
     if not (scale > 0.0).all(where=np.isfinite(scale)):
         raise ValueError("scale must be positive: the standard deviation of the ranges over that of their weights")
-    raim = compute_statistic(ranges, fix, scale, limits=limits)
     test = _detect(fix, ranges.redundancy, scale, limits)
+    raim = _untested(test, ranges.weight.shape, scale)
     raim.outcome[test.testable] = Outcome.PASSED
     failing = test.detected.nonzero()[0]
     if not len(failing):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -51,23 +51,17 @@ class EpochOrder:
         """Yield the epochs in rising order; the last part has the notes. InputFileError: a wrong time tag ("stop")."""
         for run in runs:
             self._held.append(run)
-            if self._rises():
+            if _rise([*(time[-1:] for time in self._times[-1:]), *(held.epochs.time for held in self._held)]):
                 while sum(len(held.epochs) for held in self._held[1:]) >= _HELD:
                     yield self._hand_on(self._held.pop(0).epochs)
             else:
                 yield self._sort(final=False)
-        if self._rises():
+        if _rise([*(time[-1:] for time in self._times[-1:]), *(held.epochs.time for held in self._held)]):
             yield from (self._hand_on(run.epochs) for run in self._held)
         else:
             yield self._sort(final=True)
         self._held = []
         yield self._summary()
-
-    def _rises(self) -> bool:
-        """Return whether all waiting epochs follow each other and the epochs already returned."""
-        last = [self._times[-1][-1:]] if self._times else []
-        time = np.concatenate([*last, *(run.epochs.time for run in self._held), np.empty(0, "datetime64[ns]")])
-        return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
 
     def _hand_on(self, part: Observations) -> Observations:
         if not len(part):
@@ -226,3 +220,9 @@ def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observation
             target[row] = np.where(blank, source[k], target[row])
     kept = take_epochs(ordered, first)
     return replace(kept, **values)
+
+
+def _rise(times: Sequence[Datetimes]) -> bool:
+    """Return whether epochs follow each other, those of one part after those of another."""
+    time = np.concatenate([*times, np.empty(0, "datetime64[ns]")])
+    return bool((np.diff(time) > np.timedelta64(0, "ns")).all())

@@ -85,7 +85,7 @@ def compile_filter() -> None:
     state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
-    recursion.advance(state, len(epochs), trace=None)  # of no epoch: the call compiles it
+    recursion.run(state, len(epochs), found=None, trace=None)  # of no epoch: the call compiles it
 
 
 def _read_logs() -> dict[str, Observations]:

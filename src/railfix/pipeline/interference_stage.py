@@ -30,7 +30,7 @@ from railfix.integrity.interference import (
     power_signs,
     suspicion,
 )
-from railfix.integrity.interference.motion_signs import MotionFit, fit_motion
+from railfix.integrity.interference.motion import MotionFit, fit_motion
 from railfix.integrity.interference.range_fits import MotionInputs
 from railfix.pipeline.solution import Solution
 from railfix.positioning.antenna_rows import AntennaRows

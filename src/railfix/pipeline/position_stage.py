@@ -92,8 +92,8 @@ def position_stage(
     )  # fmt: skip
     raim = checked.raim
     if "raim" in config.screens and config.raim_protection == "on":
-        level = reliability(model, limits=config.raim, scale=scale).protection_level_m
-        raim = copy_with(raim, protection_level_m=np.where(raim.faulty, np.nan, level))
+        of_raim = reliability(model, limits=config.raim, scale=scale).protection_level_m
+        raim = copy_with(raim, protection_level_m=np.where(raim.faulty, np.nan, of_raim))
     corrected = reject(corrected, raim.excluded, Reason.FAULT_EXCLUDED)
     checked = checked._replace(corrected=corrected, raim=raim)
     level, open_elsewhere = level_stage(checked, antennas, offset, config)

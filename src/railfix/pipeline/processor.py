@@ -382,16 +382,15 @@ class EpochProcessor:
 
         Two antennas are filtered in two threads.
         """
-        assert chunk.solution is not None, "single epochs are positioned before the filter"
-        interference = dict(zip(chunk.names, chunk.interference, strict=True))
+        solution, interference = chunk.solution, dict(zip(chunk.names, chunk.interference, strict=True))
+        assert solution is not None, "single epochs are positioned before the filter"
 
         def one_antenna(name: str) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
             rows, sensors = chunk.rows[name], chunk.sensors
             return along_track(
                 take_epochs(chunk.corrected, rows), take_epochs(chunk.slips, rows),
-                single_epochs(take_epochs(chunk.solution, rows), interference[name], self.config), self.lines[name],
-                self.config,
-                state.fusion.get(name) or FilterState(), samples=sensors,
+                single_epochs(take_epochs(solution, rows), interference[name], self.config), self.lines[name],
+                self.config, state.fusion.get(name) or FilterState(), samples=sensors,
                 references=self._line_references(name, sensors),
             )  # fmt: skip
 

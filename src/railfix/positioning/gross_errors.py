@@ -8,6 +8,7 @@ same force.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -285,24 +286,24 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     return GrossErrors(gross, arc, unsure & np.isfinite(arc))
 
 
-def gross_alone(ranges: Ranges, clock_m: Floats, ties: InterSystemBiases) -> Masks:
+def gross_alone(weight: Floats, groups: Sequence[slice], clock_m: Floats, ties: InterSystemBiases) -> Masks:
     """Return the ranges that are alone on their clock and off by more than `GROSS_M` by the known biases, shape (T, M).
 
     Nothing contradicts such a range while its clock is free. `clock_m` are the clocks of a position with free clocks,
     shape (T, G); the common clock is their median by satellites, less the biases.
     """
-    found = np.zeros(ranges.weight.shape, dtype=np.bool_)
-    count = np.add.reduceat((ranges.weight > 0).astype(np.int64), ranges.starts, axis=1)
+    found = np.zeros(weight.shape, dtype=np.bool_)
+    count = np.add.reduceat((weight > 0).astype(np.int64), [group.start for group in groups], axis=1)
     known = (ties.sigma_m < UNTIED_M) & np.isfinite(clock_m)
     rows = np.flatnonzero((known & (count == 1)).any(axis=1) & (known & (count > 1)).any(axis=1))
     if not len(rows):
         return found
     common = np.where(known, clock_m - ties.offset_m, np.inf)[rows]
     order = np.argsort(common, axis=1)
-    weight = np.take_along_axis(np.where(known, count, 0)[rows], order, axis=1).cumsum(axis=1)
-    middle = (2 * weight >= weight[:, -1:]).argmax(axis=1)
+    satellites = np.take_along_axis(np.where(known, count, 0)[rows], order, axis=1).cumsum(axis=1)
+    middle = (2 * satellites >= satellites[:, -1:]).argmax(axis=1)
     median = np.take_along_axis(common, order, axis=1)[np.arange(len(rows)), middle]
     wrong = known[rows] & (count[rows] == 1) & (np.abs(common - median[:, None]) > GROSS_M)
-    for g, group in enumerate(ranges.groups):
-        found[rows, group] = wrong[:, g, None] & (ranges.weight[rows, group] > 0)
+    for g, group in enumerate(groups):
+        found[rows, group] = wrong[:, g, None] & (weight[rows, group] > 0)
     return found

@@ -180,7 +180,7 @@ def tie_constellations(
     ties, after = tie_clocks(
         time, clocks, reference, agreeing, free, states, parts=parts, limits=limits.clock_offsets
     )  # fmt: skip
-    alone = gross_alone(ranges, point.clock_m, ties)
+    alone = gross_alone(ranges.weight, ranges.groups, point.clock_m, ties)
     if alone.any():
         ranges = without(ranges, alone)
     tied, tied_ranges = point, ranges

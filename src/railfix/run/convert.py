@@ -26,7 +26,7 @@ from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.mate import WRITTEN, mate_table
 from railfix.io.positions_export import COORDINATES
 from railfix.io.rinex import write_navigation, write_observations
-from railfix.io.rinex.write_navigation import with_written_messages
+from railfix.io.rinex.navigation_writer import with_written_messages
 from railfix.run.inputs import LogReading
 from railfix.run.output import OutputFolder, Overwrite, check_output_file
 from railfix.track import Track

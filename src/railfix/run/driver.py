@@ -137,16 +137,22 @@ def run_files(
         )  # fmt: skip
         record = run_record(made_from, tally, notes, figures, wall)
         record["likely_causes"] = list(dict.fromkeys(cause for cause in causes.values() if cause))
-        verdict = judge_run(record)
-        if not any(antenna.is_usable for antenna in verdict.antennas):
-            of_map = [note for note in notes if ": the map " in note]
-            raise NoPositionError(f"not one position is promised: {'; '.join([*verdict.lines(), *of_map])}")
+        verdict = _judge(record, notes)
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.stage(TRACK_FILE))
         files = folder.commit()
     warn_of(notes)
     return RunSummary(tally=tally, record=record, verdict=verdict, files=files, wall_s=wall)
+
+
+def _judge(record: Mapping[str, Any], notes: Iterable[str]) -> Verdict:
+    """Return the verdict of a run; NoPositionError where no position of it can be used."""
+    verdict = judge_run(record)
+    if not any(antenna.is_usable for antenna in verdict.antennas):
+        of_map = [note for note in notes if ": the map " in note]
+        raise NoPositionError(f"not one position is promised: {'; '.join([*verdict.lines(), *of_map])}")
+    return verdict
 
 
 def open_inputs(

@@ -334,8 +334,7 @@ class LogPositions:
         """Find the route of the log through a network; MismatchError where there is no route, or no position."""
         if self.time is None:
             raise MismatchError("there is no navigation record, so that no route through the network can be found")
-        own = self.positions
-        of_antenna = plan_log(self.path, own.time, own.ecef_m, own.sigma_m, antenna_up_m=self.antenna_up_m)
+        of_antenna = plan_log(self.positions, antenna_up_m=self.antenna_up_m)
         positions, _ = of_antenna.transform_to(network, **self.reading.motion)
         matched = match(network, positions)
         used = np.flatnonzero(np.isfinite(matched.probability))

@@ -18,7 +18,7 @@ from .scenario import (
     VehicleSettings,
 )
 from .scenario_file import Recipe, list_scenarios, load_recipe, load_scenario, scenario_table
-from .sensor_tables import sensor_tables
+from .sensor_columns import sensor_tables
 from .settings import ErrorSettings, SensorSettings
 from .signals import Piece, Simulation
 

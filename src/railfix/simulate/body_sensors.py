@@ -130,7 +130,7 @@ def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats
 
 
 def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Return pulses as the tachometer gives them, see `railfix.simulate.sensor_tables.COLUMNS`."""
+    """Return pulses as the tachometer gives them, see `railfix.simulate.sensor_columns.COLUMNS`."""
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _WHEEL])
     slips = wheel_slips(simulation, settings)
@@ -158,7 +158,7 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
 
 
 def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
-    """Return the truth of the wheel's slips and slides, see `railfix.simulate.sensor_tables.COLUMNS`."""
+    """Return the truth of the wheel's slips and slides, see `railfix.simulate.sensor_columns.COLUMNS`."""
     scenario = simulation.scenario
     slips = wheel_slips(simulation, settings)
     start = scenario.start + timedelta([slip.start_s for slip in slips])
@@ -217,7 +217,7 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
 
 
 def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.DataFrame:
-    """Return the samples of the inertial sensor, see `railfix.simulate.sensor_tables.COLUMNS`."""
+    """Return the samples of the inertial sensor, see `railfix.simulate.sensor_columns.COLUMNS`."""
     scenario = simulation.scenario
     time = np.arange(int(scenario.duration_s * settings.rate_hz + 1e-9) + 1) / settings.rate_hz
     offset = (settings.along_m, settings.across_m, settings.up_m)

@@ -21,7 +21,7 @@ from railfix.run.output import CSV_TIME, OutputFolder, Overwrite
 from railfix.simulate.sbas_stream import sbas_messages, write_sbas
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
 from railfix.simulate.scenario_file import scenario_table
-from railfix.simulate.sensor_tables import COLUMNS, sensor_tables
+from railfix.simulate.sensor_columns import COLUMNS, sensor_tables
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 

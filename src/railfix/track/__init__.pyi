@@ -1,6 +1,6 @@
 # The names of `railfix.track`, imported at their first use (lazy-loader).
 
-from .from_positions import Thinned, ThinningLimits, from_position_log, from_positions, thin
+from .map_from_positions import Thinned, ThinningLimits, from_position_log, from_positions, thin
 from .point_files import write_track_csv
 from .quality import Finding, MapLimits, TrackQuality, check_track
 from .read import read_track

@@ -18,9 +18,9 @@ from railfix.io.file_kind import find_kind
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
-from railfix.track.from_positions import SIGMA_OF_QUALITY
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference, to_map
 from railfix.track.heights import GEOIDS, ellipsoidal_heights, own_height_datum
+from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 from railfix.track.track import SIGMA_HEIGHT_M, Track
 from railfix.track.trajectory import NearestOnPolyline
 

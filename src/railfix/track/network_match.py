@@ -13,6 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks, RowArrays, ta
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.core.files import BrokenLines, FilePath
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.io.position_log import PositionLog
 from railfix.io.positions import read_positions
 from railfix.track.crs import kind_of_frame
 from railfix.track.frames import FrameShift, MapMotion, in_map_frame
@@ -134,34 +135,22 @@ def read_plan_positions(
     date: np.datetime64 | None = None,
 ) -> PlanLog:
     """Read positions in plan from any log of positions (`railfix.io.read_positions`), with its heights and sigmas."""
-    log = read_positions(path, broken_lines=broken_lines, date=date, columns=columns, heights="optional")
+    return plan_log(read_positions(path, broken_lines=broken_lines, date=date, columns=columns, heights="optional"))
+
+
+def plan_log(log: PositionLog, *, antenna_up_m: float | None = None) -> PlanLog:
+    """Return the positions of a log in plan, with its heights and standard deviations north, east and up."""
     latitude, longitude, height = log.geodetic
     return PlanLog(
-        path=str(path),
+        path=log.path,
         time=log.time,
         latitude_deg=latitude,
         longitude_deg=longitude,
         sigma_m=np.sqrt((log.sigma_m[:, :2] ** 2).mean(axis=1)),
         height_m=height if np.isfinite(height).any() else None,
         sigma_up_m=log.sigma_m[:, 2],
-        notes=log.notes,
-    )
-
-
-def plan_log(
-    path: str, time: Datetimes, ecef_m: Floats, sigma_m: Floats, *, antenna_up_m: float | None = None
-) -> PlanLog:
-    """Return positions in plan with heights, of 3-D ones and their standard deviations north, east and up."""
-    latitude, longitude, height = geodetic_from_ecef(ecef_m)
-    return PlanLog(
-        path=path,
-        time=time,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        sigma_m=np.sqrt((sigma_m[:, :2] ** 2).mean(axis=1)),
-        height_m=height,
-        sigma_up_m=sigma_m[:, 2],
         antenna_up_m=antenna_up_m,
+        notes=log.notes,
     )
 
 

@@ -19,7 +19,7 @@ from railfix.core.settings import Settings
 from railfix.core.settings_files import load_settings
 from railfix.core.staged_files import FilePath
 from railfix.track.curves import centre_curve, with_breaks
-from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.map_from_positions import ANTENNA_PATH
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory, joins_m
 

@@ -13,8 +13,8 @@ from .limits import (
     power_signs,
     suspicion,
 )
-from .motion_signs import MotionSigns, MotionSignState, motion_signs
-from .wheel_signs import WheelSigns, WheelState, wheel_signs
+from .motion import MotionSigns, MotionSignState, motion_signs
+from .wheel import WheelSigns, WheelState, wheel_signs
 
 __all__ = [
     "CAUSES",

@@ -1,8 +1,8 @@
 # The names of `railfix.integrity.raim`, imported at their first use (lazy-loader).
 
+from .detectable_bias import Reliability, noncentrality, reliability
 from .exclusion import Detection, Exclusion, Outcome, RaimLimits, detect, exclude, threshold, worst_channel
 from .position_model import LinearModel, linear_model
-from .reliability import Reliability, noncentrality, reliability
 
 __all__ = [
     "Detection",

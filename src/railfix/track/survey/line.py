@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.geodesy import axes_at
 from railfix.core.notebook import plural
-from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.map_from_positions import ANTENNA_PATH
 from railfix.track.survey import equations as eq
 from railfix.track.survey.equations import Equations, ReferenceLine, RunColumns
 from railfix.track.survey.passes import (

@@ -14,7 +14,7 @@ from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Masks,
 from railfix.core.settings import Settings, option
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
-from railfix.track.from_positions import SIGMA_OF_QUALITY
+from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 
 #: Standard deviation of the error that all positions of a run share, by their quality (RTKLIB), plan and height [m]:
 #: orbits, ionosphere and reference frame, which averaging over the run does not reduce.
