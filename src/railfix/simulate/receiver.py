@@ -59,7 +59,7 @@ class _FirstOrder:
 
 
 class CodeSmoothing:
-    """First-order filter of code errors since lock: ``y[k] = y[k-1] + (1 - exp(-dt / time)) (x[k] - y[k-1])``."""
+    """Low-pass of code errors since lock (0 s: none): ``y[k] = y[k-1] + (1 - exp(-dt / time)) (x[k] - y[k-1])``."""
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
         self._keep = float(np.exp(-interval_s / time_s)) if time_s > 0.0 else 0.0
