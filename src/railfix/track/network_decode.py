@@ -120,11 +120,11 @@ class Transitions:
         share[:m, -1] = np.where(self._opens[k], np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
         share[-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
-        # a train that comes to an open end beside it enters there or goes on, equally probable; one that has passed an
-        # open end has that factor and `UNMAPPED_PRIOR`, with which it begins, so that a run and its return agree
+        # a train that has passed an open end, or comes to one, is on a track that the map lacks; as it begins on one
+        # with `UNMAPPED_PRIOR`, leaving has that factor, too, and a run and its return are equally probable
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
-        share[:m, m:-1][self._opens[k]] = 0.5 * UNMAPPED_PRIOR * free
-        share[m:-1, :m] = np.where(self._opens[k + 1], 1.0, np.exp(-_ENTER_BESIDE_COST))
+        share[:m, m:-1][self._opens[k]] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
+        share[m:-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
