@@ -27,7 +27,7 @@ import polars as pl
 
 import paths  # noqa: F401
 from railfix import read_observations
-from railfix.cli import main as main_of_railfix
+from railfix.__main__ import main as main_of_railfix
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageError, TrainMessage, from_json
 from railfix.simulate.demonstration import demo_files
@@ -35,6 +35,8 @@ from ubx_made import log_of
 
 #: Time between two epochs of 0.1 s: slower than recorded, so that the recording outlasts the kills [s].
 EPOCH_S = 0.25
+#: Front end of the demonstration's train ahead of its middle [m].
+HALF_M = 11.6
 
 
 class Receiver(socketserver.ThreadingTCPServer):
@@ -77,28 +79,28 @@ def whole_lines(path: Path) -> list[str]:
     return text[: text.rfind("\n") + 1].splitlines()
 
 
-def true_front_m() -> dict[int, float]:
-    """True chainage of the train's front end by time tag: of its middle, and half of its length ahead."""
+def true_middle_m() -> dict[int, float]:
+    """True chainage of the train's middle by time tag."""
     truth = pl.read_csv(demo_files()["truth"]).with_columns(
         pl.col("time_gpst").str.to_datetime(time_unit="ns", strict=False)
     )
     middle = truth.group_by("time_gpst").agg(pl.col("chainage_m").mean()).sort("time_gpst")
     tags = (middle["time_gpst"].to_numpy() - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64)
-    return dict(zip(tags.tolist(), (middle["chainage_m"].to_numpy() + 11.6).tolist(), strict=True))
+    return dict(zip(tags.tolist(), middle["chainage_m"].to_list(), strict=True))
 
 
-def is_outside(message: TrainMessage, front_m: dict[int, float]) -> bool:
-    """Return whether the true front end is outside a message's bounds."""
+def is_outside(message: TrainMessage, middle_m: dict[int, float]) -> bool:
+    """Return whether the true front end, of the end that runs ahead, is outside a message's bounds."""
     place, over, under = message.chainage_cm, message.over_cm, message.under_cm
     if place is None or over is None or under is None:
         return False
-    error_cm = 100.0 * front_m[round(message.time_ns / 1e8) * 100_000_000] - place
-    return not -over <= message.facing * error_cm <= under
+    true_m = middle_m[round(message.time_ns / 1e8) * 100_000_000] + message.facing * HALF_M
+    return not -over <= message.facing * (100.0 * true_m - place) <= under
 
 
 def count_sessions(sessions: Iterable[tuple[Path, Path]]) -> tuple[Counter[str], Counter[str], list[int]]:
     """Return what was counted, what was lost, and the first message with a position of each session."""
-    front_m, newest, counted, first = true_front_m(), 0, Counter[str](), list[int]()
+    middle_m, newest, counted, first = true_middle_m(), 0, Counter[str](), list[int]()
     lost = Counter(dict.fromkeys(("numbers sent twice", "lines", "states", "bounds"), 0))
     for messages, errors in sessions:
         logged = " ".join(errors.read_text().split())
@@ -112,7 +114,7 @@ def count_sessions(sessions: Iterable[tuple[Path, Path]]) -> tuple[Counter[str],
                 lost["lines"] += 1
                 continue
             lost["numbers sent twice"] += message.sequence <= newest
-            lost["bounds"] += is_outside(message, front_m)
+            lost["bounds"] += is_outside(message, middle_m)
             newest = max(newest, message.sequence)
             counted["messages"] += 1
             placed = placed or number * (message.chainage_cm is not None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time as clock
 from datetime import datetime
 from typing import Final
 
@@ -91,6 +92,11 @@ def utc_to_gpst(utc: ArrayLike) -> Datetimes:
     at = np.asarray(utc, dtype="datetime64[ns]")
     leap = gpst_minus_utc(at).astype("timedelta64[s]")
     return np.asarray(at + leap, dtype="datetime64[ns]")
+
+
+def gps_now_ns() -> int:
+    """Return the computer's clock as GPS time since `GPS_EPOCH` [ns]."""
+    return int((utc_to_gpst(np.datetime64(clock.time_ns(), "ns")) - GPS_EPOCH).astype(np.int64))
 
 
 def gpst_to_utc(time: ArrayLike) -> Datetimes:

@@ -316,6 +316,10 @@ class ControlCentre:
         self.log("every train stopped by hand" if train is None else f"train {train}: stopped by hand", train=train)
         return None
 
+    def set_route(self, train: int) -> str | None:
+        """Set a train's route to the next station by hand; return the reason of a refusal."""
+        return self.supervision.set_route(train)
+
     def _monitor(self, now: float) -> None:
         if self.monitor is None:
             return

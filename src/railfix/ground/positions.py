@@ -6,13 +6,10 @@ import asyncio
 import os
 import stat
 import sys
-import time
 from collections.abc import AsyncIterator, Callable
 from typing import Final, Literal
 
-import numpy as np
-
-from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
+from railfix.core.timescale import gps_now_ns
 from railfix.io.train_message import MessageError, TrainMessage, from_json
 
 #: Longest line of a position message [bytes].
@@ -78,8 +75,3 @@ async def standard_input() -> AsyncIterator[str]:
             rest, cut = b"", True
     if rest and not cut:
         yield rest.decode(errors="replace")
-
-
-def gps_now_ns() -> int:
-    """Return the computer's clock as GPS time since 1980 [ns]."""
-    return int((utc_to_gpst(np.datetime64(time.time_ns(), "ns")) - GPS_EPOCH).astype(np.int64))

@@ -22,7 +22,7 @@ from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings
 from railfix.core.settings_files import load_settings
-from railfix.core.timescale import utc_to_gpst
+from railfix.core.timescale import GPS_EPOCH, gps_now_ns
 from railfix.ground.centre import CentreLimits, ReferenceCurve
 from railfix.ground.control import ControlCentre, list_orders
 from railfix.ground.field import SimulatedPoints
@@ -361,7 +361,8 @@ async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> No
         points = triangle.points_ecef_m()
         async for fixes in stream_fixes(triangle.sources, points, navigation=navigation):
             result = judge_fixes(fixes, triangle.limits)
-            age_s = float((utc_to_gpst(np.datetime64(time.time_ns(), "ns")) - fixes.time[0]) / np.timedelta64(1, "s"))
+            tag_ns = int((fixes.time[0] - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64))
+            age_s = (gps_now_ns() - tag_ns) / 1e9
             control.judge(TriangleVerdict(int(result.verdict[0])), int(result.receiver[0]), age_s=age_s)
         control.log("triangle: every stream has ended")
     except (RailfixError, ValueError) as error:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.errors import OutputError
-from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
+from railfix.core.timescale import GPS_EPOCH, gps_now_ns
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import gga_sentence
@@ -143,7 +143,7 @@ class _Session:
     read_to_ns: dict[str, int] = field(default_factory=dict)
     place: bytes = b""
     #: Time of sending, GPS time since 1980 [ns]: of the computer, or of files that are replayed at their own pace.
-    clock: Callable[[], int] = field(default_factory=lambda: _gps_now_ns)
+    clock: Callable[[], int] = field(default_factory=lambda: gps_now_ns)
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     reserved_from: int = 0
@@ -335,7 +335,7 @@ class _Pace:
     def now_ns(self) -> int:
         """Return the time of the recording, GPS time since 1980 [ns]; of the computer before the first tag."""
         if not self._first or not self._all_known.is_set():
-            return _gps_now_ns()
+            return gps_now_ns()
         elapsed_s = (asyncio.get_running_loop().time() - self._began) * self._speed
         return int((min(self._first) - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64)) + round(elapsed_s * 1e9)
 
@@ -385,9 +385,3 @@ def status_text(output: LiveOutput, metrics: Metrics) -> str:
     if dropped := sum(sink.dropped + sink.failed for sink in metrics.sinks):
         words.append(f"not delivered {dropped}")
     return "  ".join(words)
-
-
-def _gps_now_ns() -> int:
-    """Return the computer's clock as GPS time since 1980 [ns]."""
-    now = np.datetime64(time.time_ns(), "ns")
-    return int((utc_to_gpst(now) - GPS_EPOCH).astype(np.int64))

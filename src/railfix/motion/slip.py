@@ -192,7 +192,9 @@ class _Automaton:
         self.speed, self.distance, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
         self.pitch, self.bias = float("nan"), 0.0
         self._smooth, self._limit, self._square = 0.0, _MAP_LIMIT, 0.0
-        self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = self._stood = 0.0
+        self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = self._stood = (
+            self._learnt
+        ) = 0.0
         self._rest = float("nan")
         #: Time, speed and acceleration by inertia of past samples, to which a detection looks back.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
@@ -252,7 +254,7 @@ class _Automaton:
     def _follow(self, dt: float, sine: float, by_wheel: float, rate: float, *, rests: bool) -> None:
         """Reference pitch: from the line, with a gyro its fast part; without a line from the wheel, slowly.
 
-        A body at rest does not turn: the rate is the bias of the gyro.
+        The rate of a body at rest is the bias of the gyro: its mean over `bias_s` is taken.
         """
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel
@@ -260,10 +262,11 @@ class _Automaton:
             self.pitch = target
             return
         turning = rate == rate
-        if turning and rests:
-            self.bias += min(dt / _PITCH_S, 1.0) * (rate - self.bias)
-        elif turning:
+        if turning:
             self.pitch += (rate - self.bias) * dt
+            self._learnt += dt
+            if rests:
+                self.bias += dt / min(max(self._learnt, dt), limits.bias_s) * (rate - self.bias)
         elif known:
             self.pitch = sine
             return

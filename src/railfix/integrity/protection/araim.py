@@ -25,10 +25,10 @@ from pydantic import Field, model_validator
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, join_rows
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath
 from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings, validate
 from railfix.core.settings_files import read_toml
+from railfix.core.staged_files import FilePath
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
 #: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.
