@@ -26,7 +26,7 @@ from typing import Final, NamedTuple
 import paths
 
 SOURCE: Final = paths.ROOT / "src" / "railfix"
-#: Packages that are looked at, with a floor of killed mutants [%]; docs/maintain/mutants.md has the results.
+#: Floor of killed mutants of a package [%]; below it the exit code is 1.
 FLOORS: Final = {"live": 80, "motion": 80, "report": 80, "io/receiver": 80}
 _PAIRS: Final = (
     (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.BitAnd, ast.BitOr), (ast.And, ast.Or), (ast.Lt, ast.LtE),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +130,19 @@ def test_screens_and_unseen_lines_are_as_they_were(part: str, tmp_path: Path) ->
 
 
 @pytest.mark.requirement("D2")
+@pytest.mark.requirement("D2")
+@pytest.mark.parametrize("systems", ["G", "G+J"])
+def test_each_screen_left_out_leaves_more_large_errors_but_that_of_two_antennas(systems: str) -> None:
+    """P1 table 6 names the screens and their limits: what each of them takes, by the kept output of `screens`."""
+    found = re.findall(rf"(?m)^{re.escape(systems)} +(\S.*?) +(\d\d\.\d\d .*)$", "\n".join(shown("screens")))
+    over_10_m = {way: int(numbers.split()[9]) for way, numbers in found}
+    every = over_10_m.pop("p1")
+    assert over_10_m.pop("conventional") > 25 * every
+    assert over_10_m.pop("without antenna_pair") < every
+    assert list(over_10_m) == [f"without {name}" for name in ("cn0", "doppler", "raim", "antenna_spacing")]
+    assert min(over_10_m.values()) > every
+
+
 def test_intervals_over_lines_hold_the_mean_as_often_as_they_say() -> None:
     random = np.random.default_rng(3)
     weights = random.uniform(0.5, 2.0, 20)

@@ -24,6 +24,8 @@ from railfix.gnss.observations import ObservationHeader
 if TYPE_CHECKING:
     from scipy.interpolate import PchipInterpolator
 
+__all__ = ["KINDS", "Cn0Curve", "Cn0CurveSource", "Cn0Mean", "SourceFile", "satellite_kind"]
+
 
 #: Numbers of BeiDou satellites 36 000 km above (GEO C01-C05, C59-C63; IGSO: CSNO, constellation status).
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})

@@ -13,6 +13,8 @@ from railfix.core.settings_files import read_model_file, write_toml
 from railfix.core.staged_files import FilePath
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean
 
+__all__ = ["FORMAT", "read_cn0_curve", "write_cn0_curve"]
+
 FORMAT: Final = "railfix C/N0 curve 1"
 #: Columns of a curve, and the digits that they are written with.
 _DIGITS: Final = {"elevation_deg": 3, "mean_dbhz": 2, "spread_db": 2, "count": 0}

@@ -14,6 +14,8 @@ from railfix.core.arrays import Floats, Strings
 from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve, Cn0CurveSource, Cn0Mean, satellite_kind
 
+__all__ = ["Cn0Samples", "CurveFit", "fit_cn0_curve"]
+
 #: Standard deviation of a normal variable against its median absolute deviation.
 _NORMAL_MAD: Final = 1.482_602_218_505_602
 
