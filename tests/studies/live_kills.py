@@ -27,7 +27,7 @@ import polars as pl
 
 import paths  # noqa: F401
 from railfix import read_observations
-from railfix.cli import main as main_of_railfix
+from railfix.__main__ import main as main_of_railfix
 from railfix.core.timescale import GPS_EPOCH
 from railfix.io.train_message import MessageError, TrainMessage, from_json
 from railfix.simulate.demonstration import demo_files
