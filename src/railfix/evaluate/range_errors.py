@@ -98,9 +98,7 @@ class StationErrors:
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
 ) -> StationErrors:
-    """Common range errors from the log of a station at a known position, corrected by the train's `processor` and
-    smoothed by carrier phase; the station's own multipath remains.
-    """
+    """Common range errors from a station's log, corrected by `processor`, phase-smoothed; its multipath remains."""
     station, carrier, phases = BaseStation(processor.config, position_ecef_m), CarrierState(), False
     times: list[Datetimes] = []
     errors: list[dict[str, Floats]] = []

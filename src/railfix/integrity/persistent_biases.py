@@ -19,7 +19,7 @@ from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 
-#: Below this fraction of its own error in its residual a range does not show its error.
+#: Least fraction of a range's error that appears in its residual; below it the error is not visible.
 _LEAST_REDUNDANCY: Final = 0.1
 #: A mean that is smaller is forgotten.
 _FORGOTTEN: Final = 1e-12

@@ -184,9 +184,7 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state from which a restarted session continues; `reserved` numbers of messages are left out for a
-        crash.
-        """
+        """Return the state for a restarted session; `reserved` message numbers are skipped for a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch to continue from has been received
             return replace(self._saved, sequence=sequence)

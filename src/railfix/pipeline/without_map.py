@@ -134,9 +134,7 @@ def _solvable(ranges: Ranges) -> Masks:
 
 
 def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, Masks]:
-    """Return positions from raw ranges, NaN without, shape (T, 3); grossly wrong ranges, (T, M); epochs whose other
-    ranges contradict each other, (T,).
-    """
+    """Return positions from raw ranges, NaN without, (T, 3); gross errors, (T, M); contradictory epochs, (T,)."""
     start = _below(raw)
     point = point_position(raw, start, limits=config.single_point)
     place, gross, rms = point.ecef_m.copy(), np.zeros(raw.weight.shape, dtype=np.bool_), _rms_m(raw, point)

@@ -286,9 +286,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
 def judge_travel(
     fixes: Fixes, travelled: Callable[[Datetimes], tuple[Floats, Floats]], settings: ReferenceSettings
 ) -> Fixes:
-    """Reject rows by the distance between them against that travelled and its variance (P2 3.3): kept is the chain of
-    agreeing runs with most fixes, less joints that disagree.
-    """
+    """Reject rows by their spacing against the travelled distance (P2 3.3): the chain of agreeing runs is kept."""
     rows = fixes.good
     if len(rows) < 2:
         return fixes

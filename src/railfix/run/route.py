@@ -123,7 +123,7 @@ class RouteOfLog:
         return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
 
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
-        """Return whether the train is, with more than a risk, on another track than where it was placed on the route.
+        """Return whether another track than the route's has a probability above a risk.
 
         A track that the map lacks counts beyond `_UNMAPPED_LIMIT`: up to there it is in the levels (`with_unmapped`).
         Computed from the tracks of the route within `_REACH_M` of each chainage: a part of the route that lies beside

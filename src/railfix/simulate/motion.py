@@ -65,9 +65,7 @@ class Motion:
 
 
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
-    """Average a motion over the time T that keeps its jerk within a limit: the speed becomes ``(s(t) - s(t - T)) / T``,
-    stops stay, all is late by T / 2.
-    """
+    """Average a motion over a time T that limits its jerk: the speed is ``(s(t) - s(t - T)) / T``, late by T / 2."""
     start = motion.time_s
     duration = float(np.abs(np.diff(motion.acceleration_mps2, prepend=0.0)).max()) / jerk_mps3
     if duration == 0.0:

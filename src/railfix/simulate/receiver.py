@@ -59,9 +59,7 @@ class _FirstOrder:
 
 
 class CodeSmoothing:
-    """Filter of first order on code errors, restarted after loss of lock: ``y[k] = y[k-1] + (1 - exp(-interval / time))
-    (x[k] - y[k-1])``; a time of 0 means no filter.
-    """
+    """Low-pass of code errors since lock (0 s: none): ``y[k] = y[k-1] + (1 - exp(-dt / time)) (x[k] - y[k-1])``."""
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
         self._keep = float(np.exp(-interval_s / time_s)) if time_s > 0.0 else 0.0

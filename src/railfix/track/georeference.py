@@ -138,9 +138,7 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 
 
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
-    """Return the coordinates of positions in a CRS, such as that of a raster: `georeference` reversed. Modern frames
-    count as one here: they are within 2 m of each other.
-    """
+    """Return coordinates of positions in a CRS (inverse of `georeference`); modern frames, within 2 m, count as one."""
     if not find_crs(crs).is_bound and kind_of_frame(crs) != "older datum":
         conversion, unit, origin = _to_datum(crs)
         degrees = (place.longitude_deg - origin) / unit, place.latitude_deg / unit

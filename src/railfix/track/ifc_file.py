@@ -141,7 +141,8 @@ def read_ifc_segments(path: FilePath, reading: MapReading) -> list[Segment]:
         notes: tuple[str, ...] = ()
         if uneven:
             notes = (f"{uneven} segments of constant cant have two values and are taken as linear transitions",)
-        graded = sum(_is_graded(e) for e in elements.get("IFCALIGNMENTVERTICAL", []))
+        vertical = [entity.values for entity in elements.get("IFCALIGNMENTVERTICAL", [])]
+        graded = sum(v[-1] == ".CONSTANTGRADIENT." and v[5] != v[6] for v in vertical)
         if graded:
             notes += (f"{graded} segments of constant gradient have two values, of which the first is taken",)
         xy, system = _map_conversion(step, scale)
@@ -348,10 +349,6 @@ def _cant(step: _Step, entity: _Entity, scale: float) -> CantElement:
         right_m=(right * scale, (right if right_end is None else right_end) * scale),
         law=law,
     )
-
-
-def _is_graded(entity: _Entity) -> bool:
-    return bool(entity.values[-1] == ".CONSTANTGRADIENT." and entity.values[5] != entity.values[6])
 
 
 def _is_uneven(entity: _Entity) -> bool:

@@ -134,9 +134,7 @@ class Transitions:
         return np.asarray(share / share.sum(axis=1, keepdims=True))
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Path length between two positions over ends of tracks [m], infinite beyond the limit: about the distance of
-        the positions where a train passes the joint between them.
-        """
+        """Path length between two positions over ends of tracks [m], infinite beyond the limit."""
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
         for end, rest in enumerate((float(self._place[k, i]), float(self._rest[k, i]))):

@@ -122,9 +122,7 @@ def _put_on(
 def _fill_legs(
     network: Network, first: int, from_m: float, last: int, to_m: float
 ) -> tuple[Indices, Floats, Floats] | None:
-    """Return the tracks of the shortest route between two positions, and the chainages where each is
-    entered and left.
-    """
+    """Return tracks of the shortest route between two positions, and chainages where each is entered and left."""
     if first == last:
         return np.array([first]), np.array([from_m]), np.array([to_m])
     length = network.length_m

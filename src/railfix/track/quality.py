@@ -225,9 +225,7 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 
 
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
-    """Yield curves whose cant is negative: errors where that is so of all curves, or of all to one side; otherwise
-    warnings, for turnouts in curves have such.
-    """
+    """Yield curves of negative cant: errors where all, or all to one side, have it; else warnings (turnouts)."""
     of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
     of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))
     side = np.where(np.isnan(track.radius_m), of_points, of_map)

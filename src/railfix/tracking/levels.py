@@ -134,7 +134,7 @@ class LevelState:
     """State of the filter with sub-filters after a chunk."""
 
     track: TrackState | None = None
-    every: bool = True  #: It has taken every epoch so far: it is the filter itself.
+    every: bool = True  #: It has used every epoch so far, so that it equals the filter itself.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Its last epoch.
     #: Its place, speed, levels with parts, amount and status at that epoch; shape (10,).

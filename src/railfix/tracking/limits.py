@@ -84,7 +84,7 @@ class TrackingLimits(Settings):
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
     #: Probability that a fault is common to a constellation: 1e-4, that of the ARAIM milestone 3 report for Galileo.
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
-    #: Probability that a sensor on board is faulty at such a sample. An assumption.
+    #: Probability that a sample of a sensor on board is faulty. An assumption.
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
     #: Probability that a balise is not where the list has it. An assumption; two wrong ones together are not bounded,
     #: so that it must be small.

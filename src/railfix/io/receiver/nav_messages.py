@@ -415,7 +415,7 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
     heads = dict.fromkeys(range(1, 11), BDS_HEAD)
     for row, k, head in _of_kinds(bits, valid & geo & (subframe == 1), read_unsigned(bits, 42, 4), heads, 100):
         packed = int("".join(map(str, bits[row].tolist())), 2)
-        yield row, k, {**head, "page": packed}  # the page whole: its fields go over page ends
+        yield row, k, {**head, "page": packed}  # the whole page, because its fields cross the ends of pages
 
 
 def _glonass(part: Subframes, counts: Counter[str]) -> Pages:

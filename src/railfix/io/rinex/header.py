@@ -323,14 +323,10 @@ _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
 }
 
 
-def _words_of_three(words: Sequence[str]) -> Floats:
-    return _three("".join(f"{word:>14}" for word in words[:3]))
-
-
 #: Readers of such records by their words.
 _BY_WORDS: Final[Mapping[str, Callable[[Sequence[str]], Any]]] = {
     "APPROX POSITION XYZ": lambda words: _place("".join(f"{word:>14}" for word in words[:3])),
-    "ANTENNA: DELTA H/E/N": _words_of_three,
+    "ANTENNA: DELTA H/E/N": lambda words: _three("".join(f"{word:>14}" for word in words[:3])),
     "INTERVAL": lambda words: _interval(words[0]),
     "LEAP SECONDS": lambda words: int(words[0]),
 }

@@ -257,7 +257,7 @@ class _Walk:
             if reached == position:
                 break
             position = reached
-        return self._table(), position
+        return _with_events(self._head[self._kept], self._events), position
 
     def _run_of_epochs(self, k: int, stop: int, *, at_end: bool) -> int:
         """Keep the epochs from the k-th to the first without a successor, and return the line to continue at."""
@@ -320,9 +320,6 @@ class _Walk:
         comments = sum(_label(self._lines, line) == "COMMENT" for line in range(position, end))
         self._log.count(COMMENTS, comments)
         return end
-
-    def _table(self) -> EpochHeads:
-        return _with_events(self._head[self._kept], self._events)
 
 
 def _no_epoch(lines: Lines, line: int, version: float) -> str:

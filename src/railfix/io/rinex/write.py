@@ -41,9 +41,7 @@ def detect_packing(path: FilePath) -> Packing:
 
 @contextmanager
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
-    """Open a stream with the requested compression, or by the file name; the file appears when the block ends without
-    error.
-    """
+    """Open a stream, compressed as requested or by the file name; the file appears at the end without error."""
     kind = detect_packing(path) if packing is None else packing
     if kind not in get_args(Packing):
         raise ValueError(f"packing {kind!r} is unknown; expected one of {', '.join(get_args(Packing))}")

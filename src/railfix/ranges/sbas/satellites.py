@@ -329,9 +329,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return whether positions lie in a region: the rectangle of two corners, or its half at (latitude 1,
-    longitude 2).
-    """
+    """Return whether positions are in a region: a rectangle by corners, or its half at (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

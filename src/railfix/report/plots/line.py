@@ -285,7 +285,7 @@ def interval_over_chainage(table: pl.DataFrame) -> Chart:
 
 
 def interval_distribution(table: pl.DataFrame) -> Chart:
-    """Return the distribution of distances from the previous position (P1 figure 12), of the table of `interval`."""
+    """Return the distribution of distances from the previous position (P1 figure 12); see `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)

@@ -122,9 +122,7 @@ CLEAR_V: Final = -0.78  #: Below this the loss of an edge is 0 by the formula of
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
-    """Fresnel parameter of a clearance of 1 m [1/m] at an edge at this distance, the source at infinity (P.526-15,
-    4.1).
-    """
+    """Fresnel parameter per clearance [1/m] of an edge at this distance, source at infinity (P.526-15, 4.1)."""
     return np.sqrt(2.0 / (wavelength_m * np.maximum(distance_m, 0.1)))
 
 

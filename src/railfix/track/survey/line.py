@@ -313,7 +313,9 @@ def _without_loose_ends(plan_m: Floats) -> slice:
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
     while last - first > _END_POINTS:
         end, start = plan_m[last - _END_POINTS : last], plan_m[first : first + _END_POINTS][::-1]
-        loose = [float((p[-1] - p[-2]) @ (p[-3] - p[0])) < 0.5 * spacing * _length(p[-3] - p[0]) for p in (end, start)]
+        loose = [
+            float((p[-1] - p[-2]) @ (p[-3] - p[0])) < 0.5 * spacing * np.linalg.norm(p[-3] - p[0]) for p in (end, start)
+        ]
         last, first = last - int(loose[0]), first + int(loose[1])
         if not any(loose):
             break
@@ -332,10 +334,6 @@ def _points_ahead(plan_m: Floats) -> Indices:
         if float((plan_m[k] - plan_m[kept[-1]]) @ way[k]) >= least:
             kept.append(k)
     return np.array(kept, dtype=np.intp)
-
-
-def _length(step_m: Floats) -> float:
-    return float(np.linalg.norm(step_m))
 
 
 def _points_of_line(course: Course, ties: Ties) -> tuple[Indices, Integers]:
