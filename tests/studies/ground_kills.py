@@ -106,7 +106,8 @@ class TrainProgram:
                 said = json.loads(line)
                 age_s = said.pop("age_s", None)
                 if age_s is not None and reader is self._reader:
-                    authority = Authority.model_validate(said | {"session": 0})  # its program draws a number
+                    own = {name: said[name] for name in Authority.model_fields}
+                    authority = Authority.model_validate(own | {"session": 0})  # its program draws a number
                     assert self.train.on_board.receive(authority)
                     self.train.on_board.answered_s = time.monotonic() - age_s
                     received(self.train.number, authority)
@@ -186,7 +187,9 @@ class KilledCentre:
                 program.train.step(time.monotonic())
                 program.report()
                 self.counted["reports"] += 1
-                await asyncio.sleep(1.0)
+                await asyncio.wait([listening], timeout=1.0)
+                if listening.done():
+                    listening.result()
         finally:
             listening.cancel()
             await program.kill()
