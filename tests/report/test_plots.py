@@ -127,7 +127,7 @@ def test_a_few_huge_errors_do_not_press_the_rest_flat() -> None:
     error = np.concatenate([np.linspace(-2.0, 2.0, 999), [66.0]])
     table = pl.DataFrame({"time_gpst": times(np.arange(1000)), "chainage_m": np.arange(1000.0), "error_m": error})
     chart = plots.error_over_time(table)
-    assert chart.y_scale == "symlog"
+    assert chart.y_scale == plots.draw_chart(chart).get_yscale() == "symlog"
     assert chart.y_linear == 2.0
     assert layer(chart, Points, "on the map").y.max() == 66.0
     assert plots.error_over_time(table.head(999)).y_scale == "linear"
@@ -239,7 +239,9 @@ def test_plan_in_metres(positions: pl.DataFrame) -> None:
     np.testing.assert_allclose(layer(chart, Points, "uncertain (1)").y, 0.0, atol=0.01)
     np.testing.assert_allclose(layer(chart, Points, "conventional").x, 5.0, atol=0.01)
     np.testing.assert_allclose(layer(chart, Curve).y, [-20.0, -10.0, 0.0, 10.0, 20.0], atol=0.01)
-    assert set(layer(chart, Marks).words) <= {f"{k:,} m" for k in range(1000, 1041)}
+    marks = layer(plots.plan(positions.with_columns(pl.col("kilometrage_m") + 0.5)), Marks)
+    assert marks.words == ("1,010 m", "1,020 m", "1,030 m", "1,040 m"), "every 5 m, where a position is within 1 m"
+    np.testing.assert_allclose(marks.y, [-10.0, 0.0, 10.0, 20.0], atol=0.01)
     sized = plots.plan(positions, error_m=np.array([0.1, -1.5, 3.0, np.nan, -80.0]))
     counts = {one.label for one in sized.layers if isinstance(one, Points)}
     assert counts == {
@@ -263,6 +265,7 @@ def test_intervals_of_the_reference_and_of_the_positions(errors: pl.DataFrame, p
     filled = bars.height > 0
     assert bars.left[filled].tolist() == [10.25, 20.25]
     assert bars.height[filled].tolist() == [2.0, 1.0]
+    assert bars.left[-1] <= 20.75, "the last class ends at most one class after the longest"
 
 
 def test_time_an_epoch() -> None:

@@ -160,6 +160,8 @@ class Tests:
             )
         except subprocess.TimeoutExpired:
             return False
+        if done.returncode > 2:  # no test ran: neither passed nor failed
+            sys.exit(f"pytest ended with {done.returncode}: {(done.stdout + done.stderr).decode()[-500:]}")
         return done.returncode == 0
 
 
