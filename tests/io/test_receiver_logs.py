@@ -427,20 +427,6 @@ def test_day_of_glonass_messages(day: int) -> None:
 
 
 @pytest.mark.requirement("A8")
-def test_a_rate_of_rtcm_without_a_rough_or_a_fine_part_is_none() -> None:
-    """MSM7 of three satellites by hand (RTCM 10403.3, 3.5.16): rough part absent, fine part absent, 100.5 m/s."""
-    fields = [(1077, 12), (0, 12), (204_236_600, 30), (0, 19), (7 << 61, 64), (1 << 30, 32), (7, 3)]
-    fields += [(70, 8)] * 3 + [(0, 4)] * 3 + [(512, 10)] * 3 + [(1 << 13, 14), (100, 14), (100, 14)]
-    fields += [(0, 20)] * 3 + [(0, 24)] * 3 + [(5, 10)] * 3 + [(0, 1)] * 3 + [(640, 10)] * 3
-    fields += [(0, 15), (1 << 14, 15), (5000, 15)]
-    piece, _ = decode(rtcm_message(fields), StreamState(time=np.datetime64("2019-01-20", "ns")), at_end=True)
-    observations, _ = join_observations(piece.measurements)
-    assert observations.satellite.tolist() == ["G01", "G02", "G03"]
-    np.testing.assert_allclose(observations.code_m[0], 70.5e-3 * SPEED_OF_LIGHT)
-    np.testing.assert_allclose(observations.doppler_hz[0], [np.nan, np.nan, -100.5 * 1575.42e6 / SPEED_OF_LIGHT])
-
-
-@pytest.mark.requirement("A8")
 def test_channel_of_glonass_phases_by_hand() -> None:
     """MSM4 has phases in metres: no cycles before message 1020 gave the channel, and its latest one after it."""
     tow_ms = 204_236_600

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from railfix.core.timescale import from_week
 from railfix.io.receiver import nav_messages
-from railfix.io.receiver.framing import fields, read_signed, read_unsigned, sign_magnitude
+from railfix.io.receiver.ephemerides import assemble_navigation
+from railfix.io.receiver.framing import Subframes, fields, read_signed, read_unsigned, sign_magnitude
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.measurements import frame_time
 from test_receiver_logs import ubx_frame
@@ -104,13 +106,6 @@ def test_gps_lnav(seed: int) -> None:
     assert values["group_delay_1_s"][0] == pytest.approx(ephemeris.tgd[0] if bits[160:168].any() else 0.0, rel=1e-14)
 
 
-def test_leap_seconds_of_gps() -> None:
-    """IS-GPS-200, figure 20-1, sheet 8: bits 241 to 248 of 300, first of word 9; A1 and A0 stand before."""
-    bits = np.ones((1, 240), dtype=np.uint8)
-    put(bits[0], 8 * 24, 8, 18)
-    assert nav_messages.fields(bits, nav_messages.LNAV[4])["leap_seconds"].tolist() == [18.0]
-
-
 @pytest.mark.parametrize("seed", range(20))
 def test_galileo_inav(seed: int) -> None:
     rtk = rtklib()
@@ -135,53 +130,113 @@ def test_galileo_inav(seed: int) -> None:
     assert values["group_delay_2_s"][0] == pytest.approx(ephemeris.tgd[1], rel=1e-14)
 
 
-@pytest.mark.parametrize("seed", range(20))
+def put_field(bits: np.ndarray, field: Any, value: int) -> None:
+    """A value in its place, or in its places."""
+    place, length, _, _ = field
+    left = length
+    for first, count in place if isinstance(place, tuple) else ((place, length),):
+        left -= count
+        put(bits, first, count, value >> left & (1 << count) - 1)
+
+
+def beidou_stream(pages: np.ndarray, number: int) -> bytes:
+    """RXM-SFRBX of pages of 300 bits, which have ten words of 30 bits."""
+    words = [read_unsigned(page.reshape(10, 30), 0, 30).astype("<u4").tobytes() for page in pages]
+    return b"".join(ubx_frame(0x0213, bytes([3, number, 0, 0, 10, 0, 2, 0]) + part) for part in words)
+
+
+def beidou_record(pages: np.ndarray, number: int) -> tuple[Any, Any]:
+    """Records and ionosphere of a stream of pages."""
+    piece, _ = decode(beidou_stream(pages, number), StreamState(), at_end=True)
+    found = assemble_navigation(piece.ephemerides)
+    return found.kepler, found.klobuchar.get("C")
+
+
+def compare_beidou(record: Any, ephemeris: Any, rtk: Any, seed: int) -> None:
+    """All fields of the record against RTKLIB's, and the week, which both have in GPS time."""
+    compare({name: getattr(record, name) for name in EPHEMERIS}, ephemeris)
+    for name, theirs in {"iode": "iode", "iodc": "iodc", "health": "svh"}.items():
+        assert getattr(record, name).tolist() == [getattr(ephemeris, theirs)], name
+    for k, delay in enumerate((record.group_delay_1_s, record.group_delay_2_s)):
+        assert delay[0] == pytest.approx(ephemeris.tgd[k], rel=1e-12)
+    assert record.accuracy_m[0] == nav_messages.URA_NOMINAL_M[seed % 16]
+    for name, theirs in {"toe": "toe", "toc": "toc", "transmitted": "ttr"}.items():
+        since = rtk.timediff(getattr(ephemeris, theirs), rtk.gpst2time(2367, 0.0))
+        assert (getattr(record, name)[0] - from_week(2367, 0.0)) / np.timedelta64(1, "s") == since, name
+
+
+#: Numbers that no orbit exceeds, as they are sent; others are random.
+BEIDOU: dict[str, int] = {
+    "eccentricity": 1 << 26, "sqrt_a": int(5282.6 * 2**19), "week": 2367 - 1356, "omega_dot": -23_456, "toc_s": 20_000,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(16))
 def test_beidou_d1(seed: int) -> None:
     rtk = rtklib()
-    bits = random_bits(seed, 3 * 304).reshape(3, 304)[:, :300]
+    bits = random_bits(seed, 3 * 300).reshape(3, 300)
+    toe = BEIDOU["toc_s"]
+    sent = {**BEIDOU, "toe_high": toe >> 15, "toe_low": toe & 0x7FFF, "accuracy": seed}
     for k in range(3):
-        put(bits[k], 15, 3, k + 1)
-        sow = 1000 + 6 * k
-        put(bits[k], 18, 8, sow >> 12)
-        put(bits[k], 30, 12, sow & 0xFFF)
-    values: dict[str, np.ndarray] = {}
-    for k in range(3):
-        values |= fields(bits[k][None], nav_messages.D1[k + 1])
-    toe = (int(values["toe_high"][0]) << 15 | int(values["toe_low"][0])) * 8
-    for first, length, shift in ((73, 9, 8), (90, 8, 0)):  # RTKLIB asks that toc and toe are equal
-        put(bits[0], first, length, toe // 8 >> shift & (1 << length) - 1)
+        put(bits[k], 0, 11, 0x712)
+        layout = nav_messages.D1[k + 1]
+        for name, value in {**sent, "subframe": k + 1, "tow_s": 160_000 + 6 * k}.items():
+            if name in layout:
+                put_field(bits[k], layout[name], value)
     padded = np.zeros((3, 304), np.uint8)
     padded[:, :300] = bits
-    ephemeris = rtk.eph_t()
-    buffer = np.packbits(padded, axis=1)
+    ephemeris, ion = rtk.eph_t(), rtk.Arr1Ddouble(8)
     whole = np.zeros(38 * 5, np.uint8)
-    whole[: 38 * 3] = buffer.reshape(-1)
-    rtk.decode_bds_d1(octets(rtk, whole), ephemeris, rtk.Arr1Ddouble(8), rtk.Arr1Ddouble(8))
-    values["toe_sow_s"] = np.array([toe])
-    compare(values, ephemeris)
-    assert values["group_delay_2_s"][0] == pytest.approx(ephemeris.tgd[1], rel=1e-12)
+    whole[: 38 * 3] = np.packbits(padded, axis=1).reshape(-1)
+    rtk.decode_bds_d1(octets(rtk, whole), ephemeris, ion, rtk.Arr1Ddouble(8))
+    record, ionosphere = beidou_record(bits, 10)
+    compare_beidou(record, ephemeris, rtk, seed)
+    assert ionosphere.tolist() == [ion[k] for k in range(8)]
+    for k in range(3):  # one subframe is lost, or of the frame before
+        other = bits.copy()
+        put_field(other[k], nav_messages.BDS_HEAD["tow_s"], 160_000 + 6 * k - 30)
+        assert not len(beidou_record(other, 10)[0])
+        assert not len(beidou_record(np.delete(bits, k, axis=0), 10)[0])
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(16))
 def test_beidou_d2(seed: int) -> None:
     rtk = rtklib()
-    bits = random_bits(seed, 10 * 300).reshape(10, 300)
+    bits = random_bits(seed, 3000)
+    for name, value in {**BEIDOU, "toe_sow_s": BEIDOU["toc_s"], "accuracy": seed}.items():
+        put_field(bits, nav_messages.D2[name], value)
+    bits = bits.reshape(10, 300)
     for k in range(10):
-        put(bits[k], 15, 3, 1)
+        put(bits[k], 0, 11, 0x712)
         put(bits[k], 42, 4, k + 1)
-        sow = 1000 + 3 * k
-        put(bits[k], 18, 8, sow >> 12)
-        put(bits[k], 30, 12, sow & 0xFFF)
-    put(bits[4], 124, 1, 0)  # RTKLIB reads the first piece of the eccentricity as signed; no orbit has 0.5
-    values = fields(bits.reshape(1, -1), nav_messages.D2)
-    toe = int(values["toe_sow_s"][0])
-    for first, length, shift in ((77, 5, 12), (90, 12, 0)):
-        put(bits[0], first, length, toe // 8 >> shift & (1 << length) - 1)
+        for name, value in {"subframe": 1, "tow_s": 160_000 + 3 * k}.items():
+            put_field(bits[k], nav_messages.BDS_HEAD[name], value)
     padded = np.zeros((10, 304), np.uint8)
     padded[:, :300] = bits
     ephemeris = rtk.eph_t()
     rtk.decode_bds_d2(octets(rtk, np.packbits(padded, axis=1).reshape(-1)), ephemeris, rtk.Arr1Ddouble(8))
-    compare(fields(bits.reshape(1, -1), nav_messages.D2), ephemeris)
+    compare_beidou(beidou_record(bits, 3)[0], ephemeris, rtk, seed)
+    for k in range(10):
+        other = bits.copy()
+        put_field(other[k], nav_messages.BDS_HEAD["tow_s"], 160_000 + 3 * k - 30)
+        assert not len(beidou_record(other, 3)[0])
+        assert not len(beidou_record(np.delete(bits, k, axis=0), 3)[0])
+
+
+def test_beidou_geostationary_satellites_send_d2() -> None:
+    """ICD B1I: C01 to C05 and C59 to C63 are geostationary; the others send D1."""
+    names = ["C01", "C05", "C06", "C58", "C59", "C63"]
+    words = np.zeros((len(names), 10), dtype=np.uint32)
+    words[:, 0] = 0x712 << 19 | 1 << 12  # preamble, subframe 1
+    words[:, 1] = 3 << 14  # the third page of ten, as D2 numbers them
+    part = Subframes(
+        satellite=np.array(names), signal=np.zeros(len(names), dtype=np.int64), words=words,
+        glonass_channel=np.zeros(len(names), dtype=np.int64), order=np.arange(len(names)),
+    )  # fmt: skip
+    pages, _ = nav_messages.decode_pages(part)
+    numbers = {name: number for _, name, number, _ in pages}
+    assert {name for name, number in numbers.items() if number >= 100} == {"C01", "C05", "C59", "C63"}
+    assert {name for name, number in numbers.items() if number == 1} == {"C06", "C58"}
 
 
 @pytest.mark.parametrize("seed", range(20))

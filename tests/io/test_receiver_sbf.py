@@ -109,25 +109,6 @@ def test_values_come_back(logged: Observations, tmp_path: Path) -> None:
         assert np.nanmax(np.abs(a - b)) < tolerance, name
 
 
-def test_values_that_mean_none_are_none(tmp_path: Path) -> None:
-    """MeasEpoch by hand: G01 has all, G02 no code and so no phase, G03 no Doppler, G04 no C/N0."""
-    content, code, rate = b"", 22_345_678_901, -12_345_678
-    rows = ((1, code, rate, 148), (2, 0, rate, 148), (3, code, -(1 << 31), 148), (4, code, rate, 255))
-    for satellite, milli, doppler, level in rows:
-        head = (1, 0, satellite, milli >> 32, milli & 0xFFFFFFFF, doppler, 250, 0, level)
-        content += struct.pack("<BBBBIiHbBHBB", *head, 9, 0, 0)
-    path = tmp_path / "log.sbf"
-    path.write_bytes(block(4027, struct.pack("<IHBBBBBB", 1000, 2367, len(rows), 20, 12, 0, 0, 0) + content))
-    read = railfix.read_observations(path)
-    assert read.satellite.tolist() == ["G01", "G02", "G03", "G04"]
-    code_m, doppler_hz, none = code * 1e-3, rate * 1e-4, np.nan
-    phase = code_m * CARRIER["G1C"] / LIGHT + 0.25
-    np.testing.assert_allclose(read.code_m[0], [code_m, none, code_m, code_m], rtol=1e-12)
-    np.testing.assert_allclose(read.phase_cycles[0], [phase, none, phase, phase], rtol=1e-12)
-    np.testing.assert_allclose(read.doppler_hz[0], [doppler_hz, doppler_hz, none, doppler_hz], rtol=1e-12)
-    np.testing.assert_allclose(read.cn0_dbhz[0], [47.0, 47.0, 47.0, none], rtol=1e-12)
-
-
 def test_rtklib_reads_the_same(logged: Observations, tmp_path: Path) -> None:
     """Values that both have; RTKLIB 2.4.3 keeps phases marked "do not use", and scales the C/N0 of B1I wrongly."""
     program = shutil.which("convbin")

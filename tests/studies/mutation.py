@@ -1,9 +1,10 @@
 """Score of the tests of a package: bugs put into its source, one at a time, and how many make a test fail.
 
-Run ``python tests/studies/mutation.py live --sample 40 --seed 1``. The tests of the room (``--tests`` for others) run
-once under `coverage`, which notes the tests that pass each line. Every mutant changes one operator, comparison, number,
-condition or statement in a temporary copy of the source; the tests that pass its lines run against it, of fixtures
-those of the whole file. A mutant is killed where a test fails or exceeds its time. The score is the killed share of the
+Run ``python tests/studies/mutation.py live --sample 40 --seed 1``. The tests of the room, of a package in it the files
+that name it (``--tests`` for others) run once under `coverage`, which notes the tests that pass each line. Every mutant
+changes one operator, comparison, number, condition or statement in a temporary copy of the source; the tests that pass
+its lines run against it, of fixtures those of the whole file, of lines that run at import all. A mutant is killed where
+a test fails, or where they take three times as long as all did under `coverage`. The score is the killed share of the
 mutants on lines that a test passes and of those that none does; survivors are printed with their place.
 """
 
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import json
 import os
 import random
 import shutil
@@ -100,7 +102,7 @@ def mutated(text: str, mutant: Mutant) -> str:
 
 #: Plugin of pytest that notes the running test, and whether it is in its fixtures, as the context of `coverage`.
 _PLUGIN: Final = """
-import os, coverage, pytest
+import json, os, pathlib, coverage, pytest
 measured = coverage.Coverage(data_file=os.environ["MEASURED"], source_pkgs=["railfix"], config_file=False)
 measured.set_option("run:disable_warnings", ["module-not-measured", "already-imported"])
 measured.start()
@@ -108,7 +110,14 @@ measured.start()
 def pytest_runtest_setup(item): measured.switch_context(item.nodeid + "|setup")
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_call(item): measured.switch_context(item.nodeid + "|run")
-def pytest_sessionfinish(): measured.stop(); measured.save()
+times = {}
+def pytest_runtest_logreport(report):
+    for name in (report.nodeid.partition("[")[0], report.nodeid.partition("::")[0]):
+        times[name] = times.get(name, 0.0) + report.duration
+def pytest_sessionfinish():
+    measured.stop()
+    measured.save()
+    pathlib.Path(os.environ["MEASURED"] + ".json").write_text(json.dumps(times))
 """
 
 
@@ -119,20 +128,24 @@ class Tests:
         from coverage import CoverageData
 
         (folder / "measuring.py").write_text(_PLUGIN)
-        self.source, self._data = source, CoverageData(str(folder / "measured"))
+        self.source, self._folders, self._data = source, folders, CoverageData(str(folder / "measured"))
+        began = time.monotonic()
         if not self.pass_within(3600.0, [*folders, "-p", "measuring"], {"MEASURED": str(folder / "measured")}):
-            sys.exit(f"the tests of {' '.join(folders)} must pass before mutants are tried")
+            sys.exit(f"the tests of {' '.join(folders)} must pass before mutants are tried, also under coverage")
+        self.limit_s = max(120.0, 3.0 * (time.monotonic() - began))
         self._data.read()
+        self._times = json.loads((folder / "measured.json").read_text())
 
     def at(self, module: str, line: int) -> list[str]:
-        """Return the tests that pass a line, as arguments of pytest: functions, or whole files by a fixture."""
-        found = set()
-        for context in self._data.contexts_by_lineno(str(self.source / "railfix" / module)).get(line, ()):
+        """Return the tests that pass a line, quickest first: functions, or whole files by a fixture or import."""
+        found, contexts = set(), self._data.contexts_by_lineno(str(self.source / "railfix" / module)).get(line, ())
+        if list(contexts) == [""]:
+            return list(self._folders)
+        for context in contexts:
             test, _, when = context.rpartition("|")
             found.add(test.partition("[")[0] if when == "run" else test.partition("::")[0])
         some = [test for test in found if test and not ("::" in test and test.partition("::")[0] in found)]
-        own = Path(module).stem
-        return sorted(some, key=lambda test: (own not in test.partition("::")[0], "::" not in test, test))
+        return sorted(some, key=lambda test: self._times.get(test, 0.0))
 
     def pass_within(self, limit_s: float, words: Sequence[str], environment: dict[str, str] | None = None) -> bool:
         """Return whether tests pass against the copy of the source within a time."""
@@ -148,6 +161,15 @@ class Tests:
         except subprocess.TimeoutExpired:
             return False
         return done.returncode == 0
+
+
+def tests_of(package: str) -> list[str]:
+    """Return the tests of a room, or of a package in it the files that name it, as arguments of pytest."""
+    room, _, inner = package.partition("/")
+    name = f"railfix.{package.replace('/', '.')}"
+    files = sorted((paths.ROOT / "tests" / room).rglob("test_*.py")) if inner else []
+    naming = [f.relative_to(paths.ROOT).as_posix() for f in files if name in f.read_text(encoding="utf-8")]
+    return naming or [f"tests/{room}"]
 
 
 def main() -> None:
@@ -167,15 +189,14 @@ def main() -> None:
         folder = Path(name)
         shutil.copytree(SOURCE, folder / "src" / "railfix")  # with the compiled kernels
         (folder / "data").symlink_to(paths.ROOT / "data")
-        rooms = options.tests or [f"tests/{options.package.partition('/')[0]}"]
-        tests = Tests(folder / "src", rooms, folder)
+        tests = Tests(folder / "src", options.tests or tests_of(options.package), folder)
         for mutant in drawn:
             if time.monotonic() - started > 60.0 * options.minutes:
                 break
             module, at = folder / "src" / "railfix" / mutant.module, tests.at(mutant.module, mutant.line)
             text = module.read_text(encoding="utf-8")
             module.write_text(mutated(text, mutant), encoding="utf-8")
-            survived = not at or tests.pass_within(120.0, at)
+            survived = not at or tests.pass_within(tests.limit_s, at)
             module.write_text(text, encoding="utf-8")
             done, killed = done + 1, killed + (not survived)
             if survived:

@@ -295,13 +295,7 @@ def has_crc(bits: Bytes, checked: int) -> Masks:
 
 def sisa_m(index: Floats) -> Floats:
     """Return signal-in-space accuracy of Galileo [m] by index; NaN where no prediction is available (ICD, table 89)."""
-    i = np.asarray(index)
-    value = np.select(
-        [i < 50, i < 75, i < 100, i < 126],
-        [0.01 * i, 0.5 + 0.02 * (i - 50), 1.0 + 0.04 * (i - 75), 2.0 + 0.16 * (i - 100)],
-        default=np.nan,
-    )
-    return np.asarray(value)
+    return np.asarray(np.interp(index, (0, 50, 75, 100, 125), (0.0, 0.5, 1.0, 2.0, 6.0), right=np.nan))
 
 
 def glonass_hamming(bits: Bytes) -> Masks:
