@@ -55,7 +55,7 @@ STAGES: Final = (
     ("filter: measurements", "railfix.pipeline.along_track", "gnss_epochs"),
     ("filter: preparation", "railfix.tracking.filter", "prepare_chunk"),
     ("filter: preparation", "railfix.tracking.filter", "Recursion.__init__"),
-    ("filter: recursion", "railfix.tracking.filter", "Recursion.advance"),
+    ("filter: recursion", "railfix.tracking.filter", "Recursion.run"),
     ("filter: starts and searches", "railfix.pipeline.along_track", "track"),
     ("filter: positions", "railfix.pipeline.processor", "along_track"),
     ("filter: rows of train.csv", "railfix.run.tally", "train_table"),

@@ -75,6 +75,7 @@ def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -
 def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(good: Desk, name: str) -> None:
     command, code, words = (MISTAKES[name][key] for key in ("command", "exit", "words"))
     files, words = MISTAKES[name].get("files", {}), [words] if isinstance(words, str) else words
+    kept = {file: (good.folder / file).read_bytes() for file in files if (good.folder / file).exists()}
     for file, text in files.items():
         (good.folder / file).write_text(text if isinstance(text, str) else edited(good.folder, *text))
     before = contents(good.folder)
@@ -84,6 +85,8 @@ def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(good: Desk, name:
     finally:
         for file in files:
             (good.folder / file).unlink()
+        for file, content in kept.items():
+            (good.folder / file).write_bytes(content)
         # a command that should have failed leaves its results: they must not fail the next one
         shutil.rmtree(good.folder / "out", ignore_errors=True)
     assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)

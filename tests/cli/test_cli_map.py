@@ -90,7 +90,7 @@ def test_the_limit_of_the_mid_chord_deviation_is_an_option(tmp_path: Path) -> No
         (["from-positions", "line.csv", "--out", "m.csv", "--quality", "good"], 4, "whole numbers"),
         (["from-positions", "line.csv", "--out", "m.csv", "--quality", "1"], 3, "no column 'quality'"),
         (["from-positions", "line.csv", "--out", "m.csv", "--spacing", "0"], 4, "must be positive"),
-        (["from-positions", "line.csv", "--out", "m.csv", "--spacing", "900"], 3, "a track needs two"),
+        (["from-positions", "line.csv", "--out", "m.csv", "--spacing", "900"], 7, "a track needs two"),
         (["from-positions", "line.csv", "--out", "m.csv", "--column", "lat"], 4, "expected NAME=COLUMN"),
         (["from-positions", "line.csv", "--out", "m.csv", "--column", "lat=x"], 4, "'lat' is unknown"),
     ],

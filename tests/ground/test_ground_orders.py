@@ -453,6 +453,16 @@ def test_an_interval_is_corrected_once_every_authority_has_lapsed(desk: Desk) ->
     assert not unit.receive(authority)  # it answers a report of more than 45 s ago
 
 
+def test_a_train_that_was_never_heard_may_have_what_it_was_sent(desk: Desk) -> None:
+    """Its authority of now has lapsed no sooner than that of a train that reports."""
+    desk.steps(1.0)
+    desk.orders["stop"]({"train": 1}, "anna")
+    values = {"train": 1, "rear_m": 190, "front_m": 410, "direction": 1, "track": 1, "reason": "seen in West, whole"}
+    assert "has not reported that it obeys" in (desk.twice("correct-train", values) or "")
+    desk.steps(61.0)
+    assert desk.twice("correct-train", values) is None
+
+
 def test_a_train_is_entered_anywhere_and_removed(desk: Desk) -> None:
     """Between stations: no authority leads into it; removed, its section stays occupied until it is seen free."""
     values = {

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from navigation_text import header, label, record, record_2, write
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex import read_navigation
 
@@ -133,7 +133,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         read_navigation(tmp_path / "none.nav")
     with pytest.raises(InputFileError, match="folder"):
         read_navigation(tmp_path)
-    with pytest.raises(ValueError, match="no file"):
+    with pytest.raises(SettingsError, match="no file"):
         read_navigation([])
 
 

@@ -15,7 +15,7 @@ from hatanaka import rnx2crx
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import BrokenLines
 from railfix.io import read_observations, scan_observations
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
@@ -347,7 +347,7 @@ def test_options_are_checked(tmp_path: Path, options: dict[str, str]) -> None:
         read_observations(write(tmp_path / "log", good_3()), **options)
     with pytest.raises(ValueError, match="at least one epoch"):
         scan_observations(tmp_path / "log", epochs=0)
-    with pytest.raises(ValueError, match="no file"):
+    with pytest.raises(SettingsError, match="no file"):
         read_observations([])
 
 

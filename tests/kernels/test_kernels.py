@@ -25,6 +25,7 @@ from railfix.kernels import compiling
 from railfix.kernels.compiling import compute_stamp
 from railfix.kernels.tracking.recursion import advance
 from railfix.kernels.tracking.velocity import write_velocities
+from railfix.live.warm_up import compile_filter
 from railfix.pipeline.config import Config
 from railfix.pipeline.results import Result
 from railfix.positioning.igg3_fit import robust_fit
@@ -189,6 +190,14 @@ def test_arrays_of_any_caller_are_of_one_type_for_kernels() -> None:
         robust_fit(ranges, near)
         compiled.append([len(kernel.signatures) for kernel in used])
     assert compiled[0] == compiled[1] == compiled[2]
+
+
+@pytest.mark.requirement("A8")
+def test_the_recursion_is_compiled_by_itself_for_the_arrays_of_a_run() -> None:
+    """It is called in a process of its own, whose failure would only make the first run slower."""
+    before = len(advance.signatures)
+    compile_filter()
+    assert len(advance.signatures) == max(before, 1)
 
 
 @pytest.mark.slow

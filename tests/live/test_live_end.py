@@ -67,8 +67,10 @@ def test_signals_act_while_data_wait() -> None:
 #: A program that is ended by a signal in a callback from C, as the compiler of kernels makes them.
 CALLBACK = """
 import ctypes, os, signal, time, typer
+from railfix.__main__ import raise_exit
 from railfix.cli.command import run_program
 
+signal.signal(signal.SIGTERM, raise_exit)
 app = typer.Typer()
 
 @ctypes.CFUNCTYPE(None)

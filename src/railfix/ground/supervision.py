@@ -150,7 +150,7 @@ class Supervision:
         Each answers a report that arrived before it was sent, so that its age is counted from then at the latest.
         """
         record = self.records.get(train)
-        counted_s = -math.inf if record is None or record.counted_s is None else record.counted_s
+        counted_s = math.inf if record is None or record.counted_s is None else record.counted_s
         answered_s = min(self.granted_s.get(train, -math.inf), counted_s)
         return now_s - max(answered_s, self.begun_s) > LAPSED_S
 

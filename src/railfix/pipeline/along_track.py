@@ -98,7 +98,10 @@ def along_track(
             sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
             pulled, filtered = _against_wheel(replays, tracked.arc_m, sure, after.pulled, config)
             after, tracked = replace(after, pulled=filtered), _bound_by_wheel(tracked, pulled.bound_m)
-        tracked = mark_doubtful(tracked, wheel.parted & is_bounded(tracked.status), TrackStatus.SPOOFING_SUSPECTED)
+        # a cause with a name outranks a doubt without one; an error of the time tags outranks both
+        unnamed = (tracked.status == TrackStatus.DOUBTFUL) & (single.suspicion != Suspicion.TIME_TAGS)
+        parted = wheel.parted & (is_bounded(tracked.status) | unnamed)
+        tracked = mark_doubtful(tracked, parted, TrackStatus.SPOOFING_SUSPECTED)
     speed, sigma = tracked.speed_mps, tracked.speed_sigma_mps
     direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
     result = AlongTrack(
