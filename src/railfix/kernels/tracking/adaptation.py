@@ -57,15 +57,18 @@ def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
 
 
 @inner
-def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float) -> None:
-    """Adapt the state to an epoch's fit; `shift` is that of `compute_code_shift` of the hypothesis reported."""
+def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float) -> bool:
+    """Adapt the state to an epoch's fit; return whether another satellite's codes are left out from here on.
+
+    `shift` is that of `compute_code_shift` of the hypothesis reported.
+    """
     monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
     of_dopplers, of_phases = mean_square(rows, rows.doppler, found), mean_square(rows, rows.phase, found)
     monitors.log_doppler_scale = update_scale(monitors.log_doppler_scale, of_dopplers, dt)
     monitors.log_phase_scale = update_scale(monitors.log_phase_scale, of_phases, dt)
     update_doubt(monitors, rows, found, dt)
     update_map_scale(monitors, shift, rows.code_s, parameters)
-    beyond, early = 0, 0
+    beyond, early, excluded = 0, 0, False
     for j in range(rows.code.start, rows.code.stop):
         channel = given.channel[t, rows.channel[j]]
         sigma = channel.code_sigma_m * math.sqrt(1.0 + parameters.code_white_share**2)
@@ -74,8 +77,10 @@ def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation
             beyond += 1
             early += bias < 0.0
         state.code_bias[channel.satellite] = update_bias(bias, innovation[j] / sigma, rows.code_s)
+        excluded = excluded or (is_faulty(state.code_bias[channel.satellite]) and not is_faulty(bias))
     if early and beyond > constants.BIAS_SATELLITES:
         monitors.level_hold_s = max(monitors.level_hold_s, constants.LEVEL_HOLD_S)
+    return bool(excluded)
 
 
 @inner

@@ -96,6 +96,9 @@ NOMINAL_M: Final = 0.8
 #: map or a constellation is wrong, or reflections pull the clock.
 BIAS_SATELLITES: Final = 2
 BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out: innovations show when the fault ends.
+#: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
+INFLATED_M: Final = 15.0
+INFLATED_SIGMAS: Final = 3.0  #: Not where all codes are off by more sigmas: they may have stepped together.
 
 # Lengths of the map.
 #: Time over which codes are to contradict the length (`TrackingLimits.map_misfit_sigmas`), and within which a larger

@@ -174,9 +174,11 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
     leads = find_leading(state.hypothesis, len(corrections))
     best = corrections[leads]
     implied = 0.0 if leads else shift
-    adapt(given, t, state, rows, best.fit, best.innovation, implied)
+    excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leads)
+    if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have led the place so far
+        state.P[:, ix.ARC, ix.ARC] += constants.INFLATED_M**2
     square = compute_contradiction(given, t, state, leads)
     beyond_m = excess_beyond_end(given.line[0], best.x[ix.ARC], math.sqrt(best.P[ix.ARC, ix.ARC]))
     update_monitors(state, square, implied, beyond_m, given.epoch[t].interval_s, rows.code_s)
