@@ -98,8 +98,8 @@ class CentreFile(Settings):
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Stations of the line, in order of chainage.
-    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection, which answers by the order
-    #: ``detect-section`` at least every `InterlockingLimits.detection_s`: unknown without.
+    #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection. It answers by the
+    #: order ``detect-section`` at least every `InterlockingLimits.detection_s`; otherwise the section is unknown.
     detected_sections: tuple[str, ...] = ()
     drive: Literal["left", "right"] = "left"  #: Side on which trains pass a station of the network.
     #: Initial stations of the trains; later starts read them from the database.

@@ -66,7 +66,7 @@ class Supervision:
     heard: set[int] = field(default_factory=set)  #: Trains that have reported since the last authorities.
     #: When a train was sent its last authority [s], and whether it was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
-    granted_s: dict[int, float] = field(default_factory=dict)  #: When it was sent the last one that was no such order.
+    granted_s: dict[int, float] = field(default_factory=dict)  #: When a train was last sent an authority to run [s].
 
     #: When a train was sent the order to brake that it has not acknowledged yet, and the number of the order.
     ordered: dict[int, tuple[float, int]] = field(default_factory=dict)

@@ -17,7 +17,7 @@ _WINDOW_NS: Final = 30_000_000_000
 _LEAST_SPEEDS: Final = 10
 _NEAR_NS: Final = 150_000_000  #: A speed of the radar belongs to one by satellites that is so near [ns].
 _MOVING_MPS: Final = 3.0
-#: Windows before a step that it is a step from, at least and at most, and windows after it that show it.
+#: Windows before a step that are compared, at least and at most, and windows after it.
 _LEAST_BEFORE: Final = 5
 _MOST_BEFORE: Final = 20
 _AFTER: Final = 3

@@ -48,7 +48,7 @@ def map_information(trajectory: Trajectory, section: Indices) -> Floats:
 
 
 def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
-    """Return it in the axes of the line there, shape (T, 3, 3), and the sigmas of its map."""
+    """Return the inverse covariance, ECEF, shape (T, 3, 3) [1/m^2], from axes of the line and sigmas of its map."""
     across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
         across[:, :, None] * across[:, None, :] / sigma_plan_m**2 + up[:, :, None] * up[:, None, :] / sigma_height_m**2

@@ -179,9 +179,8 @@ def hold_signs(
     """Return which conditions have been true for their time, which within their time of release, and the state.
 
     An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
-    sufficient. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a time of holding of
-    0
-    counts at once.
+    sufficient. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a condition whose
+    time of holding is 0 counts at once.
     """
     conditions = signs.shape[1]
     run, last = state.run_ns, state.last
