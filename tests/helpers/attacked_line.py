@@ -148,7 +148,7 @@ class AttackedLine:
             self.centre.state = from_documents(to_documents(self.centre.state))
             self.centre._clocks.clear()
             moving = set(self.moving)
-            for point in self.centre.begin_again(self.now_s):
+            for point in self.centre.begin_again(self.now_s, wall_us=int(1e6 * self.now_s)):
                 if point not in moving:
                     self.centre.set_detected(point, self.points[point])
             self.centre.awaited &= set(self.trains)  # what reports nothing is confirmed by hand

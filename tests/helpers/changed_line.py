@@ -246,7 +246,8 @@ class ChangedLine(AttackedLine):
         )  # fmt: skip
         self.centre.records.clear()
         self.centre._clocks.clear()
-        for point in self.centre.begin_again(self.now_s):
+        # a second after what was sent in the last step
+        for point in self.centre.begin_again(self.now_s, wall_us=int(1e6 * self.now_s + 1e6)):
             if point not in self.moving:
                 self.centre.set_detected(point, self.points[point])
         for number in self.parts.values():

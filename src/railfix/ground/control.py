@@ -120,7 +120,7 @@ class ControlCentre:
             stopped = monitor.stopped
         supervision.state = replace(supervision.state, stopped=stopped)
         if texts:
-            asked = supervision.begin_again(centre.clock())
+            asked = supervision.begin_again(centre.clock(), wall_us=centre.wall_ns() // 1000)
         for point in asked:
             centre.ask(point)
         centre.log("centre started again; every train is unknown" if texts else "centre started")

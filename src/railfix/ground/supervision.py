@@ -41,8 +41,8 @@ from railfix.io.train_message import TrainMessage
 ROUTE_AHEAD_M = 700.0
 #: A train is sent an authority at its report, at a stop, and otherwise this often [s].
 AUTHORITY_S = 1.0
-#: Numbers of authorities that are skipped at a start: more than an older copy of the database can be behind.
-SKIPPED: Final = 1 << 32
+#: Numbers of authorities that are skipped at least at a start.
+SKIPPED: Final = 1 << 20
 #: An authority has lapsed on board this long after the report that it answers: longer than `LONGEST_FRESH_S` [s].
 LAPSED_S: Final = 60.0
 #: Largest drift between clocks of a train and of the centre.
@@ -154,19 +154,21 @@ class Supervision:
         answered_s = min(self.granted_s.get(train, -math.inf), counted_s)
         return now_s - max(answered_s, self.begun_s) > LAPSED_S
 
-    def begin_again(self, now_s: float) -> tuple[PointName, ...]:
+    def begin_again(self, now_s: float, *, wall_us: int) -> tuple[PointName, ...]:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
         Nothing is granted until every train has sent a report that names an order of this start: the report includes
         authorities unknown to the database, and the train accepts no late authority of the earlier centre any more. The
         stored detection of points is dropped.
+
+        Numbers begin at the microseconds `wall_us` of the computer's clock, so that they are above those of every
+        earlier start; where that clock has been set back, above those of the database.
         """
         self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
-        trains = {n: replace(t, runs_by=last + SKIPPED) for n, t in self.state.trains.items()}
+        first = max(last + SKIPPED, wall_us)
+        trains = {n: replace(t, runs_by=first) for n, t in self.state.trains.items()}
         points = {name: replace(p, detected=None, commanded=False) for name, p in self.state.points.items()}
-        self.state = replace(
-            self.state, trains=trains, points=points, granted=last + SKIPPED, skipped=(last, last + SKIPPED)
-        )
+        self.state = replace(self.state, trains=trains, points=points, granted=first, skipped=(last, first))
         self._asked_s = dict.fromkeys(points, now_s)
         return tuple(points)
 
