@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import polars as pl
 from matplotlib.colors import to_hex
 
-REFERENCES = Path(__file__).resolve().parents[1] / "references" / "pages"
+REFERENCES = Path(__file__).resolve().parents[1] / "references" / "described"
 #: Longer arrays are described by their number, first, last, smallest, largest value and sum.
 _LISTED = 40
 
@@ -134,3 +135,22 @@ def page_text(document: str, hidden: Mapping[str, str]) -> list[str]:
     text = re.sub(r"<(figure|a|details|circle|tr|section|table|div|text)\b([^>]*)>", r"\n[\1\2] ", text)
     lines = (" ".join(re.sub(r"<[^>]+>", " ", line).split()) for line in text.splitlines())
     return [line for line in lines if line and not re.fullmatch(r"\[(div|tr|details|text|table)[^\]]*\]", line)]
+
+
+def _text(parts: Iterable[Iterable[str]]) -> str:
+    """Return descriptions one after the other, apart by a blank line where they have several lines."""
+    texts = ["\n".join(str(line) for line in part) for part in parts]
+    return "".join(f"{text}\n\n" if "\n" in text else f"{text}\n" for text in texts)
+
+
+def check_described(name: str, parts: Iterable[Iterable[str]]) -> None:
+    """Compare descriptions with the reference of a name, line by line."""
+    assert _text(parts).splitlines() == (REFERENCES / f"{name}.txt").read_text(encoding="utf-8").splitlines()
+
+
+def write_described(cases: Mapping[str, Callable[[Path], Iterable[Iterable[str]]]], names: Sequence[str]) -> None:
+    """Write the references of all cases, or of those with these names."""
+    REFERENCES.mkdir(exist_ok=True)
+    for name in names or cases:
+        with tempfile.TemporaryDirectory() as folder:
+            (REFERENCES / f"{name}.txt").write_text(_text(cases[name](Path(folder))), encoding="utf-8")

@@ -25,7 +25,7 @@ if __name__ == "__main__":
     sys.path[:0] = [str(folder) for folder in sorted(Path(__file__).resolve().parents[1].iterdir()) if folder.is_dir()]
 
 from chart_tables import START, errors_table, observations_table, positions_table, times
-from described import REFERENCES, describe, describe_axes, describe_figure, page_text
+from described import check_described, describe, describe_axes, describe_figure, page_text, write_described
 from made_report import made_report_run
 from network_made import log_at, made_network, to_degrees
 from railfix.core.geodesy import ecef_from_geodetic
@@ -401,20 +401,10 @@ CASES: Final[dict[str, Callable[[Path], Iterable[Iterable[str]]]]] = {
 }
 
 
-def described(name: str, folder: Path) -> str:
-    return "\n\n".join("\n".join(lines) for lines in CASES[name](folder)) + "\n"
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_pages_show_what_was_reviewed(name: str, tmp_path: Path) -> None:
-    expected = (REFERENCES / f"{name}.txt").read_text(encoding="utf-8")
-    assert described(name, tmp_path).splitlines() == expected.splitlines()
+    check_described(name, CASES[name](tmp_path))
 
 
 if __name__ == "__main__":
-    import tempfile
-
-    REFERENCES.mkdir(exist_ok=True)
-    for name in sys.argv[1:] or CASES:
-        with tempfile.TemporaryDirectory() as temporary:
-            (REFERENCES / f"{name}.txt").write_text(described(name, Path(temporary)), encoding="utf-8")
+    write_described(CASES, sys.argv[1:])
