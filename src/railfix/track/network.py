@@ -10,7 +10,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 import scipy
@@ -314,7 +314,10 @@ class Network(NotebookTable):
         entries = 4 * stop, 4 * stop + 2
         for node, (so_far, route) in routes.items():
             for cutoff in (_NEAR_WAY_M, None):
-                length, path = nx.single_source_dijkstra(self.graph, node, cutoff=cutoff)
+                length, path = cast(
+                    "tuple[dict[int, float], dict[int, list[int]]]",
+                    nx.single_source_dijkstra(self.graph, node, cutoff=cutoff),
+                )
                 if any(entry in length for entry in entries):
                     break
             for entry in entries:
