@@ -107,9 +107,7 @@ def exclude_faults(
     antennas, limits, fix_limits = AntennaRows.on(line), limits or RaimLimits(), fix_limits or FixLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),))
     if not (scale > 0.0).all(where=np.isfinite(scale)):
-        raise ValueError(
-            "scale must be positive: standard deviation of the ranges over the sigmas of the weights"
-        )
+        raise ValueError("scale must be positive: standard deviation of the ranges over the sigmas of the weights")
     test = _detect(fix, ranges.redundancy, scale, limits)
     raim = _untested(test, ranges.weight.shape, scale)
     raim.outcome[test.testable] = Outcome.PASSED

@@ -202,8 +202,8 @@ class EpochProcessor:
         faults = None if self._error_model is None else self._error_model.faults
         if faults is not None and "side_upper" not in faults.model_fields_set:
             notes.append(
-                "error model: faults.side_upper, the frequency of common faults of low satellites on one side, is missing; the "
-                "file is of an earlier version, so make it again with railfix error-model"
+                "error model: faults.side_upper, the frequency of common faults of low satellites on one side, is "
+                "missing; the file is of an earlier version, so make it again with railfix error-model"
             )
         if self.config.protection == "on" and self.config.carrier in ("float", "fixed"):
             notes.append("protection level: requested, but not available for positions from code and phase together")

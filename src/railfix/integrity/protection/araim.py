@@ -276,9 +276,7 @@ class IntegritySupport(Settings):
     def notes(self, time: Datetimes) -> tuple[str, ...]:
         """Return a note if the message states no end of validity, or is invalid at some epochs."""
         if self.valid_until is None:
-            return (
-                "integrity support message: without valid_until it is not known whether it has expired",
-            )
+            return ("integrity support message: without valid_until it is not known whether it has expired",)
         if self.holds(time).all():
             return ()
         first = "" if self.valid_from is None else f"from {self.valid_from} "
