@@ -379,7 +379,7 @@ def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
 
 @pytest.mark.requirement("E5")
 def test_a_position_off_in_a_curve_displaces_across() -> None:
-    """10 m of travel on a radius of 573 m: the tangents differ by 10 / 573, to the right, for each metre of position."""
+    """10 m of travel on a radius of 573 m: the tangents differ by 10 / 573 to the right, for each metre."""
     line = Line(bent_line(1800.0, turn_deg=60.0))  # 60 degrees on 600 m
     vertex, whole = line.records
     for sigma_m, counted_m in ((4.0, 4.0), (500.0, 30.0)):  # a position is never more uncertain than at a start
