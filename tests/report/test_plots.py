@@ -13,8 +13,8 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
+from chart_tables import START, errors_table, observations_table, positions_table, times
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.core.reasons import Reason
 from railfix.integrity.stanford import stanford as sorted_epochs
 from railfix.report import plots
 from railfix.report.plots.chart import (
@@ -37,71 +37,26 @@ from railfix.track import Track
 
 pytestmark = pytest.mark.requirement("D3")
 
-START = np.datetime64("2024-03-05T03:10:00", "ns")
+
+@pytest.fixture
+def errors() -> pl.DataFrame:
+    return errors_table()
 
 
-def times(seconds: Any) -> np.ndarray:
-    return START + (np.asarray(seconds) * 1e9).astype("timedelta64[ns]")
+@pytest.fixture
+def positions() -> pl.DataFrame:
+    return positions_table()
+
+
+@pytest.fixture
+def observations() -> pl.DataFrame:
+    return observations_table()
 
 
 def layer(chart: Chart, kind: type, label: str = "") -> Any:
     """The layer of a kind and, where one is given, a label."""
     (found,) = [one for one in chart.layers if isinstance(one, kind) and label in ("", one.label)]
     return found
-
-
-@pytest.fixture
-def errors() -> pl.DataFrame:
-    """Five epochs; the fourth has no position on the map, the fifth a reference that is too bad."""
-    return pl.DataFrame(
-        {
-            "time_gpst": times([0.0, 1.0, 2.0, 3.0, 4.0]),
-            "status": ["ok", "ok", "ok", "too_few_satellites", "ok"],
-            "chainage_m": [10.0, 20.0, 30.0, 40.0, 50.0],
-            "error_m": [0.5, -1.0, 2.0, None, 9.0],
-            "conventional_error_m": [1.5, -3.0, None, 4.0, 9.0],
-            "along_sigma_m": [1.0, 1.1, 1.2, None, 1.3],
-            "protection_level_m": [5.0, float("inf"), 1.5, None, 6.0],
-            "reference_good": [True, True, True, True, False],
-            "interval_m": [None, 10.0, 10.0, None, 20.0],
-            "conventional_interval_m": [None, 10.0, None, 20.0, 10.0],
-        }
-    )
-
-
-@pytest.fixture
-def positions() -> pl.DataFrame:
-    """A straight line to the north, a position a second and 10 m apart, the third off it to the east."""
-    latitude = 35.0 + np.arange(5) * 10.0 / 110_941.0
-    ecef = ecef_from_geodetic(latitude, np.full(5, 135.0), np.full(5, 50.0))
-    aside = ecef_from_geodetic(latitude, np.full(5, 135.0 + 5.0 / 91_288.0), np.full(5, 50.0))
-    return pl.DataFrame(
-        {
-            "time_gpst": times(np.arange(5)),
-            "antenna": ["front"] * 5,
-            "status": ["ok", "ok", "uncertain", "ok", "ok"],
-            "chainage_m": np.arange(5) * 10.0,
-            "kilometrage_m": 1000.0 + np.arange(5) * 10.0,
-            **{f"{axis}_m": ecef[:, i] for i, axis in enumerate("xyz")},
-            **{f"conventional_{axis}_m": aside[:, i] for i, axis in enumerate("xyz")},
-            "conventional_chainage_m": [0.0, 11.0, None, 29.0, 40.0],
-            "n_used": [8, 7, 4, 8, 9],
-            "n_rejected": [1, 2, 5, 1, 0],
-        }
-    )
-
-
-@pytest.fixture
-def observations() -> pl.DataFrame:
-    """Two epochs of three satellites; one has a second signal, one is refused."""
-    taken, other = 0, int(Reason.OTHER_SIGNAL_TAKEN)
-    mask = int(Reason.ELEVATION_MASK | Reason.CN0_FLOOR)
-    rows = [("G01", "1C", taken, 40.0, 90.0, 45.0), ("G01", "2W", other, 40.0, 90.0, 30.0)]
-    rows += [("E05", "1C", mask, 12.0, 359.5, 28.0), ("J02", "1C", taken, 80.0, 10.0, None)]
-    table = pl.DataFrame(
-        rows, schema=["satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"], orient="row"
-    )
-    return pl.concat([table.with_columns(pl.lit(t).alias("time_gpst")) for t in times([0.0, 1.0])])
 
 
 def test_errors_are_drawn_where_they_are_known_and_the_reference_is_good(errors: pl.DataFrame) -> None:
@@ -220,7 +175,7 @@ def test_levels_over_time(positions: pl.DataFrame) -> None:
     np.testing.assert_array_equal(layer(chart, Points, "level").x, [0.0, 2.0, 4.0])
     assert {one.label for one in chart.layers} == {"level", "fault-free part", "alarm limit 20 m"}
     assert "Epochs: available 3, unavailable 1, alarm 1." in chart.caption
-    assert "1 levels are infinite" in chart.caption
+    assert "not drawn: 1 infinite level." in chart.caption
     assert plots.levels_over_time(positions, 20.0).empty
     along = plots.levels_over_chainage(told.with_columns(chainage_m=pl.Series([10.0, 20.0, None, 40.0, 50.0])), 20.0)
     np.testing.assert_array_equal(layer(along, Points, "level").y, [5.0, 6.0])

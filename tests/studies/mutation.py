@@ -131,7 +131,9 @@ class Tests:
         self.source, self._folders, self._data = source, folders, CoverageData(str(folder / "measured"))
         began = time.monotonic()
         if not self.pass_within(3600.0, [*folders, "-p", "measuring"], {"MEASURED": str(folder / "measured")}):
-            sys.exit(f"the tests of {' '.join(folders)} must pass before mutants are tried, also under coverage")
+            sys.exit(
+                f"tests of {' '.join(folders)} must pass, also under coverage, before mutants are tried: {self.said}"
+            )
         self.limit_s = max(120.0, 3.0 * (time.monotonic() - began))
         self._data.read()
         self._times = json.loads((folder / "measured.json").read_text())
@@ -160,8 +162,9 @@ class Tests:
             )
         except subprocess.TimeoutExpired:
             return False
+        self.said = (done.stdout + done.stderr).decode()[-1000:]
         if done.returncode > 2:  # no test ran: neither passed nor failed
-            sys.exit(f"pytest ended with {done.returncode}: {(done.stdout + done.stderr).decode()[-500:]}")
+            sys.exit(f"pytest ended with {done.returncode}: {self.said}")
         return done.returncode == 0
 
 

@@ -272,8 +272,8 @@ class TrainLinks:
                 ) as protocol:
                     self.protocols[name] = protocol
                     self._resend(name)
-                    while not (protocol.ended or protocol.has_expired):
-                        await asyncio.sleep(0.1)
+                    async with asyncio.timeout(protocol.valid_s):
+                        await protocol.wait_closed()
             except (ConnectionError, TimeoutError, OSError):
                 pass  # retried after a time; the meter counts unanswered frames
             self.protocols.pop(name, None)
@@ -403,7 +403,7 @@ class CentreLinks:
             for protocol in self._peers.values():
                 if protocol.certificate is None:
                     continue
-                if protocol.has_expired or self._revoked.has(protocol.certificate):
+                if protocol.valid_s < 0.0 or self._revoked.has(protocol.certificate):
                     protocol.reject()
             self._note_ending()
             await asyncio.sleep(RETRY_S)

@@ -151,9 +151,11 @@ class LinkProtocol(QuicConnectionProtocol):
         self.close(error_code=_REJECTED, reason_phrase="certificate")
 
     @property
-    def has_expired(self) -> bool:
-        """Whether the certificate of the other end has expired since."""
-        return self.certificate is not None and datetime.now(UTC) > self.certificate.not_valid_after_utc
+    def valid_s(self) -> float:
+        """Time until the certificate of the other end expires, 0 without a verified one [s]."""
+        if self.certificate is None:
+            return 0.0
+        return (self.certificate.not_valid_after_utc - datetime.now(UTC)).total_seconds()
 
     def datagram_received(self, data: bytes | str, addr: Any) -> None:
         """Process a packet; delayed acknowledgements to a verified peer halve packets and work."""

@@ -228,7 +228,7 @@ class LiveEngine:
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
         """Take over a saved state where an epoch with this tag may follow it."""
         self._saved = None
-        age_s = (tag_ns - saved.done_ns) * 1e-9
+        age_s = (tag_ns - saved.done_ns) / 1e9
         if 0.0 < age_s <= self.settings.state_age_s:
             self._state, self._done_ns, self._last_tag = saved.state, saved.done_ns, dict(saved.last_tag)
             self._running = saved.running

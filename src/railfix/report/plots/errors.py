@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.core.notebook import plural
 from railfix.evaluate.accuracy import PASSED
 from railfix.evaluate.epoch_table import level_columns
 from railfix.integrity.stanford import Region, Stanford
@@ -330,7 +331,7 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
         layers.append(Curve(label=f"alarm limit {alarm_limit_m:g} m", colour=RED, x=line, y=limit, dash="dashed"))
     infinite = int(np.isinf(floats(positions, "protection_level_m")).sum())
     caption = [_count(positions), f"Values beyond {top:g} m, twice the alarm limit, are cut off"]
-    caption[1] += f", {infinite:,} levels are infinite and not drawn." if infinite else "."
+    caption[1] += f"; not drawn: {plural(infinite, 'infinite level')}." if infinite else "."
     if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
             "Each part is computed with its own part of the risk; the level uses the whole risk and can be below a "

@@ -12,6 +12,7 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Masks
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.notebook import plural
 from railfix.core.reasons import Status
 from railfix.report.plots.chart import (
     BLACK,
@@ -84,7 +85,7 @@ def plan(
     layers += _line(track, frame, floats(positions, "chainage_m")[has], here[has], tunnels_m)
     if len(kept):
         layers.append(Points(label="conventional", colour=GREY, shape="cross", x=there[kept, 0], y=there[kept, 1]))
-    shown, total = len(kept), int(np.isfinite(there[:, 0]).sum())
+    shown, total = len(kept), int(near.sum())
     epoch = since(positions, find_start(positions))
     classes, coloured = _classes(positions, error_m, level_m)
     for label, colour, mask in classes:
@@ -101,7 +102,7 @@ def plan(
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
     thinned = "" if shown == total else f" Positions too close to distinguish are drawn once ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
-    far = f" {outside:,} conventional positions lie outside." if outside else ""
+    far = f" Outside: {plural(outside, 'conventional position')}." if outside else ""
     return chart(
         caption=f"Positions on the map, coloured by {coloured}; conventional positions in grey.{far} Origin at "
         f"latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}.{thinned}",
