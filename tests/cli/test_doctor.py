@@ -100,7 +100,7 @@ def test_heights_are_taken_as_the_format_defines_them(tmp_path: Path, name: str,
     (tmp_path / name).write_text(text)
     found = examine_files([tmp_path / name])
     assert " ".join(found.findings[0].options) == f"--height-datum {datum}"
-    assert f"takes them as {datum.split()[0]}" in found.problems[0]
+    assert f"takes the heights as {datum.split()[0]}" in found.problems[0]
 
 
 @pytest.mark.requirement("A6")
