@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -180,6 +181,7 @@ def open_inputs(
     positions = LogPositions(
         path=str(paths[0]), parts=open_log(paths).parts, navigation=navigation, config=config, time=at,
         reading=options.track, antenna_up_m=None if offset is None else offset.up_m,
+        open_base=partial(base_log, inputs.base, options),
     )  # fmt: skip
     line = open_line(
         inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, heights=inputs.heights, at=at,

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import polars as pl
@@ -21,6 +21,7 @@ from railfix.core.timescale import nearest_rows
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.position_log import PositionLog
+from railfix.pipeline.base_station_stage import BaseState, BaseStation
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import known_from_start
@@ -31,6 +32,9 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import UNMAPPED_PRIOR, Network
 from railfix.track.network_match import Matched, PlanLog, match, plan_log
 from railfix.track.network_route import find_route, left_out_note
+
+if TYPE_CHECKING:
+    from railfix.run.processor_setup import BaseLog
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
@@ -313,13 +317,18 @@ class LogPositions:
     time: np.datetime64 | None  #: Epoch of frames; None without a navigation record.
     reading: TrackReading
     antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
+    open_base: Callable[[], BaseLog | None] = lambda: None  #: Open the log of a base station; None without one.
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions of quality 5 (single); NoPositionError if the log has none."""
+        """Positions of quality 5 (single), or 4 with a base station; NoPositionError if the log has none."""
         received, book = known_from_start(self.config, navigation=self.navigation), ChannelBook(self.config)
-        located = []
+        base, state, located = self.open_base(), BaseState(), []
+        station = None if base is None else BaseStation(self.config, base.ecef_m)
         for part in self.parts():
+            if base is not None and station is not None:
+                state = station.add_observations(base.until(part.time[-1]), received, state, part.time[0])
+                received = state.beside(received)
             seconds = np.diff(part.time) / np.timedelta64(1, "s")
             step = max(1, round(_INTERVAL_S / float(np.median(seconds)))) if len(seconds) else 1
             located.append(locate(part[::step], received, self.config, book))
@@ -328,7 +337,8 @@ class LogPositions:
             raise NoPositionError(f"{self.path}: the log has no position, so that its line cannot be found")
         placed = join_rows(known)
         return PositionLog(
-            path=self.path, time=placed.time, ecef_m=placed.ecef_m, quality=np.full(count, 5), sigma_m=placed.sigma_m,
+            path=self.path, time=placed.time, ecef_m=placed.ecef_m, quality=np.full(count, 5 if base is None else 4),
+            sigma_m=placed.sigma_m,
             line=np.arange(count),
         )  # fmt: skip
 
