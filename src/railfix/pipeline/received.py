@@ -82,6 +82,11 @@ def correction_source(received: Received, config: Config) -> CorrectionSource:
         source = DfmcSource(models=models, service=received.sbas)
     elif received.sbas is not None:
         source = SbasSource(navigation=received.navigation, corrections=received.sbas)
+    return with_base_station(source, received, config)
+
+
+def with_base_station(source: CorrectionSource, received: Received, config: Config) -> CorrectionSource:
+    """Return a source with the errors that a base station has measured; the source itself without a station."""
     if received.base is None:
         return source
     return BaseStationSource(

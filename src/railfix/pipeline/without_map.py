@@ -18,7 +18,7 @@ from railfix.gnss.observations import Observations
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.range_stage import raw_ranges
-from railfix.pipeline.received import Received, broadcast_source
+from railfix.pipeline.received import Received, broadcast_source, with_base_station
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
 from railfix.positioning.igg3_fit import robust_fit
@@ -100,9 +100,12 @@ _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OT
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
-    """Return corrected ranges of one antenna without a track: the codes give the approximate position."""
+    """Return corrected ranges of one antenna without a track: the codes give the approximate position.
+
+    The models correct them, and a base station that has been received; SBAS does not.
+    """
     channels = book.of(obs, received.navigation)
-    source = replace(broadcast_source(received, config), second="none")
+    source = with_base_station(replace(broadcast_source(received, config), second="none"), received, config)
     satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)
     raw = raw_ranges(obs, channels, satellites)
     observed, implausible = (satellites.reason & _OF_CODES) == 0, int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE)
