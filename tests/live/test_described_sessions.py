@@ -10,7 +10,7 @@ import asyncio
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
@@ -40,6 +40,7 @@ from railfix.live.session import status_text
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink, parse_file_target
 from railfix.live.sources import check_source, hidden, is_file
+from railfix.live.state_values import StateFormatError, decode, encode
 from railfix.live.stream import FOREVER, Lag, Sensed, SensorLines, fresh_state
 from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import GroundUnits, RadarSpeeds, SensorSamples, StationRanges
@@ -54,6 +55,13 @@ pytestmark = pytest.mark.requirement("A8")
 START: Final = np.datetime64("2024-03-05T00:00:10.25", "ns")
 MS: Final = 1_000_000
 NAN: Final = float("nan")
+
+
+@dataclass
+class Example:
+    """A data class that is not of the package."""
+
+    value: int
 
 
 class Track(SimpleNamespace):
@@ -322,10 +330,15 @@ class Processor(SimpleNamespace):
         return screened
 
     def along_track(self, epochs: dict[str, Observations], _: Any) -> Any:
-        antennas = {
-            name: single(300.0 + 18.2 * (name == "front"), seconds=_second(epoch)) for name, epoch in epochs.items()
-        }
-        return result(**{name: (own, None) for name, own in antennas.items()}), State()
+        antennas = {}
+        for name, epoch in epochs.items():
+            seconds = _second(epoch)
+            place = 300.0 + 18.2 * (name == "front") + 40.0 * seconds
+            antennas[name] = single(place, seconds=seconds)
+        received = SimpleNamespace(notes=self.notes_later.pop(0)) if self.notes_later else None
+        state = State(received=received)  # type: ignore[arg-type]
+        return result(**{name: (own, None) for name, own in antennas.items()}), state
+        return result(**{name: (own, None) for name, own in antennas.items()}), state
 
 
 def _count(value: Any) -> int:
@@ -349,6 +362,7 @@ def _engine(*antennas: str, sensors: tuple[str, ...] = (), **settings: Any) -> L
     processor = Processor(
         notes=("a note",), received=SimpleNamespace(notes=(), navigation=no_navigation()), antenna_order=lambda: None,
         trajectories={name: clean_trajectories()[name] for name in antennas}, balises=None, units=None, given=[],
+        notes_later=[],
         config=SimpleNamespace(antenna_pair=SimpleNamespace(tag_tolerance_s=0.01)),
     )  # fmt: skip
     return LiveEngine(processor, LiveSettings(**settings), sensors)  # type: ignore[arg-type]
@@ -401,6 +415,7 @@ def _sessions(_: Path) -> Iterator[Iterable[str]]:
     left = [*_shown(engine, 0, engine.poll(now_ns=END_NS))]
     yield [f"{len(left)} left", left[0], left[-1], str(dict(engine.counts))]
     yield from _sensed_and_heard()
+    yield from _changes()
     yield from _resumed()
     lag = Lag(behind_s=1.0)
     before = -1
@@ -438,6 +453,22 @@ def _sensed_and_heard() -> Iterator[Iterable[str]]:
     engine.add_sbas(SimpleNamespace(merge=lambda _: None))  # type: ignore[arg-type]
     engine.add_base(epoch_at(300))
     yield _play(engine, [(100.0, "front", 100.0), (200.0, "front", 200.0)], live=False)
+
+
+def _changes() -> Iterator[Iterable[str]]:
+    """Replacements of requested data that begin, change and end."""
+    engine = _engine("front", no_input="skip")
+    engine.processor.notes_later += [("b", "c"), ("b", "c"), ("c", "d"), ()]  # type: ignore[attr-defined]
+    yield _play(engine, [(100.0 * k, "front", 100.0 * k) for k in range(5)], live=False)
+    engine, seen = _engine("front", "rear", no_input="skip"), []
+
+    def add(front: tuple[np.ndarray, ...], rear: tuple[np.ndarray, ...]) -> bool:
+        seen.append(f"order at {front[1][-1]:.1f} and {rear[1][-1]:.1f} m")
+        return len(seen) > 2
+
+    engine._order = SimpleNamespace(add=add, note="the antennas are exchanged")  # type: ignore[assignment]
+    pairs = [(100.0 * k, name, 100.0 * k) for k in range(12) for name in ("front", "rear")]
+    yield [*_play(engine, pairs, live=False), *seen]
 
 
 def _resumed() -> Iterator[Iterable[str]]:
@@ -505,6 +536,12 @@ def _streams(_: Path) -> Iterator[Iterable[str]]:
         except RailfixError as error:
             said = str(error)
         yield [f"{hidden(source)}: {said}; a file {is_file(source)}"]
+    for value in (PlaceWatch(str), Example(1), {"a": (1.5, b"x", slice(1, 2)), 3: {4}}, np.array([None])):
+        try:
+            said = repr(decode(encode(value)))
+        except StateFormatError as error:
+            said = str(error).replace(f"{__name__}.", "")
+        yield [f"{type(value).__name__} in a state: {said}"]
     for target in (
         "json@-",
         "json",
