@@ -31,7 +31,7 @@ from railfix.core.timescale import GPS_EPOCH, timedelta
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection import LevelStatus
 from railfix.io.train_message import MessageStatus, TrainMessage
-from railfix.live import console, warm_up
+from railfix.live import command, console, warm_up
 from railfix.live.console import Metrics, PlaceWatch, SensorWatch
 from railfix.live.engine import END_NS, EngineState, LiveEngine, LiveOutput
 from railfix.live.forms import ROW_FORMS, _json_rows, cbor_bytes, forms, gga_sentence, wants, whole_message
@@ -40,11 +40,13 @@ from railfix.live.session import status_text
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink, parse_file_target
 from railfix.live.sources import check_source, hidden, is_file
+from railfix.live.state import belongs_to
 from railfix.live.state_values import StateFormatError, decode, encode
 from railfix.live.stream import FOREVER, Lag, Sensed, SensorLines, fresh_state
 from railfix.live.train_ends import RunningEnd, TrainFrame
 from railfix.motion.samples import GroundUnits, RadarSpeeds, SensorSamples, StationRanges
 from railfix.motion.slip import MotionState
+from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor_state import State
 from railfix.pipeline.received import no_navigation
 from railfix.track import Trajectory
@@ -243,6 +245,7 @@ def _console(_: Path) -> Iterator[Iterable[str]]:
         ]  # type: ignore[list-item]
         yield metrics.text().splitlines(), metrics.summary()
         yield from _watch(patch)
+        yield from _observed(patch)
         said: list[str] = []
         check = iter([RailfixError("elsewhere")])
         patch.setattr(console, "ENOUGH_TO_STOP", 3)
@@ -259,6 +262,22 @@ def _console(_: Path) -> Iterator[Iterable[str]]:
             places.take(SimpleNamespace(result=SimpleNamespace(antennas={"front": None})))  # type: ignore[arg-type]
             places.take(SimpleNamespace(result=None))  # type: ignore[arg-type]
             yield [f"place watch has said {said}"]
+
+
+def _observed(patch: pytest.MonkeyPatch) -> Iterator[Iterable[str]]:
+    """Sentences on balises are logged where the line has any, for outputs with rows."""
+    patch.setattr(command, "balise_notes", lambda name, passings: [f"{name}: {passings}"])
+    for balises, part in product((None, object()), ("both", "rows", "message")):
+        said: list[str] = []
+        log = SimpleNamespace(say=said.append, shows_status=False, show=None)
+        inputs = SimpleNamespace(out=None, sensors={}, state=None)
+        engine = SimpleNamespace(processor=SimpleNamespace(balises=balises))
+        hooks, streams = command._hooks(inputs, LiveSettings(), engine, log, None, full="drop")  # type: ignore[arg-type]
+        own = SimpleNamespace(antennas={}, fusion={"front": SimpleNamespace(passings="B1")})
+        assert hooks.observe is not None
+        for found in (own, None):
+            hooks.observe(LiveOutput(message=None, result=found, part=part))  # type: ignore[arg-type]
+        yield [f"balises {balises is not None}, {part}: {said} {hooks.sensed} {hooks.save} {hooks.show} {streams}"]
 
 
 def _watch(patch: pytest.MonkeyPatch) -> Iterator[Iterable[str]]:
@@ -542,6 +561,9 @@ def _streams(_: Path) -> Iterator[Iterable[str]]:
         except StateFormatError as error:
             said = str(error).replace(f"{__name__}.", "")
         yield [f"{type(value).__name__} in a state: {said}"]
+    priors = [{"satellite_prior": dict(pairs)} for pairs in ((("G", 1e-5), ("E", 2e-5)), (("E", 2e-5), ("G", 1e-5)))]
+    heads = [belongs_to({}, {"settings": parse_config({"risk": risk})}, ("front",)) for risk in priors]
+    yield [f"the order of keys in settings changes nothing: {heads[0] == heads[1]}, {list(heads[0])}"]
     for target in (
         "json@-",
         "json",

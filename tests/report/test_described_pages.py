@@ -130,8 +130,14 @@ def _plans() -> Iterator[Chart]:
     yield plots.plan(positions.with_columns(x_m=pl.lit(None, dtype=pl.Float64)))
     gap = pl.concat([positions, positions.with_columns(pl.col("chainage_m") + 500.0)] * 2)
     yield plots.plan(gap)
-    dense = pl.concat([positions] * 2000)
-    yield plots.plan(dense)
+    east = np.arange(7000.0) * 0.01
+    spread = pl.concat([positions.head(1)] * 7000).with_columns(
+        x_m=pl.col("x_m") - east * np.sin(np.radians(135.0)), y_m=pl.col("y_m") + east * np.cos(np.radians(135.0)),
+        conventional_x_m=pl.col("conventional_x_m") - east * np.sin(np.radians(135.0)),
+        conventional_y_m=pl.col("conventional_y_m") + east * np.cos(np.radians(135.0)),
+    )  # fmt: skip
+    later = spread.with_columns((pl.col("time_gpst") + pl.duration(days=1)).cast(pl.Datetime("ns")))
+    yield plots.plan(spread, filtered=later.select("time_gpst", "x_m", "y_m", "z_m"))
 
 
 def _line() -> Iterator[Chart]:
