@@ -433,6 +433,8 @@ def _sessions(_: Path) -> Iterator[Iterable[str]]:
     yield ["queue", *queued[:2], *queued[50:53], *queued[-2:]]
     left = [*_shown(engine, 0, engine.poll(now_ns=END_NS))]
     yield [f"{len(left)} left", left[0], left[-1], str(dict(engine.counts))]
+    slow = _engine("front", "rear", period_s=5.0, pair_wait_s=3.0)
+    yield ["a period of 5 s", *_play(slow, [(0.0, "front", 0.0), (2000.0, "", 0), (3100.0, "", 0)], live=False)]
     yield from _sensed_and_heard()
     yield from _changes()
     yield from _resumed()
