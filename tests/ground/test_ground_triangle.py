@@ -17,12 +17,13 @@ from typer.testing import CliRunner
 import static_monitors
 from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.gnss.observations import Observations
+from railfix.gnss.observations import Observations, concatenate
 from railfix.ground.demo import PLAN_M, TIME, draw_fixes, points_ecef_m
 from railfix.ground.fixes_at_stations import StationStreams, station_fixes
 from railfix.ground.triangle import (
     SIDES,
     STOPPING,
+    Monitor,
     MonitorLimits,
     MonitorState,
     Order,
@@ -36,6 +37,7 @@ from railfix.ground.triangle import (
     release,
 )
 from railfix.io import read_navigation, read_observations, write_observations
+from railfix.pipeline.received import no_navigation
 from railfix.simulate import write_run
 from railfix.simulate.scenario import ReferenceStation
 from railfix.simulate.scenario_file import load_recipe
@@ -376,14 +378,43 @@ def test_a_receiver_without_satellites_gives_no_fix_and_all_three_are_jamming() 
     assert np.isnan(fixes.fixes_m).all()
     triangle = compare_triangle(PLAN_M, fixes.fixes_m, limits=LIMITS, cn0_fallen=fixes.cn0_fallen)
     assert triangle.verdict[0] == TriangleVerdict.JAMMING
-    # one receiver alone is behind: nothing comes out, and the older epochs are dropped when it is back
-    for second in range(23, 26):
-        for k in (0, 1):
-            assert stations.push(k, logs[k][second : second + 1]) is None
-    for k in range(3):
-        fixes = stations.push(k, logs[k][26:27])
-    assert fixes is not None
-    assert stations.counts["incomplete"] == 3
+
+
+def test_epochs_that_a_receiver_lacks_are_late_in_logs_as_in_streams() -> None:
+    """Epochs missing at random: the same epochs count, with the same C/N0; a gap of more than 3 s stops the trains."""
+    random = np.random.default_rng(5)
+    there = random.random((3, 30)) < 0.8
+    there[:, [0, 3, 6, 9, 12, 15, 17, 22]] = True
+    there[1, 18:22] = False  # nothing from the second one for 4 s
+    logs = [
+        concatenate([full_epoch(full_sky(k), second) for second in np.flatnonzero(rows)])
+        for k, rows in enumerate(there)
+    ]
+    log = station_fixes(logs, points_ecef_m(), no_navigation())
+    stations, streamed = StationStreams(points_ecef_m()), []
+    for second in range(30):
+        for k, rows in enumerate(there):
+            if rows[second]:
+                streamed.append(stations.push(k, full_epoch(logs[k], second)))
+    parts = [fixes for fixes in streamed if fixes is not None]
+    np.testing.assert_array_equal(np.concatenate([part.time for part in parts]), log.time)
+    np.testing.assert_array_equal(np.concatenate([part.cn0_fallen for part in parts]), log.cn0_fallen)
+    assert log.cn0_fallen[-1].all()
+    assert len(log.time) == there.all(axis=0).sum()
+    assert stations.counts["incomplete"] == there.any(axis=0).sum() - there.all(axis=0).sum()
+    healthy = replace(log, fixes_m=np.broadcast_to(log.points_m, log.fixes_m.shape))
+    whole = Monitor(limits=LIMITS, times=TIMES).judge(healthy)
+    gap = TIME + np.timedelta64(22, "s")
+    assert {(time, cause) for time, _, cause, _ in whole.orders} == {(gap, TriangleVerdict.MONITOR_LOST)}
+    monitor = Monitor(limits=LIMITS, times=TIMES)
+    pieces = [monitor.judge(replace(part, fixes_m=np.broadcast_to(part.points_m, (1, 3, 2)))) for part in parts]
+    assert [order for piece in pieces for order in piece.orders] == list(whole.orders)
+
+
+def full_epoch(log: Observations, second: int) -> Observations:
+    """The epoch of a log in a second from the start; from 25 s on all C/N0 is 8 dB less."""
+    row = int(np.argmin(np.abs(log.time - TIME - np.timedelta64(second, "s"))))
+    return replace(log[row : row + 1], cn0_dbhz=np.full((1, len(log.satellite)), 37.0 if second >= 25 else 45.0))
 
 
 def full_sky(receiver: int) -> Observations:

@@ -327,7 +327,7 @@ def test_epochs_outside_the_period_of_a_message_have_no_level(tmp_path: Path, fi
 def test_a_period_is_in_gps_time_and_its_absence_is_told(tmp_path: Path) -> None:
     path = tmp_path / "ism.toml"
     path.write_text(MESSAGE, encoding="utf-8")
-    assert "whether it has expired is not known" in read_integrity_support(path).notes(np.empty(0, "datetime64[ns]"))[0]
+    assert "not known whether it has expired" in read_integrity_support(path).notes(np.empty(0, "datetime64[ns]"))[0]
     path.write_text("valid_until = 2026-01-01T00:00:00Z\n" + MESSAGE, encoding="utf-8")
     with pytest.raises(SettingsError, match="GPS time: write them without a time zone"):
         read_integrity_support(path)

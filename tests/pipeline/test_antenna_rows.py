@@ -200,7 +200,7 @@ def test_carrier_phases_of_two_antennas_give_the_results_of_each_alone(carrier: 
 def test_antennas_on_maps_of_other_sigmas_are_refused() -> None:
     _, navigation, paths = _inputs()
     other = paths | {"rear": replace(paths["rear"], sigma_plan_m=2.0 * paths["rear"].sigma_plan_m)}
-    with pytest.raises(ValueError, match="different sigmas of the map"):
+    with pytest.raises(ValueError, match="different map sigmas"):
         make_processor(parse_config({}), navigation, other)
 
 

@@ -199,7 +199,7 @@ def test_integers_without_a_base_station_and_two_kinds_of_corrections_are_refuse
 @pytest.mark.parametrize(
     ("base", "settings", "words"),
     [
-        (True, {}, "a base station subtracts errors of one"),
+        (True, {}, "a base station corrects a single frequency"),
         (False, {"signals": {"G": ["5Q"]}}, "no satellite has a second code"),
         (False, {}, ""),
     ],
@@ -209,7 +209,7 @@ def test_one_frequency_in_place_of_two_is_told(drive: Drive, base: bool, setting
     stations = Stations(base_ecef_m=PLACE if base else None)
     processor = EpochProcessor(config, {"front": drive.trajectory}, navigation=drive.navigation, stations=stations)
     result, _ = processor.process({"front": drive.train[:1]}, base=drive.base[:1] if base else None)
-    told = [note for note in result.notes if note.startswith("frequencies: two asked for, one used: ")]
+    told = [note for note in result.notes if note.startswith("frequencies: two requested, one used: ")]
     assert [note.split(": ")[-1] for note in told] == ([words] if words else [])
 
 

@@ -109,7 +109,7 @@ def test_results_say_what_was_asked_and_used(folder: Path) -> None:
     assert record["settings_asked"]["sbas_band"] == "L5"
     assert record["protection"]["kind"] == "sbas"
     said = " ".join(record["notes"])
-    assert "frequencies: one asked for, ionosphere-free codes used in their place" in said
+    assert "frequencies: one requested, ionosphere-free codes used instead" in said
     assert "SBAS on L5 asked for: corrections of MSAS PRN 137 used" in said
     table = pl.read_parquet(folder / "l5" / "observations.parquet").filter(pl.col("reason") == 0)
     assert set(table["satellite"].str.slice(0, 1)) == {"G", "E", "C"}
@@ -204,13 +204,13 @@ def test_every_state_has_a_reason() -> None:
 
 
 def test_phases_of_one_frequency_are_refused() -> None:
-    with pytest.raises(SettingsError, match="carrier = float takes the phase of one: give carrier = off or smoothed"):
+    with pytest.raises(SettingsError, match="carrier = float uses the phase of one: give carrier = off or smoothed"):
         parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5", "carrier": "float"})
 
 
 def test_a_base_station_of_one_frequency_is_refused() -> None:
     config = parse_config({"sbas": "stream", "sbas_prn": 137, "sbas_band": "L5"})
-    with pytest.raises(SettingsError, match="those of a base station are of one; leave one of the two out"):
+    with pytest.raises(SettingsError, match="a base station has codes of one; leave one of the two out"):
         BaseStation(config, "stream")
 
 

@@ -222,7 +222,7 @@ def test_the_command_says_what_was_asked_and_what_was_used(recording: Recording,
     assert {entry["input"] for entry in record["inputs"]} == {"front", "nav", "track", "sbas"}
     assert record["protection"]["kind"] == "sbas"
     said = " ".join(record["notes"])
-    assert "klobuchar, troposphere: saastamoinen asked for, those of SBAS used in their place" in said
+    assert "klobuchar, troposphere: saastamoinen requested, SBAS models used instead" in said
     assert "best SBAS PRN by usable fast corrections: 137" in said
     assert record["antennas"]["front"]["observations_rejected_by_first_reason"]["sbas_no_correction"] > 1000
     missing = CliRunner().invoke(app, [*command, "--sbas", "nowhere.sbs", "--out", str(tmp_path / "other")])
@@ -279,7 +279,7 @@ def test_positions_from_code_and_phase_have_no_level(recording: Recording) -> No
     config = recording.config(carrier="float")
     processor = make_processor(config, recording.navigation, {"front": recording.line})
     assert processor.process({"front": recording.observations[150:170]})[0].antennas["front"].protection is None
-    assert any("there is none for positions from code and phase together" in note for note in processor.notes)
+    assert any("not available for positions from code and phase together" in note for note in processor.notes)
 
 
 @pytest.mark.requirement("C2", "C3")

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
-from network_around import network_around, write_network
+from network_around import Around, network_around, write_network
 from network_made import made_network, made_run, segment, to_degrees, write_stations
 from railfix.cli import app
 from railfix.core.errors import MismatchError
@@ -33,6 +33,7 @@ from railfix.track.network import Network
 from railfix.track.network_match import match
 from railfix.track.network_read import links_of_ends
 from railfix.track.network_route import find_route
+from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("A10")
 LOOP_M = (250.0, 550.0)
@@ -387,6 +388,27 @@ def test_from_the_geopackage_of_an_operator_and_a_log_of_an_hour_to_positions_wi
     near = pl.read_csv(out / "tracks.csv")
     assert set(near["track"]) >= {f"loop {k}" for k in range(2)}
     run("report", out, "--out", tmp_path / "report.html")
+
+
+def test_with_a_base_station_one_of_three_tracks_is_told_from_the_others(tmp_path: Path) -> None:
+    """A train at rest; the base station is its own rear antenna, 18 m away, which has the same satellite errors."""
+    scenario = load_recipe("demo").scenario(changes={"duration_s": 90.0, "run": {"first_stand_s": 91.0}})
+    files = write_run(scenario.replaced(seed=5), tmp_path / "made")
+    line = Trajectory.from_antenna_path(read_track(files["track"]))
+    right = line.across[line.segment_at(line.arc_m)[0]]
+    tracks = {name: line.at_arc(line.arc_m) + aside * right for name, aside in (("L", -3.6), ("M", 0.0), ("R", 3.6))}
+    net = write_network(Around(tracks=tracks, driven=frozenset({"M"})), tmp_path / "net.gpkg")
+    truth = pl.read_csv(files["truth"]).filter(antenna="rear")
+    place = geodetic_from_ecef(truth.select("x_m", "y_m", "z_m").to_numpy()[0])
+    alone = RunInputs(front=(files["front"],), nav=(files["nav"],), track=(net,), vehicle=files["vehicle"])
+    options = ELLIPSOIDAL.replaced(base_place=",".join(f"{float(v):.9f}" for v in place))
+    least = []
+    for inputs, chosen in ((alone, ELLIPSOIDAL), (alone.replaced(base=(files["rear"],)), options)):
+        found = open_inputs(inputs, chosen, Config())[1].route
+        assert found is not None
+        least.append(float(found.probability.min()) if found.names == ["M"] else 0.0)
+    assert least[0] < 0.99
+    assert least[1] > 1.0 - Config().track_risk
 
 
 @pytest.mark.slow

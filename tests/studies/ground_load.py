@@ -38,6 +38,8 @@ from railfix.io.train_message import encode
 
 CENTRE = {"A": ("127.0.1.1", 4433), "B": ("127.0.2.1", 4433)}
 BEARERS_OF = create_bearers(CENTRE, {"A": "127.0.1.41", "B": "127.0.2.41"})
+#: Trains that connect at a time. A handshake takes several turns of the centre, which last longer with more trains.
+AT_ONCE = 16
 
 
 def line(trains: int) -> tuple[Layout, dict[int, SimulatedTrain]]:
@@ -112,11 +114,12 @@ async def drive(
 ) -> tuple[list[float], int, float]:
     """Return times from report to authority [s], the number of reports, and the processor time of a second.
 
-    A train reports once it is connected, and the next one connects; what is counted begins once all do.
+    Trains connect `AT_ONCE` at a time, and each reports once it is connected; counting begins once all are.
     """
     times: list[float] = []
     reported: dict[tuple[int, int], float] = {}
-    begin, counted = float("inf"), 0
+    begin, counted, connected = float("inf"), 0, 0
+    places = asyncio.Semaphore(AT_ONCE)
 
     def received(number: int, payload: bytes) -> None:
         authority, now = Authority.decode(payload), time.perf_counter()
@@ -124,10 +127,17 @@ async def drive(
         if (sent := reported.pop((number, authority.report), float("-inf"))) > begin:
             times.append(now - sent)
 
-    async def run(number: int, link: TrainLinks) -> None:
-        nonlocal counted
-        due = time.perf_counter()
+    async def run(number: int) -> None:
+        nonlocal connected, counted
+        link = TrainLinks(number, folder / "keys", BEARERS_OF, received=partial(received, number))
+        async with places:
+            await link.start()
+            while len(link.protocols) < len(BEARERS_OF):
+                await asyncio.sleep(0.05)
+        connected += 1
+        due = np.ceil(time.perf_counter()) + number / len(trains)
         while due < begin + seconds:
+            await asyncio.sleep(max(0.0, due - time.perf_counter()))
             now = time.perf_counter()
             trains[number].step(now)
             message = trains[number].message(now)
@@ -135,21 +145,20 @@ async def drive(
             counted += now > begin
             link.send(encode(message))
             due += 1.0
-            await asyncio.sleep(max(0.0, due - time.perf_counter()))
         await asyncio.sleep(2.0)
         await link.stop()
 
-    running = []
-    for number in trains:
-        link = TrainLinks(number, folder / "keys", BEARERS_OF, received=partial(received, number))
-        await link.start()
-        while len(link.protocols) < len(BEARERS_OF):
-            await asyncio.sleep(0.005)
-        running.append(asyncio.create_task(run(number, link)))
+    started = time.perf_counter()
+    running = [asyncio.create_task(run(number)) for number in trains]
+    while connected < len(trains):
+        await asyncio.sleep(0.1)
+    print(f"{len(trains):6d}  connected after {time.perf_counter() - started:.1f} s", flush=True)
     await asyncio.sleep(10.0)
-    begin, spent = time.perf_counter(), processor()
+    begin, spent, own = time.perf_counter(), processor(), time.process_time()
     await asyncio.sleep(seconds)
     spent = (processor() - spent) / (time.perf_counter() - begin)
+    own = (time.process_time() - own) / (time.perf_counter() - begin)
+    print(f"{len(trains):6d}  trains {own:6.3f} s/s", flush=True)
     await asyncio.gather(*running)
     return times, counted, spent
 

@@ -1,15 +1,18 @@
 """Simulated runs of issue 63 on networks that lack the track, or have others beside, above and below it.
 
-``python tests/studies/map_networks.py [--seeds N] [--run] [--only WORD]``: the scenario is `cases/maps/sc.toml` of the
-shared data. Of each network: the share of positions of which the right track is named, where the map has it and where
-it does not, rows on a wrong track with a probability above 0.999, and the largest one; with ``--run`` the rows of
-`railfix run` that are `ok` or `tracking` and those of them on a wrong track, also with a probability above 0.999.
+``python tests/studies/map_networks.py [--seeds N] [--run] [--base] [--only WORD]``: the scenario is
+`cases/maps/sc.toml` of the shared data. Of each network: the share of positions of which the right track is named,
+where the map has it and where it does not, rows on a wrong track with a probability above 0.999, and the largest one;
+with ``--run`` the rows of `railfix run` that are `ok` or `tracking` and those of them on a wrong track, also with a
+probability above 0.999. With ``--base`` these runs have a base station: the rear antenna of a train of the same
+scenario that stands all the time.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +20,14 @@ from typing import Final
 
 import numpy as np
 import polars as pl
+import tomli_w
 from typer.testing import CliRunner
 
 import paths
 from network_around import Around, made, write_network
 from railfix.cli import app
 from railfix.core.arrays import take_rows
-from railfix.core.geodesy import axes_at
+from railfix.core.geodesy import axes_at, geodetic_from_ecef
 from railfix.io import PositionLog
 from railfix.io.logs import read_navigation, read_observations
 from railfix.pipeline.channel_book import ChannelBook
@@ -37,6 +41,7 @@ from railfix.track.vehicle import read_vehicle
 
 SCENARIO: Final = paths.DATA / "cases" / "maps" / "sc.toml"
 END_M: Final = 1e9  #: Beyond the end of the line [m].
+PAST_M: Final = 3.0  #: A position this far past the end of its track is on it: tracks end at a point every 5 m [m].
 #: Tracks that were driven, and from where to where the map has them [m]; elsewhere it lacks the track.
 Driven = Mapping[str, tuple[float, float]]
 _SIGMA: Final = {"sigma_plan_m": "0.1", "sigma_height_m": "0.1"}
@@ -81,7 +86,7 @@ def true_names(driven: Driven, chainage_m: np.ndarray) -> np.ndarray:
     """Return the name of the track driven at chainages, "none" where the map lacks it."""
     names = np.full(len(chainage_m), "none", dtype=object)
     for name, (first, last) in driven.items():
-        names[(chainage_m >= first) & (chainage_m <= last)] = name
+        names[(chainage_m >= first) & (chainage_m <= last + PAST_M)] = name
     return names
 
 
@@ -124,13 +129,25 @@ def chainages(folder: Path, time: np.ndarray) -> np.ndarray:
     return np.interp(time.astype("datetime64[ns]").astype(np.int64), at, truth["chainage_m"].to_numpy())
 
 
-def run_rows(folder: Path, around: Around, driven: Driven) -> Iterator[str]:
+def base_words(folder: Path, seed: int) -> tuple[object, ...]:
+    """Simulate the log of a base station, and return the options that name it."""
+    scenario, out = tomllib.loads(SCENARIO.read_text()), folder / "base"
+    length = float(np.ptp(read_observations(folder / "front.crx.gz").time) / np.timedelta64(1, "s"))
+    scenario |= {"seed": seed, "duration_s": length, "run": {"first_stand_s": length + 1.0}}
+    (folder / "base.toml").write_text(tomli_w.dumps(scenario))
+    assert not invoke("simulate", folder / "base.toml", "--out", out)
+    truth = pl.read_csv(out / "truth.csv.gz", comment_prefix="#").filter(pl.col("antenna") == "rear")
+    place = geodetic_from_ecef(truth.select("x_m", "y_m", "z_m").to_numpy()[0])
+    return ("--base", out / "rear.crx.gz", "--base-place", ",".join(f"{float(v):.9f}" for v in place))
+
+
+def run_rows(folder: Path, around: Around, driven: Driven, base: tuple[object, ...] = ()) -> Iterator[str]:
     """Run a network with the filter, and count passed rows and those on a wrong track."""
     track, out = write_network(around, folder / "net.gpkg"), folder / "out"
     refused = invoke(
         "run", "--front", folder / "front.crx.gz", "--nav", folder / "nav.rnx.gz", "--vehicle", folder / "vehicle.toml",
         "--track", track, "--height-datum", "ellipsoidal", "--plan-sigma", 0.1, "--filter", "track", "--out", out,
-        "--overwrite",
+        "--overwrite", *base,
     )  # fmt: skip
     if refused:
         yield refused[:200]
@@ -155,17 +172,19 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1)
     parser.add_argument("--only", default="")
     parser.add_argument("--run", action="store_true")
+    parser.add_argument("--base", action="store_true")
     given = parser.parse_args()
     for seed in range(given.first, given.first + given.seeds):
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name) / "sim"
             assert not invoke("simulate", SCENARIO, "--seed", seed, "--out", folder)
             line = Trajectory.from_antenna_path(read_track(folder / "track.csv"))
+            base = base_words(folder, seed) if given.base else ()
             for kind, (around, driven) in networks(line).items():
                 if given.only not in kind:
                     continue
                 print(f"{seed:2d} {kind:22s} {matched_row(folder, around, driven)}", flush=True)
-                for text in run_rows(folder, around, driven) if given.run else ():
+                for text in run_rows(folder, around, driven, base) if given.run or given.base else ():
                     print(f"   {kind:22s} {text}", flush=True)
 
 

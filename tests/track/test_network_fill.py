@@ -98,7 +98,7 @@ def test_the_tunnel_of_the_measuring_train_is_filled_as_networkx_finds_it(record
     assert (matched.track < 0).mean() > 0.5
     filled = fill_gaps(net, matched, log, rows_to_fill="off-map")
     assert (filled.track >= 0).all()
-    first, *_, last = np.flatnonzero(~np.isnan(filled.bound_m))
+    first, *_, last = np.flatnonzero(np.isfinite(filled.bound_m))
     before, after = first - 1, last + 1
     places = (
         int(matched.track[before]),

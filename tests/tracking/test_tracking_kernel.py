@@ -377,6 +377,20 @@ def test_unknowns_that_nothing_measures_walk_all_the_time() -> None:
         assert growth[unknown] == pytest.approx(30.0 * walk**2, rel=1e-6)
 
 
+@pytest.mark.requirement("E5")
+def test_a_position_off_in_a_curve_displaces_across() -> None:
+    """10 m of travel on a radius of 573 m: the tangents differ by 10 / 573 to the right, for each metre."""
+    line = Line(bent_line(1800.0, turn_deg=60.0))  # 60 degrees on 600 m
+    vertex, whole = line.records
+    for sigma_m, counted_m in ((4.0, 4.0), (500.0, 30.0)):  # a position is never more uncertain than at a start
+        P = np.diag(np.full(ix.SATELLITES, 1e-8))
+        P[ix.ARC, ix.ARC] = sigma_m**2
+        given = named_tuple(layout.Given, vertex=vertex, line=whole)
+        plain("tracking.model").add_bend(given, (910.0, 900.0), P)
+        assert np.sqrt(P[ix.STEP_RIGHT, ix.STEP_RIGHT]) == pytest.approx(counted_m * 10.0 * np.pi / 1800.0, rel=0.01)
+        assert np.sqrt(P[ix.STEP_UP, ix.STEP_UP]) < 2e-3
+
+
 @pytest.mark.requirement("C6")
 def test_sub_filters_coast_with_the_scale_of_the_map_too() -> None:
     """Lengths along a map that was found to be wrong add as much variance to each of them as to the filter."""

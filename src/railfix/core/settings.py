@@ -69,23 +69,20 @@ class Settings(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _no_switch_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Reject true and false where a number is expected; pydantic takes them for 1 and 0."""
+    def _as_written(cls, value: Any, info: ValidationInfo) -> Any:
+        """Reject true and false for a number, which pydantic takes for 1 and 0; take words or a path for a list.
+
+        Words have commas between them: ``systems=G,E``.
+        """
+        if not isinstance(value, (bool, str, Path)):
+            return value
+        kind = cls.model_fields[str(info.field_name)].annotation
         if isinstance(value, bool):
-            kind = cls.model_fields[str(info.field_name)].annotation
             parts = (kind, *get_args(kind))
             if bool not in parts and (int in parts or float in parts):
                 raise ValueError("a number was expected")
-        return value
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _one_word_for_a_list(cls, value: Any, info: ValidationInfo) -> Any:
-        """Take words with commas between them, or one path, for a list: ``systems=G``."""
-        if get_origin(cls.model_fields[str(info.field_name)].annotation) is tuple:
-            if isinstance(value, str):
-                return tuple(word.strip() for word in value.split(",") if word.strip())
-            return (value,) if isinstance(value, Path) else value
+        elif get_origin(kind) is tuple:
+            return (value,) if isinstance(value, Path) else tuple(filter(None, map(str.strip, value.split(","))))
         return value
 
     def replaced(self, **changes: Any) -> Self:

@@ -66,13 +66,20 @@ def correct_interval(
         return state, f"no such train: {train}"
     if known.stop is None:
         return state, f"train {train} is not stopped: stop it first"
-    if known.runs_by is not None and not lapsed:
-        return state, f"train {train} has not reported that it obeys the order to brake, and may run on: wait for that"
+    if (reason := _may_run(known, lapsed=lapsed)) is not None:
+        return state, reason
     moved = _placed(known, layout, direction=direction, rear_m=rear_m, front_m=front_m, track=track)
     if isinstance(moved, str):
         return state, moved
     moved = replace(moved, stop="its interval was corrected by order")
     return _refused_overlap(state, moved, layout, without_locks(state.points, train))
+
+
+def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
+    """Return that a train may run by an authority on the way to it, None where it cannot."""
+    if known.runs_by is None or lapsed:
+        return None
+    return f"train {known.train} has not reported that it obeys the order to brake, and may run on: wait for that"
 
 
 def enter_train(
@@ -120,16 +127,19 @@ def without_locks(points: Mapping[PointName, PointState], train: int) -> dict[Po
     }
 
 
-def remove_train(state: Interlocking, train: int, layout: Layout) -> Changed:
+def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: bool = False) -> Changed:
     """Return the state without a train, whose sections are occupied by vehicles that report nothing.
 
-    Their detection frees them, or an order of a person who has seen them free.
+    Their detection frees them, or an order of a person who has seen them free. So no authority on the way may let the
+    train run, as in `correct_interval`.
     """
     known = state.trains.get(train)
     if known is None:
         return state, f"no such train: {train}"
     if known.stop is None or not known.standstill:
         return state, f"train {train} is not stopped, or does not stand still"
+    if (reason := _may_run(known, lapsed=lapsed)) is not None:
+        return state, reason
     pieces = pieces_of(known, layout)
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))

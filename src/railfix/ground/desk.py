@@ -133,6 +133,7 @@ class OrderDesk:
         train = number_of(values, "train")
         if isinstance(train, str):
             return state, train
+        lapsed = self.supervision.has_lapsed(train, self.clock())
         if of in ("correct", "enter"):
             ends, track = metres_of(values, "rear_m", "front_m"), number_of(values, "track")
             direction = number_of(values, "direction")
@@ -141,14 +142,13 @@ class OrderDesk:
                     return state, value
             place: Any = {"rear_m": ends[0], "front_m": ends[1], "track": track, "direction": direction}
             if of == "correct":
-                lapsed = self.supervision.has_lapsed(train, self.clock())
                 return correct_interval(state, train, layout, **place, lapsed=lapsed)
             length = metres_of(values, "length_m")
             if isinstance(length, str):
                 return state, length
             return enter_train(state, train, layout, length_m=length[0], **place)
         if of == "remove":
-            return remove_train(state, train, layout)
+            return remove_train(state, train, layout, lapsed=lapsed)
         other = number_of(values, "other")
         if isinstance(other, str):
             return state, other

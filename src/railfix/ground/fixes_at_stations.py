@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Indices, Integers, Masks
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import axes_at
 from railfix.gnss.navigation import Navigation
@@ -46,9 +46,9 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 class StationFixes(FrozenArrays):
     """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights."""
 
-    time: Datetimes  #: Epochs that at least one log has, rounded to 0.1 s; shape (T,).
+    time: Datetimes  #: Epochs that all logs have, rounded to 0.1 s; shape (T,).
     points_m: Floats  #: Known points, east and north of the first; shape (N, 2).
-    fixes_m: Floats  #: NaN where a log has no epoch, or the common satellites are too few; shape (T, N, 2).
+    fixes_m: Floats  #: NaN where the common satellites are too few; shape (T, N, 2).
     n_satellites: Integers  #: Shape (T,).
     cn0_fallen: Masks  #: Shape (T, N).
 
@@ -76,21 +76,15 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
     common = list({satellite: (satellite, signal) for satellite, signal in reversed(common)}.values())[::-1]
     if not common:
         raise MismatchError("the logs have no satellite on the same signal in common; the same signals are needed")
-    epochs = [round_tags(log.time) for log in logs]
-    if not len(reduce(np.intersect1d, epochs)):
-        raise MismatchError("the logs have no epoch in common; logs of the same time are needed")
-    time = reduce(np.union1d, epochs)
-    tags = np.repeat(time[None], len(logs), axis=0)
+    time, rows_of = _common_epochs([log.time for log in logs])
+    tags = np.stack([log.time[rows] for log, rows in zip(logs, rows_of, strict=True)])
     satellite, signal = (np.array(column) for column in zip(*common, strict=True))
     shape = (len(logs), len(time), len(common))
-    code, cn0 = np.full((2, *shape), np.nan)
-    level = np.full((len(time), len(logs)), np.nan)
+    code, cn0 = np.empty((2, *shape))
+    level = np.stack([mean_cn0(log)[rows] for log, rows in zip(logs, rows_of, strict=True)], axis=1)
     for k, (log, chosen, known) in enumerate(zip(logs, channels, names, strict=True)):
-        columns = chosen.columns[[known.index(name) for name in common]]
-        rows = np.searchsorted(time, epochs[k])
-        tags[k, rows] = log.time
-        code[k, rows], cn0[k, rows] = log.code_m[:, columns], log.cn0_dbhz[:, columns]
-        level[rows, k] = mean_cn0(log)
+        cells = np.ix_(rows_of[k], chosen.columns[[known.index(name) for name in common]])
+        code[k], cn0[k] = log.code_m[cells], log.cn0_dbhz[cells]
     frequency = channels[0].frequency_hz[[names[0].index(name) for name in common]]
     klobuchar = known_from_start(config, navigation=navigation).klobuchar
     corrected, sigma, usable, states_of = np.empty(shape), np.empty(shape), np.empty(shape, bool), []
@@ -104,9 +98,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
         bad = states.no_record | states.too_old | states.unhealthy | (seen.elevation_deg < config.elevation.mask_deg)
         usable[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k])
         states_of.append(states)
-    there = np.stack([np.isin(time, epoch) for epoch in epochs])
-    # a receiver without an epoch removes no satellite from the others: their own fixes still count
-    shared = (usable | ~there[:, :, None]).all(axis=0)
+    shared = usable.all(axis=0)
     # with the same weights too, as otherwise a common error moves each fix differently
     square = np.where(usable, sigma**2, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
@@ -166,15 +158,21 @@ def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> St
 
     Whether they are from the same satellites is not known: `n_satellites` is 0. MismatchError: no epoch in common.
     """
-    known = [np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time) for log in logs]
-    epochs = [round_tags(log.time[rows]) for log, rows in zip(logs, known, strict=True)]
-    if not len(reduce(np.intersect1d, epochs)):
-        raise MismatchError("the logs have no epoch in common; positions of the same time are needed")
-    nothing = no_fixes(reduce(np.union1d, epochs), points_ecef_m)
-    fixes, plane = nothing.fixes_m.copy(), axes_at(points_ecef_m[0])[:2]
-    for k, (log, rows) in enumerate(zip(logs, known, strict=True)):
-        fixes[np.searchsorted(nothing.time, epochs[k]), k] = (log.ecef_m[rows] - points_ecef_m[0]) @ plane.T
-    return replace(nothing, fixes_m=fixes)
+    known = [np.flatnonzero(np.isfinite(log.ecef_m[:, 0]) & ~np.isnat(log.time)) for log in logs]
+    time, rows_of = _common_epochs([log.time[rows] for log, rows in zip(logs, known, strict=True)])
+    places = [log.ecef_m[rows[common]] for log, rows, common in zip(logs, known, rows_of, strict=True)]
+    plane = axes_at(points_ecef_m[0])[:2]
+    fixes = (np.stack(places, axis=1) - points_ecef_m[0]) @ plane.T
+    return replace(no_fixes(time, points_ecef_m), fixes_m=fixes)
+
+
+def _common_epochs(times: Sequence[Datetimes]) -> tuple[Datetimes, list[Indices]]:
+    """Return the rounded epochs that all logs have, and their rows in each log; MismatchError without one."""
+    epochs = [round_tags(time) for time in times]
+    common = reduce(np.intersect1d, epochs)
+    if not len(common):
+        raise MismatchError("the logs have no epoch in common; logs of the same time are needed")
+    return common, [np.searchsorted(epoch, common) for epoch in epochs]
 
 
 def no_fixes(time: Datetimes, points_ecef_m: Floats) -> StationFixes:

@@ -272,8 +272,9 @@ class TrainLinks:
                 ) as protocol:
                     self.protocols[name] = protocol
                     self._resend(name)
-                    while not (protocol.ended or protocol.has_expired):
-                        await asyncio.sleep(0.1)
+                    if protocol.peer is not None:
+                        async with asyncio.timeout(protocol.peer.valid_s):
+                            await protocol.wait_closed()
             except (ConnectionError, TimeoutError, OSError):
                 pass  # retried after a time; the meter counts unanswered frames
             self.protocols.pop(name, None)
@@ -401,9 +402,7 @@ class CentreLinks:
             except InputFileError as error:
                 self.alarm = f"{error}; the certificates revoked before are still rejected"
             for protocol in self._peers.values():
-                if protocol.certificate is None:
-                    continue
-                if protocol.has_expired or self._revoked.has(protocol.certificate):
+                if protocol.peer is not None and (protocol.peer.valid_s < 0.0 or self._revoked.has(protocol.peer)):
                     protocol.reject()
             self._note_ending()
             await asyncio.sleep(RETRY_S)
@@ -411,11 +410,12 @@ class CentreLinks:
     def _note_ending(self) -> None:
         """List the certificates that expire within `WARNING_DAYS`: of the centre, and of connected trains."""
         limit = datetime.now(UTC) + timedelta(days=WARNING_DAYS)
-        ends = {p.peer: p.certificate.not_valid_after_utc for p in self._peers.values() if p.peer and p.certificate}
+        peers = [protocol.peer for protocol in self._peers.values() if protocol.peer is not None]
         self._ending = {text: text for text in list_ending(self._keys, "centre")} | {
-            name: f"the certificate of {name} ends on {end.date().isoformat()}; renew it (railfix ground keys --renew)"
-            for name, end in ends.items()
-            if end <= limit
+            peer.name: f"the certificate of {peer.name} ends on {peer.ends.date().isoformat()}; renew it (railfix "
+            "ground keys --renew)"
+            for peer in peers
+            if peer.ends <= limit
         }
 
     def _masquerade(self) -> None:
@@ -434,9 +434,9 @@ class CentreLinks:
         return self._encode(train, FrameKind.ECHO, echo.encode())
 
     def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:
-        kind, _, name_of_train = (protocol.peer or "").partition("-")
-        known = protocol.certificate
-        if kind != "train" or not name_of_train.isdigit() or known is None or self._revoked.has(known):
+        peer = protocol.peer
+        kind, _, name_of_train = ("" if peer is None else peer.name).partition("-")
+        if kind != "train" or not name_of_train.isdigit() or peer is None or self._revoked.has(peer):
             protocol.reject()
             return
         train, now_ns = int(name_of_train), time.monotonic_ns()

@@ -346,6 +346,7 @@ class Monitor:
     def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
         """Process fixes at a clock time, by default each at its tag; return their verdicts with the orders to be sent.
 
+        Fixes that are late after those before stop the trains, in a log as in a stream.
         The cause of an order is the one that the stop has at the end of the fixes: it may have become more exact.
         SettingsError: the sides of the triangle are too short for the limits.
         """
@@ -355,9 +356,9 @@ class Monitor:
             now, verdict = second if now_s is None else now_s, TriangleVerdict(int(triangle.verdict[k]))
             if not self.begun:
                 self.begin(now)
-            receiver = int(triangle.receiver[k])
+            late, receiver = self.silent(now), int(triangle.receiver[k])
             self.state, given = advance(self.state, now, verdict, receiver=receiver, limits=self.times)
-            orders += [(fixes.time[k], order) for order in given]
+            orders += [(fixes.time[k], order) for order in (*late, *given)]
         cause = self.state.cause or TriangleVerdict.HEALTHY
         latched = tuple((time, order, cause, self.state.receiver) for time, order in orders)
         return MonitoredLog(fixes=fixes, triangle=triangle, orders=latched)

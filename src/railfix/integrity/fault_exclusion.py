@@ -1,4 +1,4 @@
-"""Detect and exclude faulty satellites, then find the positions again: RAIM (P1 2.3(4), P4)."""
+"""Detect and exclude faulty satellites, then re-solve the positions: RAIM (P1 2.3(4), P4)."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ class RaimResult(NotebookTable):
     """Detection and exclusion of T epochs."""
 
     outcome: Codes  #: `raim.Outcome`, shape (T,).
-    #: Before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
+    #: Test statistic before any exclusion; in noise variances, or in m^2 with the fixed limit; shape (T,).
     statistic: Floats
     threshold: Floats
-    scale: Floats  #: Noise scale that the residuals are compared with, from earlier epochs; shape (T,).
+    scale: Floats  #: Noise scale for the test of the residuals, from earlier epochs; shape (T,).
     excluded: Masks  #: Shape (T, K).
-    own_error_m: Floats  #: Error of the channels named as faulty against all others; NaN elsewhere; shape (T, K).
-    #: `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN without
-    #: a position, where a fault remains in it, or where the level or RAIM is off; shape (T,).
+    own_error_m: Floats  #: Error of the faulty channels relative to all others; NaN elsewhere; shape (T, K).
+    #: Level by `raim.reliability` of the remaining ranges; infinite where a fault of one range cannot be detected; NaN
+    #: without a position, with a remaining fault, or where the level or RAIM is off; shape (T,).
     protection_level_m: Floats
 
     @property
     def faulty(self) -> Masks:
-        """Epochs with a fault left in the position, shape (T,)."""
+        """Epochs with a remaining fault in the position, shape (T,)."""
         return np.asarray((self.outcome == int(Outcome.INSEPARABLE)) | (self.outcome == int(Outcome.UNRESOLVED)))
 
 
 def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
-    """Return the statistic of the residuals and its threshold (P4) without judging: every outcome is UNTESTABLE."""
+    """Return the statistic of the residuals and its threshold (P4) without a test: every outcome is UNTESTABLE."""
     return _untested(_detect(fix, ranges.redundancy, scale, limits or RaimLimits()), ranges.weight.shape, scale)
 
 
@@ -84,30 +84,30 @@ def exclude_faults(
     """Return ranges and positions without up to two faulty satellites, and the verdict on each epoch (P1 2.3(4), P4).
 
     The sum of squared residuals is tested against chi-square (P4, false alarm 1e-3), or against 100 m^2 (P1 table 6,
-    mode "fixed"). Every satellite, then every pair is left out; a set is excluded where the rest passes and each of its
-    own errors is over the limit. If two satellites disagree with the rest, the rest can be the faulty ones: a pair is
-    not excluded if the epoch's robust fit keeps a range of it. Where a fault stays unresolved, the position is that of
-    the ranges that the robust fit keeps (`RaimResult.faulty`).
+    mode "fixed"). Every satellite, then every pair is left out in turn; a set is excluded where the remaining ranges
+    pass and each range of the set has an error over the limit. If two satellites disagree with the others, the others
+    may be faulty instead: a pair is not excluded if the epoch's robust fit keeps a range of it. Where a fault stays
+    unresolved, the position is computed from the ranges that the robust fit keeps (`RaimResult.faulty`).
 
     Parameters
     ----------
     ranges : Ranges
-        Of `weighted_ranges`.
+        Returned by `weighted_ranges`.
     line : Trajectory, SearchIndex or AntennaRows
     fix : LineFix
-        Positions from these ranges (`fix_on_line`).
+        Positions computed from these ranges (`fix_on_line`).
     scale : array_like, shape (T,) or ()
-        Standard deviation of this receiver's ranges over that of the weights (`noise_scale`).
+        Ratio of the receiver's range standard deviation to the one assumed by the weights (`noise_scale`).
     agreeing : ndarray of bool, shape (T, M), optional
-        Ranges that a robust fit on the line keeps (`robust_fit`), by default computed here.
+        Ranges that a robust fit on the line keeps (`robust_fit`); computed here by default.
     model : LinearModel, optional
-        That of the positions (`linear_model`), by default computed here.
+        Linear model of the positions (`linear_model`); computed here by default.
     limits, fix_limits : RaimLimits, FixLimits, optional
     """
     antennas, limits, fix_limits = AntennaRows.on(line), limits or RaimLimits(), fix_limits or FixLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(ranges),))
     if not (scale > 0.0).all(where=np.isfinite(scale)):
-        raise ValueError("scale must be positive: the standard deviation of the ranges over that of their weights")
+        raise ValueError("scale must be positive: standard deviation of the ranges over the sigmas of the weights")
     test = _detect(fix, ranges.redundancy, scale, limits)
     raim = _untested(test, ranges.weight.shape, scale)
     raim.outcome[test.testable] = Outcome.PASSED
@@ -130,7 +130,7 @@ def exclude_faults(
         return ranges, fix, raim
     ranges = without(ranges, raim.excluded)
     fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
-    # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
+    # Without the fault another section can fit best; the remaining ranges must be consistent on that section, too.
     still = _detect(fix, ranges.redundancy, scale, limits).detected[changed]
     raim.outcome[changed[still]] = Outcome.UNRESOLVED
     return ranges, fix, raim

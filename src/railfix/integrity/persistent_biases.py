@@ -1,4 +1,4 @@
-"""Satellites whose codes are wrong for a minute: found by the mean of their clipped residuals."""
+"""Detection of satellites with persistent code errors by the mean of their clipped residuals."""
 
 from __future__ import annotations
 
@@ -19,53 +19,55 @@ from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 
-#: Least fraction of a range's error that appears in its residual; below it the error is not visible.
+#: Smallest fraction of a range error that must appear in its residual; below it the error is not detectable.
 _LEAST_REDUNDANCY: Final = 0.1
-#: A mean that is smaller is forgotten.
+#: Smaller means are discarded.
 _FORGOTTEN: Final = 1e-12
-#: Remaining degrees of freedom, so that the rest is still checked.
+#: Minimum remaining degrees of freedom, so that the other ranges are still checked.
 _LEAST_FREEDOM: Final = 2
 
 
 class LastingErrorLimits(Settings):
-    """When a satellite is wrong for long."""
+    """Limits of the test for persistent range errors."""
 
-    #: Time constant of the mean of the residuals: a minute, as reflections on a train that moves last less.
+    #: Time constant of the mean residual: one minute, because reflections at a moving train are shorter.
     memory_s: float = Field(default=60.0, gt=0)
-    #: Limit of a residual in standard deviations: of the weights, or of the receiver's noise where that is larger.
+    #: Clipping limit of a residual in standard deviations, of the weights or of the receiver's noise if larger.
     clipped: float = Field(default=2.0, gt=0)
-    #: Mean from which on a satellite is left out, over `clipped`. On recordings in cities without a fault the largest
-    #: is 0.59, but for satellites seen by reflection alone; 20 m on one satellite reach it after 75 to 115 s.
+    #: Mean, as a fraction of `clipped`, from which on a satellite is left out. On fault-free city recordings the
+    #: largest mean is 0.59, except for satellites received by reflection only; an error of 20 m on one satellite
+    #: reaches the limit after 75 to 115 s.
     share: float = Field(default=0.62, gt=0, le=1)
-    most_satellites: int = Field(default=2, ge=0, le=4)  #: Satellites left out at a time; 0: none.
+    #: Largest number of satellites left out at a time; 0 switches the test off.
+    most_satellites: int = Field(default=2, ge=0, le=4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LastingErrorState:
-    """Means of the residuals after the last epoch."""
+    """Mean residuals after the last epoch."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: [windows].
+    age: float = 0.0  #: Age, in windows.
     channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
-    #: Sums behind the noise of the ranges, those in error included (`NoiseState`); shape (2,).
+    #: Sums for the noise of the ranges, faulty ranges included (`NoiseState`); shape (2,).
     noise: Floats = field(default_factory=lambda: np.zeros(2))
-    #: In turn: mean square of the residuals of all ranges, without the worst satellite, and so on; shape (S, P).
+    #: Mean residuals of all ranges, then without the worst satellite, and so on; shape (S, P).
     sums: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
 
 class BiasLimits(NamedTuple):
-    """Limits of the means, and of the positions that are found again."""
+    """Limits of the means, and of the re-solved positions."""
 
     lasting: LastingErrorLimits = LastingErrorLimits()
     fix: FixLimits = FixLimits()
 
 
 class PersistentBiases(NamedTuple):
-    """Positions without the satellites that are wrong for long, T epochs."""
+    """Positions of T epochs without satellites with persistent errors."""
 
     ranges: Ranges
     fix: LineFix
-    model: LinearModel  #: Of the positions.
+    model: LinearModel  #: Linear model of the positions.
     rejected: Masks  #: Shape (T, K).
 
 
@@ -79,10 +81,10 @@ def reject_persistent_biases(
     states: Sequence[LastingErrorState],
     limits: BiasLimits,
 ) -> tuple[PersistentBiases, list[LastingErrorState]]:
-    """Return ranges, positions and model without satellites whose codes are wrong for a minute, and the new states.
+    """Return ranges, positions and model without satellites with persistent code errors, and the new states.
 
-    P4 tests single epochs, which an error of twice the noise passes: here the clipped residuals are averaged over
-    time. The worst satellite is left out, then the worst of the rest, whose residuals are then those without the first.
+    P4 tests single epochs, which an error of twice the noise passes; here the clipped residuals are averaged over time.
+    The worst satellite is left out, then the worst of the remaining ones, by the residuals without the first.
 
     Parameters
     ----------
@@ -134,7 +136,7 @@ def reject_persistent_biases(
 
 
 def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
-    """Return the used range of each epoch whose mean is the largest, where it is beyond the limit, shape (T, K)."""
+    """Return the used range with the largest mean of each epoch, if beyond the limit, as a mask of shape (T, K)."""
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)
@@ -148,7 +150,7 @@ def _is_remembered(state: LastingErrorState) -> Masks:
 
 
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
-    """Return the residuals over their standard deviations, clipped, over `clipped`; 0 where nothing checks a range."""
+    """Return the normalised, clipped residuals as fractions of `clipped`; 0 for unchecked ranges."""
     checked = model.redundancy > _LEAST_REDUNDANCY
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
     own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]

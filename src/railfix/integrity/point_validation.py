@@ -1,4 +1,4 @@
-"""Validation of conventional positions, as in single-point programs (RTKLIB: `valsol` of pntpos.c)."""
+"""Validation of conventional single-point positions (RTKLIB: `valsol` of pntpos.c)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from railfix.positioning.range_arrays import Ranges
 class PointStatus(IntEnum):
     """Result of the validation of a conventional position."""
 
-    #: Both checks passed; residuals without a redundant range pass.
+    #: Both checks passed; without a redundant range the residuals pass.
     VALID = 0
     #: No position.
     NO_POSITION = 1
@@ -33,9 +33,10 @@ def _of_residuals(limits: SinglePointLimits) -> RaimLimits:
 
 
 def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
-    """Return the `PointStatus` of each conventional position (RTKLIB: `valsol`), a clock per constellation, shape (T,).
+    """Return the `PointStatus` of conventional positions with one clock per constellation (RTKLIB: `valsol`), shape
+    (T,).
 
-    `noise_scale`: standard deviation of this receiver's ranges over the sigmas of the weights, shape (T,).
+    `noise_scale` is the ratio of the receiver's range standard deviation to the sigmas of the weights, shape (T,).
     """
     test = detect(
         point.wsse, point.residual_m, ranges.space_redundancy, scale=noise_scale,
@@ -49,8 +50,8 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
 
 
 def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
-    """Return the position dilution of precision (RTKLIB: `dops`), with a clock per constellation, shape (T,).
+    """Return the position dilution of precision with one clock per constellation (RTKLIB: `dops`), shape (T,).
 
-    Root of the trace of the position's covariance for ranges of unit sigma; NaN where the geometry is singular.
+    It is the root of the trace of the position covariance for ranges of unit sigma; NaN where the geometry is singular.
     """
     return kernels.ranges.dilutions(ranges.arrays, kernel_array(ecef_m))

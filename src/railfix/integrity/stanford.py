@@ -1,6 +1,6 @@
-"""Stanford diagram on the along-track axis: the error against the level that was to bound it.
+"""Stanford diagram along the track: position error against protection level.
 
-Every epoch is in one region. With an alarm limit AL, the level PL and the absolute error:
+Every epoch belongs to one region, defined by the alarm limit AL, the level PL and the absolute error:
 
 - no position: neither is there;
 - unjudged: a level, but no reference to take an error from;
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
 _BINS: Final = 100  #: Bins of an axis, up to twice the alarm limit.
-_GAP: Final = 1.5  #: Epochs farther apart than this many usual intervals are separated by a gap.
+_GAP: Final = 1.5  #: Number of usual intervals from which on two epochs are separated by a gap.
 
 
 class Region(IntEnum):
@@ -41,12 +41,12 @@ class Region(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Continuity:
-    """Probability that an available epoch stays available? Windows that start at an available epoch."""
+    """Continuity: fraction of the windows starting at an available epoch that stay available."""
 
     window_s: float
-    windows: int  #: Windows that the run covers to their end.
-    kept: int  #: Those in which every epoch is available and none is missing.
-    probability: float  #: kept / windows; NaN without windows.
+    windows: int  #: Number of complete windows.
+    kept: int  #: Number of windows in which every epoch is available and none is missing.
+    probability: float  #: Fraction kept / windows; NaN without windows.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +55,12 @@ class Stanford:
 
     alarm_limit_m: float
     region: Codes  #: `Region`, shape (T,).
-    counts: dict[Region, int]  #: Epochs of each region; they add up to T.
-    available_rate: float  #: Epochs with a level within the alarm limit, judged or not / T.
+    counts: dict[Region, int]  #: Number of epochs in each region; the sum is T.
+    available_rate: float  #: Fraction of the T epochs with a level within the alarm limit, with or without a reference.
     beyond: Indices  #: Indices of the epochs whose error is over the level, the largest excess first.
-    continuity: tuple[Continuity, ...]  #: One a window.
-    #: Blocks of time with epochs, and of these those with an error over the level: errors stay alike for tens of
-    #: seconds, so that a block is worth an epoch of statistics.
+    continuity: tuple[Continuity, ...]  #: One entry per window length.
+    #: Number of time blocks with epochs, and of blocks with an error over the level. Errors are correlated over tens of
+    #: seconds, so that a block counts as one independent sample.
     blocks: int
     misleading_blocks: int
     #: Edges of the bins of error and level; the upper edge of the last one is infinite; shape (N + 1,).
@@ -77,26 +77,26 @@ def stanford(
     windows_s: Sequence[float] = (15.0, 60.0),
     block_s: float = 60.0,
 ) -> Stanford:
-    """Sort epochs into the diagram.
+    """Assign epochs to the regions of the diagram.
 
     Parameters
     ----------
     time : ndarray of datetime64, shape (T,)
-        Ascending; every epoch of the run, with a position or without.
+        Ascending times of every epoch of the run, with or without a position.
     error_m : array_like, shape (T,) [m]
-        Along the track, signed or not; NaN without a position or no reference.
+        Error along the track, signed or absolute; NaN without a position or without a reference.
     level_m : array_like, shape (T,) [m]
-        Infinite where no error can be excluded, NaN without a position. An error without a level counts as one
-        with an infinite level.
+        Protection level, infinite where no error can be excluded, NaN without a position. An error without a level
+        counts as having an infinite level.
     windows_s : sequence of float [s]
-        Lengths of the windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next.
+        Lengths of the continuity windows: 15 s as for an approach in aviation; one minute from one station to the next.
     block_s : float [s]
         Length of the blocks, from the first epoch.
     """
     time = time.astype("datetime64[ns]")
     error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
     if not len(time) == len(error) == len(level):
-        raise ValueError(f"one time, error and level an epoch: got {len(time)}, {len(error)} and {len(level)}")
+        raise ValueError(f"one time, error and level per epoch needed, got {len(time)}, {len(error)} and {len(level)}")
     if (np.diff(time) <= np.timedelta64(0, "ns")).any():
         raise ValueError("times must ascend")
     if (level < 0).any():
@@ -142,7 +142,9 @@ def _nanoseconds(value_s: float) -> np.timedelta64:
 
 
 def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuity:
-    """Return windows ``[t, t + window]`` from each available epoch; a gap in the times breaks one."""
+    """Return the continuity of windows ``[t, t + window]`` from each available epoch; a gap in the times breaks a
+    window.
+    """
     if len(time) < 2:
         return Continuity(window_s=window_s, windows=0, kept=0, probability=np.nan)
     step = np.diff(time)
@@ -151,7 +153,7 @@ def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuit
     until = time + _nanoseconds(window_s)
     started = available & (until <= time[-1])
     last = np.searchsorted(time, until, side="right") - 1
-    # A window that ends inside a gap is broken too: the next epoch is across it.
+    # A window that ends inside a gap is broken too, because the next epoch is after the gap.
     ends = np.append(across, False)[last] & (until > time[last])
     kept = started & (broken[last] == broken) & ~ends
     windows = int(started.sum())

@@ -1,4 +1,4 @@
-"""Compiled functions of arrays, with numba: the filter along the track, and the stages of single epochs.
+"""Functions on arrays, compiled with numba: the filter along the track, and the single-epoch stages.
 
 A module of this package is imported at the first use of one of its functions (``kernels.ranges.misfits``): numba takes
 half a second to load. They operate on arrays and numbers only, and import nothing of railfix except this package and
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["hypotheses", "level", "model", "off_tangent", "ranges", "reading", "robust", "screens", "search", "windows"]
 
-#: Modules with kernels that the filter calls.
+#: Modules whose kernels the filter calls.
 _FILTER_MODULES: Final = ("tracking.recursion", "tracking.velocity")
 
 
@@ -28,7 +28,7 @@ def __getattr__(name: str) -> Any:
 
 
 def numba_version() -> str:
-    """Return numba with its version."""
+    """Return the name and version of numba."""
     return f"numba {version('numba')}"
 
 
@@ -40,16 +40,18 @@ def _import_all() -> Any:
 
 
 def load() -> None:
-    """Load the code of all kernels, so that none is loaded while epochs wait."""
+    """Load the machine code of all kernels, so that no epoch is delayed by loading."""
     _import_all().load()
 
 
 def is_compiled() -> bool:
-    """Return whether this machine has the code of all kernels; others are compiled at their first call."""
+    """Return whether this machine has the machine code of all kernels; missing kernels are compiled at their first
+    call.
+    """
     compiled: bool = _import_all().is_compiled()
     return compiled
 
 
 def record_compiled() -> None:
-    """Note that this process has compiled all kernels, and for which types of arguments."""
+    """Record that this process has compiled all kernels, and their argument types."""
     _import_all().record_compiled()

@@ -1,8 +1,8 @@
-"""Compilation with numba; the machine code is kept on disk.
+"""Compilation with numba, with the machine code cached on disk.
 
-It is stored in the folder of the source, or in the user's cache folder where that is not writable, or in
-``NUMBA_CACHE_DIR``. numba compiles a function again when its file changes, and does not check the files of the
-functions that it calls: `_remove_outdated` does.
+The cache is in the source folder, in the user's cache folder if the source folder is not writable, or in
+``NUMBA_CACHE_DIR``. numba recompiles a function when its own file changes, but does not check the files of the
+functions that it calls; `_remove_outdated` does.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from railfix.core.errors import SettingsError
 from railfix.core.staged_files import stage_file
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-#: Compiled functions of the modules that are imported.
+#: Compiled functions of the imported modules.
 COMPILED: Final[list[Any]] = []
-#: Divisions by zero give infinities and NaN as numpy's do; products are added without a rounding between.
+#: Divisions by zero give infinities and NaN, as in numpy; multiplications and additions may be fused.
 OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 _PACKAGE: Final = Path(__file__).parent
 
@@ -38,17 +38,17 @@ def is_plain() -> bool:
 
 
 def kernel(function: Function) -> Function:
-    """Compile a function of arrays at its first call, without the interpreter lock, and keep the code on disk.
+    """Compile a function on arrays at its first call, without the interpreter lock, and cache the machine code on disk.
 
     With ``NUMBA_DISABLE_JIT=1`` it stays plain Python.
 
     Raises
     ------
     SettingsError
-        No folder for the code can be written.
+        No cache folder is writable.
     """
     if is_plain():
-        # Machine code does not warn: integers that wrap around, divisions by zero and NaN are meant.
+        # Integer overflow, divisions by zero and NaN are intended, and machine code does not warn about them.
         return np.errstate(all="ignore")(function)
     try:
         compiled = numba.njit(cache=True, **OPTIONS)(function)
@@ -63,7 +63,7 @@ def kernel(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """Compile a function that kernels alone call: it becomes part of their code."""
+    """Compile a function that only kernels call; it is inlined into them."""
     if is_plain():
         return function
     return cast(Function, numba.njit(**OPTIONS)(function))
@@ -71,7 +71,7 @@ def inner(function: Function) -> Function:
 
 @cache
 def _files(package: Path, module: str) -> set[Path]:
-    """Return the file of a module of this package, or of all modules of a room, with those of all its imports."""
+    """Return the files of a module of this package, or of all modules of a subpackage, and of all their imports."""
     path = package / f"{module.replace('.', '/')}.py"
     if not path.exists():
         return set(path.with_suffix("").glob("*.py"))
@@ -81,7 +81,7 @@ def _files(package: Path, module: str) -> set[Path]:
 
 @cache
 def _tuples(package: Path) -> bytes:
-    """Return the named tuples of all of railfix by their files: numba cannot read code for one that has moved."""
+    """Return all named tuples of railfix by file: numba cannot load cached code for a tuple class that has moved."""
     named = re.compile(rb"^class \w+\(NamedTuple\)", re.MULTILINE)
     files = ((path, named.findall(path.read_bytes())) for path in sorted(package.parent.rglob("*.py")))
     return b"\n".join(
@@ -91,14 +91,14 @@ def _tuples(package: Path) -> bytes:
 
 @cache
 def compute_stamp(package: Path, module: str) -> str:
-    """Return the hash of all that the code of a module depends on: its files, the constants, the names of tuples."""
+    """Return the hash of everything that a module's machine code depends on: its files, constants and tuple names."""
     files = [*sorted(_files(package, module)), package.parent / "core" / "constants.py"]
     return hashlib.sha256(b"".join([*(path.read_bytes() for path in files), _tuples(package)])).hexdigest()
 
 
 @cache
 def _remove_outdated(folder: Path, module: str) -> None:
-    """Remove the code of a module from a folder of numba's where it is that of other sources."""
+    """Remove a module's machine code from a numba cache folder if it was compiled from other sources."""
     stamp, file = compute_stamp(_PACKAGE, module), folder / f"{module}.sha256"
     if file.exists() and file.read_text(encoding="ascii") == stamp:
         return
@@ -111,7 +111,7 @@ def _remove_outdated(folder: Path, module: str) -> None:
 
 @cache
 def announce_compilation() -> None:
-    """Say on a terminal, once, that kernels are compiled."""
+    """Report once, on a terminal, that kernels are being compiled."""
     if sys.stderr.isatty() and multiprocessing.parent_process() is None:
         sys.stderr.write("compiling for this processor, once: about a minute\n")
 
@@ -121,7 +121,7 @@ def _name(function: Any) -> str:
 
 
 def _record_file() -> Path:
-    """Return the file with the types of arguments that all kernels of these sources have been compiled for."""
+    """Return the file that records the argument types for which all kernels of these sources have been compiled."""
     modules = sorted({function.py_func.__module__.removeprefix("railfix.kernels.") for function in COMPILED})
     stamps = [compute_stamp(_PACKAGE, module) for module in modules]
     name = hashlib.sha256("".join([*stamps, numba.__version__, sys.version]).encode()).hexdigest()
@@ -129,8 +129,8 @@ def _record_file() -> Path:
 
 
 def record_compiled() -> None:
-    """Write down for which types of arguments the kernels have been compiled in this process."""
-    if not COMPILED:  # they stay plain Python
+    """Record the argument types for which this process has compiled the kernels."""
+    if not COMPILED:  # the kernels stay plain Python
         return
     file = _record_file()
     for earlier in file.parent.glob("compiled-*.pickle"):
@@ -145,7 +145,7 @@ def is_compiled() -> bool:
 
 
 def load() -> None:
-    """Load the code of all kernels; where this machine has none they are compiled at their first call."""
+    """Load the machine code of all kernels; kernels without it are compiled at their first call."""
     if not COMPILED or not is_compiled():
         return
     types = pickle.loads(_record_file().read_bytes())

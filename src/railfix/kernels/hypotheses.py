@@ -27,7 +27,7 @@ from railfix.kernels.level_equations import (
 
 
 class _Tails(NamedTuple):
-    """Offset and sigma of the error, and weight, of all hypotheses (T, K); separations over the threshold (K,)."""
+    """Error offset, sigma and weight of all hypotheses (T, K); ratio of separation to threshold (K,)."""
 
     offset: Floats
     sigma: Floats
@@ -36,12 +36,12 @@ class _Tails(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Inputs of one base of hypotheses: whether each channel belongs to it, and the remainder without it.
+    """Inputs of one base of hypotheses: channel membership, and the remaining system without the base.
 
-    `others` has priors of the rest (n,), `removed` the effect of the base (4,), `own` work space (n,).
-    By depth, for sets of channels left out in sequence: the system `reduced` (2, n + 4, n), the part `taken` (3, 4),
-    whether nothing bounds a fault (`undetectable`), the next channel (`start`), where its sets are written (`place`),
-    and the product of the priors; shape (3,).
+    `others` has priors of the rest (n,), `removed` the effect of the base (4,), `own` work space (n,). By depth, for
+    sets of channels left out in sequence: the system `reduced` (2, n + 4, n), the part `taken` (3, 4), whether a fault
+    is `undetectable`, the next channel (`start`), the output index of its sets (`place`), and the product of the
+    priors; shape (3,).
     """
 
     member: Masks
@@ -59,7 +59,7 @@ class _Work(NamedTuple):
 
 
 class _Sets(NamedTuple):
-    """Offset, sigma and separation over its threshold of sets of left-out channels, written in sequence."""
+    """Offset, sigma and ratio of separation to threshold of the sets of excluded channels, in sequence."""
 
     offset: Floats
     sigma: Floats
@@ -68,10 +68,9 @@ class _Sets(NamedTuple):
 
 @inner
 def _downdate(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, removed: Floats) -> bool:
-    """Leave out channels in sequence; return whether nothing bounds a fault of them.
+    """Leave out channels in sequence; return whether a fault of these channels is undetectable.
 
-    `removed` becomes their effect; `work` has the rows of the remainder, for all channels if `every` is
-    set.
+    `removed` gets their effect; `work` has the rows of the remaining system, for all channels if `every` is set.
     """
     n, undetectable = rows.shape[1], False
     for i in range(n + 4):
@@ -110,7 +109,7 @@ def _with_each_later(
 ) -> None:
     """Write the sets of channel i and one after it, left out together from the system `rows`.
 
-    `removed` and `undetectable` are those of the channels left out before.
+    `removed` and `undetectable` describe the channels left out before.
     """
     n, own, limit = rows.shape[1], ranges.own, common[LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
@@ -140,14 +139,14 @@ def _with_each_later(
 
 @kernel
 def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Floats, Floats, Floats]:
-    """Return the tails of all hypotheses of a block of epochs.
+    """Return the error distribution of all hypotheses for a block of epochs.
 
     Returns
     -------
     channel : ndarray of int, shape (T, n)
         Channels in use, adjacent.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
-        As `tails.solve_level` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), prior.
+        Arguments of `tails.solve_level`: threshold plus bias, sigma (infinite for undetectable faults), prior.
     separation : ndarray, shape (T,)
         `ProtectionLevel.separation`.
     """
@@ -186,7 +185,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
 
 @inner
 def _new_work(n: int) -> _Work:
-    """Return room for the hypotheses of a base."""
+    """Allocate the work arrays for the hypotheses of one base."""
     return _Work(
         np.empty(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), np.empty(n), np.zeros(4), np.empty(n),
         np.empty((n + 4, n)), np.empty((2, n + 4, n)), np.zeros((3, 4)), np.zeros(3, dtype=np.bool_),
@@ -205,7 +204,7 @@ def _write_base(
     work: _Work,
     tails: _Tails,
 ) -> None:
-    """Write the hypotheses of a base at epoch and base `at`: its shared fault alone, and with channels in addition."""
+    """Write the hypotheses of a base at index `at` (epoch, base): its shared fault alone and with further channels."""
     (t, base), n, rows = at, len(channels.root), system.rows
     order, first, prior = asked.order[t, base], asked.first[base], asked.shared_prior[t, base]
     some = False
@@ -221,7 +220,7 @@ def _write_base(
         rows = work.rows
     more = of_ranges(rows[n], ranges) if ranges.any else (0.0, 0.0, 0.0)
     _write_one(t, first[0], work.removed, more, undetectable, system.common, tails)
-    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # noise passes on either side
+    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # two-sided false alarm
     if order > 0:
         _write_singles(t, first[1], System(rows, system.common), ranges, undetectable, work, tails)
         for i in range(n):
@@ -242,7 +241,7 @@ def _write_one(
     common: Floats,
     tails: _Tails,
 ) -> None:
-    """Write a hypothesis by its effect; unbounded where it is undetectable."""
+    """Write a hypothesis from its effect; its error is unbounded if it is undetectable."""
     tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = separate(
         removed[0], removed[1], removed[2], removed[3], more, common
     )
@@ -254,7 +253,7 @@ def _write_one(
 def _write_singles(
     t: int, at: int, system: System, ranges: RangeErrors, undetectable: bool, work: _Work, tails: _Tails
 ) -> None:
-    """Write the hypotheses of each channel left out of the system, from `at` on."""
+    """Write the hypotheses that leave out one channel each, from index `at` on."""
     rows, n, limit, removed, whole = system.rows, len(work.own), system.common[LIMIT], np.empty(4), (0.0, 0.0, 0.0)
     if ranges.any:
         whole = of_ranges(rows[n], ranges)
@@ -274,7 +273,7 @@ def _write_singles(
 
 @inner
 def _write_together(t: int, order: int, system: System, ranges: RangeErrors, work: _Work, tails: _Tails) -> None:
-    """Write sets of two and more: all but the last channel are left out in sequence, `depth` so far."""
+    """Write sets of two and more channels: all but the last are left out in sequence, `depth` of them so far."""
     n, limit, depth = len(work.own), system.common[LIMIT], 0
     while depth >= 0:
         i = work.start[depth]

@@ -1,4 +1,4 @@
-"""The level at which Gaussian tails of many hypotheses sum to a risk."""
+"""Protection level at which the Gaussian tails of many hypotheses sum to the allowed risk."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import inner, kernel
 
-#: Fraction of the level up to which a step is exact to a millionth of it: the last one.
+#: Relative step size below which the next level is exact to 1e-6; that step is the last.
 _CLOSE = 5e-4
-#: Steps at most; a level that they do not come close to stays at the lowest one found within the risk.
+#: Largest number of steps; if they do not converge, the lowest level found within the risk is used.
 _STEPS = 60
-#: From this step on every other one halves the bracket: steps between two points would continue for ever.
+#: From this step on every second step bisects the bracket, as secant steps could cycle for ever.
 _HALVING = 8
 #: Fraction of the risk that remains unused.
 _AIM = 0.002
-#: Fraction of the largest part within which two hypotheses require the same level: the first is named.
+#: Relative difference below which two hypotheses require the same level; the first of them is reported.
 _ALIKE = 1e-9
 #: Q(x) is the density at x over ``(1 - a) x + a sqrt(x^2 + b)`` to 0.3 %, x >= 0 (Borjesson and Sundberg 1979).
 _MILLS = (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 _ROOT_HALF = math.sqrt(0.5)
-#: erfc(x) = exp(-x^2) P(x) / Q(x) for x >= 0, within 2e-8 of itself (Cephes; made for 1 to 8, where it is exact).
+#: erfc(x) = exp(-x^2) P(x) / Q(x) for x >= 0, with a relative error below 2e-8 (Cephes; exact in its range of 1 to 8).
 _P = (
     2.46196981473530512524e-10, 5.64189564831068821977e-1, 7.46321056442269912687, 4.86371970985681366614e1,
     1.96520832956077098242e2, 5.26445194995477358631e2, 9.34528527171957607540e2, 1.02755188689515710272e3,
@@ -35,7 +35,8 @@ _Q = (
     1.0, 1.32281951154744992508e1, 8.67072140885989742329e1, 3.54937778887819891062e2, 9.75708501743205489753e2,
     1.82390916687909736289e3, 2.24633760818710981792e3, 1.65666309194161350182e3, 5.57535340817727675546e2,
 )  # fmt: skip
-#: exp(x) = 2^k exp(r), |r| <= ln 2 / 2: log2(e), ln 2 in two parts, and the number whose last bits hold k + 1023.
+#: exp(x) = 2^k exp(r), |r| <= ln 2 / 2: log2(e), ln 2 in two parts, and the constant that shifts k + 1023 into the
+#: lowest bits.
 _LOG2_E, _LN2_HIGH, _LN2_LOW = 1.4426950408889634, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _SHIFT = 6755399441055744.0 + 1023.0
 _E = tuple(1.0 / math.factorial(k) for k in range(12))
@@ -43,7 +44,7 @@ _E = tuple(1.0 / math.factorial(k) for k in range(12))
 
 @inner
 def _mills(x: float) -> float:
-    """Return the Gaussian tail beyond x >= 0 over the density there."""
+    """Return the Mills ratio at x >= 0: Gaussian tail over density."""
     y = x * _ROOT_HALF
     p = (((((((_P[0] * y + _P[1]) * y + _P[2]) * y + _P[3]) * y + _P[4]) * y + _P[5]) * y + _P[6]) * y + _P[7]) * y
     q = (((((((_Q[0] * y + _Q[1]) * y + _Q[2]) * y + _Q[3]) * y + _Q[4]) * y + _Q[5]) * y + _Q[6]) * y + _Q[7]) * y
@@ -52,7 +53,7 @@ def _mills(x: float) -> float:
 
 @inner
 def _bells(z: Floats, bits: Indices, out: Floats) -> None:
-    """Write exp(-z^2/2) into `out`; `bits` is a view of another array of the same length. Loops of vectors."""
+    """Write exp(-z^2/2) into `out`; `bits` is a view of another array of the same length. The loops are vectorised."""
     scratch = bits.view(np.float64)
     for m in range(len(z)):
         u = max(-0.5 * z[m] * z[m], -700.0)
@@ -70,7 +71,7 @@ def _bells(z: Floats, bits: Indices, out: Floats) -> None:
 
 @inner
 def _quantile(probability: float) -> float:
-    """Return the sigmas that noise exceeds on one side with a probability, as `one_sided_k`."""
+    """Return the one-sided normal quantile of a probability, as `one_sided_k`."""
     if probability >= 1.0:
         return -np.inf
     if not probability > 0.0:
@@ -89,8 +90,8 @@ def _quantile(probability: float) -> float:
 
 
 class _Room(NamedTuple):
-    """Work space of an epoch: of each hypothesis the inverse of sigma, the weight where a fault of it is checked, the
-    level that it requires, the sigmas to the level, exp(-z^2/2), and the tail; shape (K,); the tails of each kind.
+    """Work space of an epoch. For each hypothesis, shape (K,): inverse sigma, weight if its fault is checked, required
+    level, sigmas to the level, exp(-z^2/2) and tail. For each kind: the sum of the tails.
     """
 
     inverse: Floats
@@ -107,32 +108,33 @@ class _Room(NamedTuple):
 def solve_level(
     offset_m: Floats, sigma_m: Floats, weight: Floats, bounds: Indices, share: Floats, reserved: Floats
 ) -> tuple[Floats, Codes, Floats, Floats, Indices]:
-    """Find the level at which the tails of all hypotheses keep within the risk: ``weight Q((L - offset)/sigma)`` each.
+    """Find the level at which the summed tails of all hypotheses, ``weight Q((L - offset)/sigma)``, stay within the
+    risk.
 
-    Undetectable faults use the risk with their full weight; the rest of it is for checked ones. The largest
-    part is a level within the risk, as the risk is divided among the parts. From there it is lowered as far as the sum
-    of the tails allows, to 0.998 of the risk.
+    Undetectable faults use the risk with their full weight; the remaining risk is for checked faults. The largest part
+    is a level within the risk, because the risk is divided among the parts. From there the level is lowered until the
+    sum of the tails reaches 0.998 of the risk.
 
     Parameters
     ----------
     offset_m, sigma_m, weight : ndarray, shape (T, K)
-        Hypotheses, kind after kind; `sigma_m` is infinite where nothing bounds a fault, `weight` 0 for none.
+        Hypotheses, grouped by kind; `sigma_m` is infinite for undetectable faults, `weight` is 0 for unused entries.
     bounds : ndarray of int, shape (kinds + 1,)
-        First hypothesis of each kind, and K.
+        Index of the first hypothesis of each kind, followed by K.
     share : ndarray, shape (T, kinds)
         Risk that each kind may use.
     reserved : ndarray, shape (T,)
-        Risk subtracted from their sum beforehand.
+        Risk subtracted from the sum of `share` beforehand.
 
     Returns
     -------
     level_m : ndarray, shape (T,) [m]
     spender : ndarray of int8, shape (T,)
-        The kind that uses up most of the risk at that level.
+        Kind that uses most of the risk at that level.
     part_m, k : ndarray, shape (T, kinds)
-        The largest ``offset + k sigma`` of a kind; 0 where its hypotheses fit into its share unchecked, then k is -inf.
+        Largest ``offset + k sigma`` of each kind; 0, with k = -inf, where its hypotheses fit into its share unchecked.
     worst : ndarray of int, shape (T, kinds)
-        The hypothesis that requires it, counted within its kind; -1: none.
+        Hypothesis that requires this part, counted within its kind; -1 if there is none.
     """
     (epochs, width), kinds = weight.shape, len(bounds) - 1
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
@@ -166,7 +168,7 @@ def solve_level(
 def _require(
     offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
 ) -> tuple[float, float, float, int]:
-    """Return the remainder of a kind's part of the risk, its k, the largest required level, and its hypothesis."""
+    """Return the unused risk of a kind, its k, the largest required level, and the hypothesis that requires it."""
     total, whole = 0.0, 0.0
     for m in range(len(prior)):
         total += checked[m]
@@ -193,7 +195,9 @@ def _require(
 
 @inner
 def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _Room) -> tuple[float, int]:
-    """Return the level whose tails together are `aim`, by steps down from `highest`, and the kind with the most."""
+    """Return the level whose summed tails equal `aim`, found by steps down from `highest`, and the kind with the
+    largest sum.
+    """
     level, spender, here, below, above = highest, 0, highest, 0.0, highest
     for number in range(_STEPS):
         _write_tails(offset, here, number == 0, room)
@@ -234,7 +238,7 @@ def _write_tails(offset: Floats, level: float, roughly: bool, room: _Room) -> No
 
 @inner
 def _step(bounds: Indices, here: float, highest: float, aim: float, room: _Room) -> tuple[float, float]:
-    """Return the logarithm of the tails over `aim`, and the next level by its slope and bend."""
+    """Return the logarithm of the tails over `aim`, and the next level from its first and second derivative."""
     total, slope, bend = 0.0, 0.0, 0.0
     for kind in range(len(room.of_kind)):
         room.of_kind[kind] = 0.0

@@ -10,18 +10,18 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 
-#: Effect on the position, in its own sigmas, below which a satellite has none.
+#: Smallest effect of a satellite on the position, in position sigmas; a smaller effect counts as zero.
 _NO_EFFECT = 1e-6
 #: Separations below this fraction of sigma count as zero.
 _SAME = 1e-9
-#: Entries of `System.common`: squared noise scale, variance of the distance, response of the position to the map
-#: across and up, mean error of the map across and up, sigmas of the threshold, least threshold, 1 without the map,
-#: distance without the map, and the gain below which a channel has no effect.
+#: Entries of `System.common`: squared noise scale, variance of the distance, response of the position to map errors
+#: across and up, mean map error across and up, sigmas of the threshold, smallest threshold, 1 without the map, distance
+#: without the map, and the gain below which a channel has no effect.
 _NOISE, _VARIANCE, _MAP_ACROSS, _MAP_UP, _BIAS_ACROSS, _BIAS_UP, _K, _LEAST, _FREE, _SHIFT, LIMIT = range(11)
 
 
 class Channels(NamedTuple):
-    """The channels of an epoch adjacent, those in use first; zero for others. Shape (n,) each."""
+    """Channels of one epoch, contiguous, channels in use first; zero for the others. Shape (n,) each."""
 
     number: Indices  #: Index of the channel in the model.
     root: Floats  #: Root of its weight [1/m].
@@ -29,17 +29,17 @@ class Channels(NamedTuple):
     along: Floats  #: Whitened design.
     across: Floats
     up: Floats
-    prior: Floats  #: Of a fault.
+    prior: Floats  #: Prior probability of a fault.
     bias: Floats  #: Mean error, whitened.
     beyond: Floats  #: Variance beyond the noise, whitened.
-    shared: Floats  #: Common part of two channels by their clocks; shape (n, n).
+    shared: Floats  #: Covariance of two channels through their clocks; shape (n, n).
 
 
 class System(NamedTuple):
-    """The equations of an epoch.
+    """Equations of one epoch.
 
-    `rows`: the projector of the channels, and below it their gains, residuals, and responses to the map across and up;
-    shape (n + 4, n). `common`: values for all of them; shape (11,).
+    `rows`: the projector of the channels, and below it their gains, residuals, and responses to map errors across and
+    up; shape (n + 4, n). `common`: values common to all channels; shape (11,).
     """
 
     rows: Floats
@@ -47,7 +47,7 @@ class System(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """The misfits summed by clock (C,), by axis (3,), the step of the position and of each clock that they imply."""
+    """Misfits summed by clock (C,) and by axis (3,), and the implied steps of the position and of each clock."""
 
     by_clock: Floats
     by_axis: Floats
@@ -56,9 +56,10 @@ class _Fit(NamedTuple):
 
 
 class RangeErrors(NamedTuple):
-    """Errors of single ranges beyond the noise, where there are `any`: `bias`, and variance `beyond` it.
+    """Errors of single ranges in addition to the noise, where there are `any`: `bias`, and additional variance
+    `beyond`.
 
-    `gain` is that of the ranges before any is left out, `own` work space for others.
+    `gain` is the gain of the ranges before any exclusion, `own` is work space for other gains.
     """
 
     any: bool
@@ -70,7 +71,7 @@ class RangeErrors(NamedTuple):
 
 @inner
 def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
-    """Return the contributions of the gains of single ranges to bias, variance of the distance, and variance."""
+    """Return the contributions of single-range gains to bias, variance of the distance, and variance."""
     bias, apart, total = 0.0, 0.0, 0.0
     for m in range(len(left)):
         bias += abs(left[m]) * ranges.bias[m]
@@ -83,7 +84,7 @@ def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
 def separate(
     square: float, distance: float, across: float, up: float, more: tuple[float, float, float], common: Floats
 ) -> tuple[float, float, float]:
-    """Return offset, sigma, and the distance over its threshold, of a set by its effect."""
+    """Return offset, sigma, and ratio of distance to threshold of a set from its effect."""
     noise, whole_across, whole_up = common[_NOISE], across + common[_MAP_ACROSS], up + common[_MAP_UP]
     apart = noise * square + (1.0 - noise) * (across * across + up * up)
     whole = whole_across * whole_across + whole_up * whole_up
@@ -97,7 +98,7 @@ def separate(
 
 @inner
 def new_channels(n: int) -> Channels:
-    """Return room for the channels of an epoch."""
+    """Allocate the arrays for the channels of one epoch."""
     number, clock, of_each = np.zeros(n, dtype=np.intp), np.zeros(n, dtype=np.intp), np.zeros((7, n))
     return Channels(
         number, of_each[0], clock, of_each[1], of_each[2], of_each[3], of_each[4], of_each[5], of_each[6],
@@ -107,13 +108,13 @@ def new_channels(n: int) -> Channels:
 
 @inner
 def new_fit(clocks: int) -> _Fit:
-    """Return room for the sums of the misfits."""
+    """Allocate the arrays for the sums of the misfits."""
     return _Fit(np.empty(clocks), np.empty(3), np.empty(3), np.empty(clocks))
 
 
 @inner
 def choose_channels(root: Floats, number: Indices) -> None:
-    """Write the indices of the used channels, then those of the others."""
+    """Write the indices of the used channels, then the indices of the others."""
     at = 0
     for m in range(len(root)):
         if root[m] > 0.0:
@@ -127,7 +128,7 @@ def choose_channels(root: Floats, number: Indices) -> None:
 
 @inner
 def write_channels(model: Any, errors: Any, prior: Floats, t: int, channels: Channels) -> None:
-    """Write the channels of an epoch adjacent."""
+    """Write the channels of one epoch contiguously."""
     n = len(channels.number)
     for i in range(n):
         m = channels.number[i]
@@ -173,7 +174,7 @@ def fit_misfits(model: Any, t: int, channels: Channels, fit: _Fit) -> None:
 
 @inner
 def _spread(channels: Channels, i: int, covariance: Floats) -> tuple[float, float, float]:
-    """Return the covariance of the position times the design of a channel."""
+    """Return the product of the position covariance and a channel's design vector."""
     x, y, z = channels.along[i], channels.across[i], channels.up[i]
     return (
         x * covariance[0, 0] + y * covariance[1, 0] + z * covariance[2, 0],
@@ -197,7 +198,7 @@ def _write_projector(channels: Channels, covariance: Floats, rows: Floats) -> No
 
 @inner
 def write_with_map(model: Any, errors: Any, k: float, t: int, channels: Channels, fit: _Fit, system: System) -> None:
-    """Write the equations of an epoch whose map is right, `k` false alarms' sigmas."""
+    """Write the equations of an epoch with a correct map; `k` is the false-alarm threshold in sigmas."""
     n, rows, common, covariance = len(channels.root), system.rows, system.common, model.covariance_m2[t]
     root_across, root_up = math.sqrt(model.prior[1, 1]), math.sqrt(model.prior[2, 2])
     _write_projector(channels, covariance, rows)
@@ -222,7 +223,7 @@ def write_without_map(
 ) -> bool:
     """Write the equations without the map, and return whether they determine a position.
 
-    Its distance from the position with the map counts in full, without a test.
+    The distance to the position with the map is added in full, without a test.
     """
     n, rows, common = len(channels.root), system.rows, system.common
     information, variance = errors.map_information[t], errors.scale[t] ** 2

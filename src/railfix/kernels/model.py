@@ -1,4 +1,4 @@
-"""Ranges linearised at a position, whitened, clocks eliminated; their residuals."""
+"""Ranges linearised at a position and whitened, with clocks eliminated; their residuals."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from railfix.kernels.sight import sight
 def _write_clock_covariance(totals: Floats, tie_sigma_m: Floats, rho: Floats, covariance: Floats) -> None:
     """Write the covariance of the clocks of one epoch at a known position, shape (G, G).
 
-    For a separate clock 1/T, T the summed weight of its satellites. Clocks that keep an offset to a common one to
-    sigma: ``diag(sigma^2 rho) + rho rho^T / sum(T rho)``, ``rho = 1/(1 + sigma^2 T)``. 0 for clocks without satellites.
+    A separate clock has the variance 1/T, where T is the summed weight of its satellites. Clocks whose offset from a
+    common clock is known to sigma have ``diag(sigma^2 rho) + rho rho^T / sum(T rho)`` with ``rho = 1/(1 + sigma^2 T)``.
+    Clocks without satellites get 0.
     """
     groups, mass = len(totals), 0.0
     if not len(tie_sigma_m):
@@ -59,16 +60,16 @@ def linearise_ranges(
     ----------
     ranges : RangeArrays
     place_ecef_m : ndarray, shape (T, 3) [m]
-        NaN without a place: design, misfits and covariance are NaN then.
+        NaN without a position: design, misfits and covariance are NaN then.
     axes : ndarray, shape (T, 3, 3)
         Unit vectors of the unknowns.
     prior : ndarray, shape (3, 3) [1/m^2]
-        Information on the place.
+        Prior information on the position.
 
     Returns
     -------
     root_weight, clock_covariance_m2, design, covariance_m2, misfit
-        Of `LinearModel`.
+        Fields of `LinearModel`.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
@@ -97,7 +98,7 @@ def linearise_ranges(
                     rows[m, i] = -(u0 * axes[t, i, 0] + u1 * axes[t, i, 1] + u2 * axes[t, i, 2])
                     sums[i, g] += w * rows[m, i]
             total += totals[g]
-        # A constant common to all ranges is no residual; subtracting it preserves digits of the sums.
+        # Subtracting a constant common to all ranges changes no residual and preserves digits of the sums.
         common = common / total if total > 0.0 else 0.0
         _write_clock_covariance(totals, sigma_m[t] if tied else no, rho, clocks[t])
         for i in range(3):

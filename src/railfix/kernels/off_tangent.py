@@ -1,4 +1,4 @@
-"""Risk of positions on a line off its tangent."""
+"""Risk that the true position is on a part of the line that departs from the tangent."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 @inner
 def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
-    """Return the tail of the form that is at least ``1 - tau`` times that of all channels."""
+    """Return the tail of a form that is at least ``1 - tau`` times the form of all channels."""
     if not tau < 1.0:
         return 1.0
     form = (start + math.sqrt(max(tau, 0.0)) * misfit) ** 2 / (1.0 - tau)
@@ -41,7 +41,7 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
 
 @inner
 def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, float]:
-    """Return where a form is lowest, the diagonal of the cofactors of its matrix, and 1 over the determinant.
+    """Return the minimum point of a quadratic form, the diagonal cofactors of its matrix, and 1 over the determinant.
 
     Forms are `constant`, `slope` (3), and the matrix by its elements xx, xy, xz, yy, yz, zz. The last number is 0 where
     the matrix is singular.
@@ -63,7 +63,7 @@ def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, flo
 
 @inner
 def _compute_tail(form: Floats, clear_m: float) -> float:
-    """Return the tail of a form by its own matrix and slope."""
+    """Return the tail of a form from its own matrix and slope."""
     x, y, z, c_xx, c_yy, _, inverse = _lowest(form)
     if inverse == 0.0:
         return 1.0
@@ -86,7 +86,7 @@ class _Residuals(NamedTuple):
 
 @inner
 def _work_space(channels: int) -> _Residuals:
-    """Return arrays for some channels."""
+    """Allocate work arrays for a number of channels."""
     clock = np.empty(channels, dtype=np.intp)
     projector, whitened = np.empty((channels, channels)), np.empty((4, channels))
     return _Residuals(projector, np.empty(channels), np.empty((3, channels)), whitened, clock)
@@ -94,7 +94,7 @@ def _work_space(channels: int) -> _Residuals:
 
 @inner
 def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> None:
-    """Write the form without the channels i and j (-1: none), from that of all."""
+    """Write the form without the channels i and j (-1 for none), from the form of all channels."""
     projector, residual, rows, _, _ = residuals
     for k in range(10):
         form[k] = every[k]
@@ -184,7 +184,7 @@ def _whiten(
 ) -> int:
     """Write channels in use, their residuals, and the form of all of them; return how many there are.
 
-    The map error is taken alike in all horizontal directions: another place has another tangent.
+    The map error is taken as equal in all horizontal directions, because the tangent differs between positions.
     """
     root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
     projector, residual, rows, whitened, group = residuals
@@ -198,7 +198,7 @@ def _whiten(
             asked[clock[m]] += roots[n] * misfit[t, m]
             x, y, z = x + misfit[t, m] * along[n], y + misfit[t, m] * across[n], z + misfit[t, m] * up[n]
             n += 1
-    # Map error, equal in all horizontal directions, and the position implied by the residuals.
+    # Map error, isotropic in the horizontal plane, and the position implied by the residuals.
     normal = _inverse(covariance_m2[t])
     of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
     of_map[2] = (noise / sigma_m[1]) ** 2
@@ -251,9 +251,9 @@ def risk_off_tangent(
 
     At a distance D along and across, a form exceeds its value at the position by at least ``(D - |c|)^2 / trace(C) - c
     . s``: c is its lowest point and C the inverse of its matrix, both along and across, and s its slope. Without the
-    channels J the matrix is at least ``1 - tau`` times that of all, ``tau = trace(F_J C F_J^T S_JJ^-1)`` with their
-    rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the others each subset has
-    its own bound.
+    channels J the matrix is at least ``1 - tau`` times the matrix of all channels, ``tau = trace(F_J C F_J^T S_JJ^-1)``
+    with their rows F_J of the design: the largest tau of one channel and of two decides most epochs. In the others each
+    subset has its own bound.
 
     Parameters
     ----------
@@ -265,18 +265,18 @@ def risk_off_tangent(
     sides : ndarray of bool, shape (T, S, M)
         Channels that are faulty together.
     side_prior : float
-        Probability of that.
+        Probability of a fault of a whole side.
     clear_m : ndarray, shape (T,) [m]
-        Distance within which no place is off the tangent.
+        Distance within which no part of the line is off the tangent.
     sigma_m : tuple of float [m]
-        Of the map in plan and height.
+        Map sigmas in plan and height.
     enough : float
         Probability up to which a loose bound will do.
 
     Returns
     -------
     ndarray, shape (T,)
-        Summed over no fault, one faulty satellite, two and those of a side.
+        Sum over the hypotheses of no fault, one faulty satellite, two, and a faulty side.
     """
     epochs, channels = model.root_weight.shape
     used, total, leverage = np.empty(channels, dtype=np.intp), np.empty(epochs), np.empty(channels)
@@ -343,19 +343,19 @@ def risk_off_tangent(
 def forms_of_hypotheses(
     model: Any, scale: Floats, likely: Floats, sides: Masks, side_prior: float, sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return the forms without fault, and without each channel, each pair and each side: K of them.
+    """Return the K forms without fault, and without each channel, each pair and each side.
 
     Parameters are those of `risk_off_tangent`.
 
     Returns
     -------
     prior : ndarray, shape (T, K)
-        0 for what is no hypothesis.
+        0 for unused entries.
     form : ndarray, shape (T, K, 10)
         See `_lowest`.
     lowest_m, depth, widest_m2 : ndarray, shape (T, K)
-        Distance of the place at which each is lowest, by how much it is lower there, and the trace of the inverse of
-        its matrix; NaN where that is singular.
+        Distance to the minimum of each form, depth of the minimum, and trace of the inverse matrix; NaN where the
+        matrix is singular.
     """
     epochs, channels = model.root_weight.shape
     most = 0
@@ -371,7 +371,7 @@ def forms_of_hypotheses(
     residuals = _work_space(channels)
     for t in range(epochs):
         n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
-        prior[t, 0], at = 2.0, 1  # noise passes on either side
+        prior[t, 0], at = 2.0, 1  # two-sided false alarm
         _without(-1, -1, residuals, every, form[t, 0])
         for i in range(n):
             for j in range(-1, i):
@@ -407,15 +407,15 @@ def risk_beyond(
     Parameters
     ----------
     prior, form : ndarray
-        Of `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` over the place d.
+        Returned by `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` at the displacement d.
     radius_m : ndarray, shape (T, K)
-        A hypothesis counts where a place beyond the level is nearer.
+        A hypothesis counts if a part of the line beyond the level is nearer.
     first : ndarray of int, shape (T + 1,)
         First section of each epoch.
     start_m, tangent : ndarray, shape (P, 3)
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance of the sections beyond the level; others infinite.
+        Distance of the sections beyond the level; infinite for other sections.
     """
     epochs, hypotheses = prior.shape
     spent = np.zeros(epochs)

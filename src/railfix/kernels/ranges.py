@@ -1,4 +1,4 @@
-"""Pseudoranges at a position, clocks eliminated; positions from them."""
+"""Pseudorange residuals at a position with the clocks eliminated, and positions from pseudoranges."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from railfix.kernels.sight import sight
 
 
 class _Epoch(NamedTuple):
-    """One epoch of `RangeArrays`; `offset_m` of length 0 without ties."""
+    """One epoch of `RangeArrays`; `offset_m` has length 0 without known clock offsets."""
 
     sat_ecef_m: Floats
     code_m: Floats
@@ -24,7 +24,7 @@ class _Epoch(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Results of `reduced_equations` for one epoch, and the weights of the groups."""
+    """Results of `reduced_equations` for one epoch, and the weights of the clock groups."""
 
     system: Floats
     means: Floats
@@ -37,7 +37,7 @@ class _Equations(NamedTuple):
 def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
     """Compute the normal equations of one epoch.
 
-    Loops without branches over all channels are vectorised: unused ones have finite positions.
+    The loops over all channels have no branches, so that they are vectorised; unused channels need finite positions.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
     system, means, rows, totals, _ = equations
@@ -131,7 +131,7 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     means : ndarray, shape (T, 4, G)
         Weighted means of the groups.
     rows : ndarray, shape (T, 4, M)
-        Design, and residual, less the mean of the group; 0 where the weight is 0.
+        Design and residual less their group means; 0 where the weight is 0.
     seen : ndarray of bool, shape (T, G)
         Groups with weight.
     """
@@ -195,9 +195,9 @@ def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
 
 @inner
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
-    """Clocks and residuals of one epoch after a step, to first order.
+    """Compute clocks and residuals of one epoch after a step, to first order.
 
-    A step of 5 m leaves an error of 0.03 mm (the gradient of the Earth's rotation, which the design neglects).
+    A step of 5 m leaves an error of 0.03 mm, because the design neglects the Earth's rotation.
     """
     for g in range(len(totals)):
         moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])
@@ -232,14 +232,14 @@ def iterate_points(
     ranges : RangeArrays
     start_ecef_m : ndarray, shape (T, 3) [m]
     enough : ndarray of bool, shape (T,)
-        Epochs with satellites for a position; the others are NaN.
+        Epochs with enough satellites for a position; the others are NaN.
     tolerance_m, most
-        Last step, and number of steps.
+        Convergence limit of the step, and largest number of steps.
 
     Returns
     -------
     ecef_m, clock_m, matrix, covariance_m2, wsse, residual_m
-        Of `SinglePoint`.
+        Fields of `SinglePoint`.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
@@ -317,9 +317,9 @@ def _form(system: Floats, a: Floats, b: Floats) -> float:
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
 ) -> tuple[float, float, float, float]:
-    """Return the step, sigma, sigma of an exact map and least WSSE along a section, map error allowed for.
+    """Return step, sigma, sigma with an exact map, and minimum WSSE along a section, with the map error included.
 
-    The Schur complement of the map error leaves only the dependence on the distance along the line.
+    The Schur complement eliminates the map error, so that only the distance along the line remains.
     """
     own, a, c = _form(system, tangent, tangent), _form(system, across, across), _form(system, up, up)
     to_plan, to_height, b = _form(system, tangent, across), _form(system, tangent, up), _form(system, across, up)
@@ -354,9 +354,9 @@ def iterate_along(
     ranges : RangeArrays
     line : SectionArrays
     vertex : ndarray of int, shape (T,)
-        Point to start from; -1: none.
+        Start point; -1 for none.
     tolerance_m, most
-        Last step, and number of steps.
+        Convergence limit of the step, and largest number of steps.
 
     Returns
     -------
@@ -365,7 +365,7 @@ def iterate_along(
         Distance along the section [m]; `sigma_m`, `exact_map_sigma_m`, `wsse`, `overshoot_m` and `dilution` of
         `Constrained`.
     clock_m, residual_m, iterations
-        Of `Constrained`.
+        Fields of `Constrained`.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     start_ecef_m, tangent, across, up, length_m, plan_m, height_m = line

@@ -1,4 +1,4 @@
-"""Lines of a text, fields of observation lines, their indices in arrays."""
+"""Decode lines and observation fields of a text, and compute their array indices."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _eight_digits(word: np.uint64) -> np.uint64:
 
 @inner
 def _word(data: Bytes, at: np.uintp) -> np.uint64:
-    """Return eight characters, the first the lowest byte; compiled to one load."""
+    """Return eight characters as an integer, the first as the lowest byte; compiled to one load."""
     word = _U(data[at])
     for i in range(1, 8):
         word |= _U(data[at + np.uintp(i)]) << _U(8 * i)
@@ -42,10 +42,10 @@ def _word(data: Bytes, at: np.uintp) -> np.uint64:
 def decode_fields(
     data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
 ) -> tuple[Floats, Bytes, Masks]:
-    """Decode the fields of the usual form, shape (n, k); the arguments are those of `read_fields`.
+    """Decode the fields of standard form, shape (n, k); arguments as for `read_fields`.
 
-    Values, NaN where blank or of another form; loss-of-lock digits (uint8), 255 where the last two characters are
-    neither blanks nor digits; and which fields have another form.
+    Returns the values (NaN where blank or not of standard form), the loss-of-lock digits (uint8, 255 where the last two
+    characters are neither blanks nor digits), and the mask of the fields not of standard form.
     """
     rows, columns = len(start), len(index)
     value, lock = np.empty((rows, columns)), np.zeros((rows, columns), dtype=np.uint8)
@@ -96,16 +96,16 @@ def decode_fields(
 def place_fields(
     kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
 ) -> tuple[Floats, Bytes]:
-    """Write fields into the dense arrays, which are filled in place and returned; zeros mean absent.
+    """Write fields into the dense arrays in place and return these arrays; a zero means absent.
 
     Parameters
     ----------
     kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
-        By kind of observable.
+        One array per kind of observable.
     cell : ndarray of int, shape (n,)
-        Epoch times M plus the first channel of the satellite, of each line.
+        For each line, epoch times M plus the satellite's first channel.
     kind, signal : ndarray of int, shape (k,)
-        Of each field: its kind of observable, and its channel among those of the satellite.
+        Kind of observable of each field, and its channel index within the satellite.
     value, digit : ndarray, shape (n, k)
         Values, and loss-of-lock digits.
     """

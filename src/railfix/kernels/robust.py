@@ -1,4 +1,4 @@
-"""Robust weights."""
+"""Robust weights of ranges."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
-#: Least scale of whitened residuals: ranges do not agree better than that by their own merit.
+#: Smallest scale of whitened residuals: a closer agreement of the ranges is accidental.
 _LEAST_SCALE = 0.05
 
 
 class _Room(NamedTuple):
-    """Work space of an epoch: its used channels adjacent, those of clock g from ``begin[g]`` on.
+    """Work space of one epoch: the used channels are contiguous, and those of clock g begin at ``begin[g]``.
 
     For each channel (M,): its `channel` in the ranges, `base` weight and its `root`, unit vector to the satellite
     `sight` (3, M), `misfit`, robust `factor` of the weight, `white` residual, `order` by it, weight in the `row`s,
-    which are sights and misfits without the clock's mean (4, M). For each clock (G,): the `total` weight, the `mean`
-    row (4, G), and of the ties its weight `mass` and its distance from the others, `apart` (4, G).
+    which are sights and misfits less the clock's mean (4, M). For each clock (G,): the `total` weight and the `mean`
+    row (4, G); for the known clock offsets, the weight `mass` and the difference from the other clocks, `apart` (4, G).
     """
 
     begin: Indices
@@ -68,7 +68,7 @@ def reweight_ranges(
     -------
     kept : ndarray of bool, shape (T, M)
     wsse : ndarray, shape (T,)
-        Weighted sum of the squared residuals of the kept ranges.
+        Weighted sum of squared residuals of the kept ranges.
     solved : ndarray of bool, shape (T,)
         False where the last step was not determined.
     """
@@ -92,7 +92,7 @@ def reweight_ranges(
             _write_residuals(step, solved[t], room)
             scale = max(_median(count, room) * correction[t], _LEAST_SCALE)
             if not _reweight(count, scale, keep, reject, room):
-                break  # every further step would be this one
+                break  # the weights have converged
         for k in range(count):
             if room.white[k] / scale < reject:
                 kept[t, room.channel[k]] = True
@@ -102,7 +102,7 @@ def reweight_ranges(
 
 @inner
 def _new_room(channels: int, clocks: int) -> _Room:
-    """Return work space."""
+    """Allocate the work space."""
     numbers, of_channel = np.zeros((2, channels), dtype=np.int64), np.empty((6, channels))
     return _Room(
         np.zeros(clocks + 1, dtype=np.int64), numbers[0], numbers[1], of_channel[0], of_channel[1], of_channel[2],
@@ -113,7 +113,7 @@ def _new_room(channels: int, clocks: int) -> _Room:
 
 @inner
 def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
-    """Write the channels in use adjacent, their sights and misfits, and return how many they are."""
+    """Write the used channels contiguously, with their sights and misfits, and return their number."""
     channels, clocks, count = ranges.weight.shape[1], len(ranges.starts), 0
     for g in range(clocks):
         room.begin[g], stop = count, ranges.starts[g + 1] if g + 1 < clocks else channels
@@ -134,7 +134,7 @@ def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
 
 @inner
 def _sum_clocks(room: _Room) -> None:
-    """Write the weights, and of each clock their sum and the mean row; the rows become differences from it."""
+    """Write the weights, and the sum and mean row of each clock; subtract the mean from the rows."""
     for g in range(len(room.total)):
         total = x = y = z = misfit = 0.0
         for k in range(room.begin[g], room.begin[g + 1]):
@@ -171,7 +171,7 @@ def _sum_normal(count: int, room: _Room, normal: Floats, vector: Floats) -> None
 
 @inner
 def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, vector: Floats) -> None:
-    """Add the information of the known clock offsets on the position."""
+    """Add the information that the known clock offsets give on the position."""
     clocks, whole = len(room.total), 0.0
     for g in range(clocks):
         room.mass[g] = 1.0 / (1.0 / room.total[g] + sigma_m[g] ** 2) if room.total[g] > 0.0 else 0.0
@@ -197,7 +197,7 @@ def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, ve
 
 @inner
 def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
-    """Solve three symmetric equations, and return whether they are determined; the step is zero where they are not."""
+    """Solve three symmetric equations, and return whether they are determined; otherwise the step is zero."""
     a, b, c, d, e, f = normal[0, 0], normal[0, 1], normal[0, 2], normal[1, 1], normal[1, 2], normal[2, 2]
     of_x, of_y, of_z = d * f - e * e, c * e - b * f, b * e - c * d
     determinant, mean = a * of_x + b * of_y + c * of_z, (a + d + f) / 3.0
@@ -225,7 +225,7 @@ def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
 
 @inner
 def _median(count: int, room: _Room) -> float:
-    """Return the median of the whitened residuals; their order is kept for the next time, which is nearly the same."""
+    """Return the median of the whitened residuals; their order is kept, as it is nearly the same in the next call."""
     for k in range(count):
         at, number = k, room.order[k]
         while at > 0 and room.white[room.order[at - 1]] > room.white[number]:
@@ -237,7 +237,7 @@ def _median(count: int, room: _Room) -> float:
 
 @inner
 def _reweight(count: int, scale: float, keep: float, reject: float, room: _Room) -> bool:
-    """Write the robust factors by the residuals over their scale; return whether one of them has changed."""
+    """Write the robust factors from the scaled residuals; return whether any factor has changed."""
     changed = False
     for k in range(count):
         size, before = room.white[k] / scale, room.factor[k]

@@ -1,4 +1,4 @@
-"""Levels of satellites after jumps of their codes; medians over the channels of a clock; signs of interference."""
+"""Code offsets of satellites after jumps; medians over the channels of a clock; signs of interference."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NS = 1_000_000_000
 
 @inner
 def insert(ordered: Floats, size: int, value: float) -> None:
-    """Insert a value among `size` others in rising order."""
+    """Insert a value into `size` sorted values."""
     j = size
     while j > 0 and ordered[j - 1] > value:
         ordered[j] = ordered[j - 1]
@@ -26,7 +26,7 @@ def insert(ordered: Floats, size: int, value: float) -> None:
 
 @inner
 def middle(ordered: Floats, size: int) -> float:
-    """Return the median of values in rising order."""
+    """Return the median of sorted values."""
     if size % 2:
         return float(ordered[size // 2])
     return float(0.5 * (ordered[size // 2 - 1] + ordered[size // 2]))
@@ -36,10 +36,12 @@ def middle(ordered: Floats, size: int) -> float:
 def suspicions(
     time_ns: Integers, metric: Floats, limit: Floats, level_before: Floats, since_before: Integers, hold_ns: int
 ) -> tuple[Masks, Floats, Integers]:
-    """Follow the levels of satellites after jumps: each is summed from the jump on, so that a cut does not show.
+    """Track the offset of each satellite's code after a jump; each is summed from the jump on, so that chunk boundaries
+    have no effect.
 
-    `metric` and `limit`, shape (T, M), in C order; level and start of suspicions before, shape (M,), `NEVER` for none.
-    Returns the rejections, the levels (0 without suspicion, NaN without a metric), and the starts at the end.
+    `metric` and `limit` have shape (T, M), in C order; the previous offsets and starts of suspicions have shape (M,),
+    `NEVER` for none. Returns the rejections, the offsets (0 without suspicion, NaN without a metric), and the starts at
+    the end of the chunk.
     """
     epochs, channels = metric.shape
     reject, level = np.zeros((epochs, channels), dtype=np.bool_), np.empty((epochs, channels))
@@ -67,7 +69,7 @@ def suspicions(
 def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
     """Return the median of the values (T, M) of each clock at its channels; NaN is ignored.
 
-    NaN below `least` satellites with a finite value; clock and satellite of each channel are numbers, shape (M,).
+    NaN with fewer than `least` finite satellites; clock and satellite of each channel are integers, shape (M,).
     """
     epochs, channels = values.shape
     result = np.full(values.shape, math.nan)
@@ -96,7 +98,7 @@ def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int
 
 @inner
 def _deviation(values: Floats, count: int) -> float:
-    """Return the standard deviation of some values."""
+    """Return the standard deviation of values."""
     total = square = 0.0
     for k in range(count):
         total += values[k]
@@ -117,7 +119,7 @@ def falls_of_cn0(
 ) -> tuple[Floats, Floats, Floats, tuple[Floats, Floats, Floats]]:
     """Return the falls of C/N0 below the recent peaks: the statistics of `PowerSigns`, shape (T,), and the new state.
 
-    `before`: peaks, beginnings and last observations of `PowerState`, shape (K,); `decay` of a peak in a second.
+    `before`: peaks, start times and last observations of `PowerState`, shape (K,); `decay` of a peak per second.
     """
     epochs, channels = cn0_dbhz.shape
     peak, first, last = before[0].copy(), before[1].copy(), before[2].copy()
@@ -156,10 +158,11 @@ def clock_steps(
     longest_s: float,
     least: int,
 ) -> tuple[Floats, tuple[Floats, Floats, Integers]]:
-    """Return the median change of codes (T, K) against Dopplers, shape (T,), and the last ones of each channel.
+    """Return the median change of codes (T, K) against Dopplers, shape (T,), and each channel's last codes and
+    Dopplers.
 
-    `before`: codes, Dopplers and their times so far, shape (K,). Nothing is compared across a break, nor after
-    `longest_s`; NaN below `least` channels.
+    `before`: each channel's previous code, Doppler and time, shape (K,). Values are not compared across a break or
+    after more than `longest_s`; the result is NaN with fewer than `least` channels.
     """
     epochs, channels = code_m.shape
     code, rate, since = before[0].copy(), before[1].copy(), before[2].copy()
@@ -193,9 +196,10 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return which conditions have been true for their time, which are still active, and the state: see `held`.
+    """Return which conditions have been true for their required time, which are still active, and the state: see
+    `held`.
 
-    `before`: duration of each, and time of its last activity, shape (C,).
+    `before`: duration of each condition, and time of its last activity, shape (C,).
     """
     epochs, conditions = signs.shape
     run, last, previous = before[0].copy(), before[1].copy(), time_before

@@ -1,4 +1,4 @@
-"""Points near a position, and the best of them; distances to parts of a line off its tangent."""
+"""Search for line points near a position and for the best of them; distances to parts of a line off its tangent."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from railfix.kernels.compiling import inner, kernel
 
 #: Half the inverse of the shortest range to a navigation satellite, rounded down (GLONASS at the zenith) [1/m].
 _CURVATURE = 1.0 / (2.0 * 1.9e7)
-#: Rounding allowed for in the radius of a stretch [m].
+#: Allowance for rounding in the radius of a stretch [m].
 _SLACK_M = 1e-6
 
 
 @inner
 def _bend_m(distance_m: float) -> float:
-    """Return the largest error of the linear model of a range at a distance from its expansion point [m]."""
+    """Return the largest linearisation error of a range at a distance from its expansion point [m]."""
     return distance_m * distance_m * _CURVATURE + ROTATION_GRADIENT * distance_m
 
 
@@ -36,18 +36,18 @@ def radii_of_balls(
 ) -> Floats:
     """Return the radius of the ball around each 3-D position that contains every candidate point, shape (n,) [m].
 
-    NaN where errors of the linear model leave it open.
+    NaN where linearisation errors make it indeterminate.
 
     Parameters
     ----------
     distance_m, away_m : ndarray, shapes (n,), (n, 3) [m]
-        To the nearest point of the line.
+        Distance and vector to the nearest point of the line.
     matrix, covariance_m2, wsse : ndarray, shapes (n, 3, 3), (n, 3, 3), (n,)
-        Of the 3-D positions.
+        Normal matrix, covariance and WSSE of the 3-D positions.
     weight_norm : ndarray, shape (n,)
         Root of the summed weights.
     freedom : ndarray of int, shape (n,)
-        Redundancy on the line, 1 at least.
+        Redundancy on the line, at least 1.
     limit : float
         `SectionLimits.reach`.
     """
@@ -79,7 +79,7 @@ def points_within(
 ) -> tuple[Indices, Indices, int]:
     """Find the points of a line in a ball, by `SearchIndex.stretches`.
 
-    Returns the one of two work arrays that has them, the other, and their number.
+    Returns the work array with the points, the other work array, and the number of points.
     """
     middle, reach_m, first = stretches
     x, y, z = centre_m
@@ -136,7 +136,7 @@ def points_in_balls(
         Sorted by epoch and point.
     q, half_gradient : ndarray, shapes (p,), (p, 3)
     unsure : ndarray of bool, shape (p,)
-        The error of the quadratic form leaves open which point of the epoch is the best, and this may be it.
+        True for a candidate that may be the best of its epoch within the error of the quadratic form.
     """
     epochs = len(radius_m)
     count, found = np.zeros(epochs, dtype=np.intp), 0
@@ -176,7 +176,7 @@ def points_in_balls(
 
 @inner
 def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
-    """Return the least q on the two sections that meet at a point, by its quadratic form."""
+    """Return the minimum q on the two sections that meet at a point, from its quadratic form."""
     floor = q
     for side in range(2):
         section, sign = vertex - side, 1.0 - 2.0 * side
@@ -200,7 +200,7 @@ def best_points(
     separation_m: float,
     turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
-    """Select the best point of each epoch, and the best of the other positions.
+    """Select the best point of each epoch, and the best point of any other position.
 
     Parameters
     ----------
@@ -209,14 +209,14 @@ def best_points(
     line : tuple of ndarray
         `arc_m`, `tangent` and `length_m` of the trajectory.
     separation_m : float
-        Places nearer than this along the line are one.
+        Points nearer than this along the line are one position.
     turn_m : float
-        Once round a closed line; infinite for others.
+        Length of a closed line; infinite for others.
 
     Returns
     -------
     vertex, q, excess, other_vertex : ndarray, shape (n,)
-        As in `Section`.
+        Fields of `Section`.
     """
     _, count, vertex, q, half_gradient, matrix, matrix_of = candidates
     arc_m, tangent, length_m = line
@@ -260,7 +260,7 @@ def clear_of_sections(
 ) -> Floats:
     """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
 
-    `ecef_m` are the points of the line (P, 3), the others its sections; `stretches` are of `SearchIndex`.
+    `ecef_m` are the points of the line (P, 3), the other arrays its sections; `stretches` is a field of `SearchIndex`.
     """
     clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
     nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""Sums over earlier epochs with exponential forgetting, for the epochs of several antennas in sequence."""
+"""Exponentially weighted sums over earlier epochs, for the epochs of several antennas in sequence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.kernels.compiling import kernel
 
-#: Windows that one running sum spans; exp(50) = 5e21, so that it overflows nowhere and keeps all digits of its terms.
+#: Number of windows per running sum; exp(50) = 5e21 neither overflows nor loses digits of the terms.
 SPAN: Final = 50.0
 _NAT: Final = np.iinfo(np.int64).min
 _NS: Final = 1_000_000_000
@@ -20,10 +20,11 @@ _NS: Final = 1_000_000_000
 def window_ages(
     time_ns: Integers, last_ns: Integers, last_age: Floats, ends: Indices, window_s: float, least_epochs: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return ages of T epochs of A antennas, which end at rows `ends`; `last_ns`: before the first, NaT for none.
+    """Return ages of T epochs of A antennas, which end at rows `ends`; `last_ns` is the epoch before the first, NaT for
+    none.
 
-    Time since the previous epoch [s], age in its span of `SPAN` windows, and spans begun since the previous epoch,
-    shapes (T,); and the ages at the end, shape (A,) [windows].
+    Returns, shapes (T,), the time since the previous epoch [s], the age in its span of `SPAN` windows, and the number
+    of spans begun since the previous epoch; and the ages at the end, shape (A,) [windows].
     """
     epochs = len(time_ns)
     step, in_span, begun, end_age = np.zeros(epochs), np.empty(epochs), np.empty(epochs), last_age.copy()
@@ -44,10 +45,10 @@ def window_ages(
 
 @kernel
 def decayed_sums(values: Floats, growth: Floats, decay: Floats, current: Floats, ends: Indices) -> Floats:
-    """Return sums of the values (T, K) of all earlier epochs, each times ``exp(-difference of the ages)``.
+    """Return sums of the values (T, K) of all earlier epochs, each weighted by ``exp(-difference of the ages)``.
 
-    `values` are times `growth`, and running sums `current`, shape (A, K), in units of the decay since the start of a
-    span, so that the same numbers are added in the same order wherever a chunk begins; the new sums replace them.
+    `values` are multiplied by `growth`. The running sums `current`, shape (A, K), are in units of the decay since the
+    start of a span, so that the order of additions does not depend on where a chunk begins; the new sums replace them.
     """
     before, first = np.empty(values.shape), 0
     for a in range(len(ends)):

@@ -33,7 +33,8 @@ from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracke
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Reasons with which a code is still used: the filter weighs multipath and faults itself, over more than one epoch.
+#: Rejection reasons with which the filter still uses a code: it weights multipath and faults itself, over several
+#: epochs.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK
@@ -42,21 +43,21 @@ _WEIGHED_BY_FILTER: Final = (
     | Reason.CN0_CURVE
     | Reason.ANTENNA_PAIR
 )
-#: Reasons against the code alone: the filter keeps the satellite's phase and Doppler.
+#: Rejection reasons of the code only: the filter still uses the satellite's phase and Doppler.
 _CODE_ALONE: Final = Reason.GROSS_ERROR
-#: Slower than this, with two sigmas, the train counts as standing [m/s]: 1 km/h, below which tachometers give no output
-#: either.
+#: Speed including two sigmas below which the train counts as standing [m/s]: 1 km/h, below which tachometers give no
+#: output either.
 STANDSTILL_MPS: Final = 1.0 / 3.6
-#: Positions beyond an end of the line by at most this many sigmas, or this distance [m], are moved to its end.
+#: Number of sigmas, and distance [m], up to which positions beyond an end of the line are moved to the end.
 _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
-#: Gate of two-way ranges against the predicted one, in standard deviations; least width toward long ranges: echoes are
-#: late, and separate from 0.3 m on (P2, table 3) [m].
+#: Gate of two-way ranges around the predicted range, in standard deviations; minimum width toward long ranges [m]:
+#: echoes arrive late, and are separable from 0.3 m on (P2, table 3).
 _GATE_SIGMAS: Final = 3.0
 _LATE_M: Final = 0.6
 #: With sensors, the filter processes blocks of this much GPS time [ns].
 _BLOCK_NS: Final = 5_000_000_000
-#: A direction is given where the speed is beyond this many of its sigmas.
+#: Number of sigmas of the speed beyond which a direction is reported.
 _DIRECTION_SIGMAS: Final = 3.0
 
 
@@ -71,10 +72,10 @@ def along_track(
     samples: SensorSamples | None = None,
     references: LineReferences | None = None,
 ) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
-    """Return filtered positions of one antenna after all screens and exclusions, what the filter was given, its state.
+    """Return filtered positions of one antenna after all screens and exclusions, the filter's input, and its state.
 
     The filter and its levels are `railfix.tracking.levels.track_with_levels`, its equations docs/filter-equations.md.
-    Samples are those of the sensors on board since the previous chunk; `references` has the line's features, ground
+    `samples` are the on-board sensor samples since the previous chunk; `references` has the line's features, ground
     units and balises.
     """
     epochs, after_slips = gnss_epochs(ranges, single.noise_scale, config, state.slips, slips=slips)
@@ -98,7 +99,7 @@ def along_track(
             sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
             pulled, filtered = _against_wheel(replays, tracked.arc_m, sure, after.pulled, config)
             after, tracked = replace(after, pulled=filtered), _bound_by_wheel(tracked, pulled.bound_m)
-        # a cause with a name outranks a doubt without one; an error of the time tags outranks both
+        # a named cause outranks a doubt without a cause; a time-tag error outranks both
         unnamed = (tracked.status == TrackStatus.DOUBTFUL) & (single.suspicion != Suspicion.TIME_TAGS)
         parted = wheel.parted & (is_bounded(tracked.status) | unnamed)
         tracked = mark_doubtful(tracked, parted, TrackStatus.SPOOFING_SUSPECTED)
@@ -113,7 +114,7 @@ def along_track(
 
 
 def single_epochs(solution: Solution, interference: Interference | None, config: Config) -> SingleEpochs:
-    """Return what the filter of an antenna uses of the positions of its single epochs."""
+    """Return the results of an antenna's single epochs that its filter uses."""
     has = with_coordinates(config.failed_checks)[solution.status]
     return SingleEpochs(
         noise_scale=solution.noise_scale,
@@ -127,7 +128,7 @@ def single_epochs(solution: Solution, interference: Interference | None, config:
 
 
 def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
-    """Return positions whose finite levels are at least the error that an undetected pull may have reached."""
+    """Return positions with finite levels raised to the largest error of an undetected pull."""
     levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
     return replace(
         tracked, **{n: np.where(np.isfinite(level), np.fmax(level, bound_m), level) for n, level in levels.items()}
@@ -137,7 +138,7 @@ def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
 def _against_wheel(
     replays: Sequence[Replay], arc_m: Floats, sigma_m: Floats, state: WheelState, config: Config
 ) -> tuple[WheelSigns, WheelState]:
-    """Compare positions with the distance that the wheel has rolled."""
+    """Compare positions with the wheel distance."""
     parts = [(replay.epochs.time, replay.sensors.wheel_m) for replay in replays]
     rolled = np.concatenate([np.full(len(time), np.nan) if distance is None else distance for time, distance in parts])
     return wheel_signs(
@@ -149,8 +150,7 @@ def _against_wheel(
 def apply_spacing_verdict(
     result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
 ) -> tuple[AlongTrack, FilterState]:
-    """Check distance and speed against those of the other antenna; return the positions with the verdict, and the
-    state.
+    """Check distance and speed against the other antenna; return the positions with the verdict, and the state.
 
     A verdict of shape (T,), None without any, lasts for `held_s` after it.
     """
@@ -181,7 +181,7 @@ def with_passings(
 
 
 def mark_doubtful(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
-    """Return positions with a status of doubt at some epochs; their error is not bounded there."""
+    """Return positions with a doubtful status at some epochs, where their error is not bounded."""
     if not doubtful.any():
         return tracked
     reported = np.where(doubtful, np.int8(status), tracked.status)
@@ -200,12 +200,12 @@ def _run_filter(
     references: LineReferences | None,
     alone: tuple[Floats, Floats],
 ) -> tuple[Tracked, SensedMotion, tuple[Replay, ...], FilterState]:
-    """Return the filter's positions, motion by the sensors, the smoother's input, and the state for the next chunk.
+    """Return the filter's positions, the sensor motion, the smoother's input, and the state for the next chunk.
 
-    `alone`: arc lengths by single epochs and their standard deviations, shape (T,) each [m].
+    `alone` has single-epoch arc lengths and their standard deviations, shape (T,) each [m].
 
-    With sensors the epochs are processed in blocks of `_BLOCK_NS` of GPS time, independent of the chunks: the position
-    by the wheel, which gives the gradient, begins each block at the position of the filter.
+    With sensors the epochs are processed in blocks of `_BLOCK_NS` of GPS time, independent of the chunks: the wheel
+    position, which gives the gradient, starts each block at the filter's position.
     """
 
     def sine_at(arc_m: Floats) -> Floats:
@@ -255,7 +255,7 @@ def _gate(
     state: FilterState,
     config: Config,
 ) -> tuple[GnssEpochs, ReturnState]:
-    """Return epochs without the codes that an outage makes doubtful."""
+    """Return epochs without codes that are doubtful after an outage."""
     distance = np.full(len(epochs), np.nan)
     for other in (sensors.radar_m, sensors.wheel_m):
         if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
@@ -268,11 +268,11 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return ranges that match the position of the filter: echoes come late, a wrongly surveyed unit matches nowhere
-    (P2 3.3).
+    """Return ranges that match the filter's position: echoes arrive late, a wrongly surveyed unit matches nowhere (P2
+    3.3).
 
-    The position is predicted with the filter's speed since the block began, so that the gate widens with the square of
-    time.
+    The position is predicted with the filter's speed since the start of the block, so that the gate widens with the
+    square of time.
     """
     fixed = state.anchor
     if fixed is None:
@@ -295,7 +295,7 @@ def _block(time: np.datetime64) -> int:
 
 
 def _restart_state(state: FilterState, fixed: FilterFix) -> FilterState:
-    """Return the state at the beginning of a block: dead reckoning begins at the position of the filter."""
+    """Return the state at the start of a block: dead reckoning starts at the filter's position."""
     sensors = state.sensors
     if sensors.motion.tick:
         motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
@@ -314,8 +314,8 @@ def _find_fix(tracked: Tracked) -> FilterFix:
 def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:
     """Return arc lengths on the trajectory, shape (T,) [m].
 
-    A position beyond an end by no more than errors allow (four sigmas, or those of codes at a start) is moved to that
-    end; NaN further out.
+    A position beyond an end within its errors (four sigmas, or the code sigmas at a start) is moved to that end; NaN
+    further out.
     """
     arc, end = tracked.arc_m, trajectory.arc_m[-1]
     near = np.clip(arc, 0.0, end)
@@ -330,13 +330,13 @@ def gnss_epochs(
     *,
     slips: Slips | None = None,
 ) -> tuple[GnssEpochs, CycleSlipState | None]:
-    """Return the measurements of the filter, and the state of the slip detection.
+    """Return the filter's measurements, and the state of the slip detection.
 
     A code is the corrected pseudorange, NaN where it has a rejection reason that the filter does not weigh itself; its
-    standard deviation is that of the range times `noise_scale`, shape (T,).
+    standard deviation is the range sigma times `noise_scale`, shape (T,).
 
-    The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in
-    the Dopplers; the change of the carrier phase has both subtracted.
+    Dopplers still contain satellite clock drift and tropospheric rate, which are below 5 mm/s above 10 degrees; both
+    are subtracted from the carrier-phase change.
     """
     obs, columns = ranges.observations, ranges.columns
     after = state

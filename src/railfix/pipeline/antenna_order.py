@@ -1,8 +1,8 @@
 """Order of two antennas of one vehicle by their positions.
 
-Each antenna is positioned on its own trajectory, with its own offset from the vehicle. With the logs exchanged, or the
-vehicle turned round, both positions fit their ranges, but the front antenna comes out as far behind the rear one as
-it should be ahead.
+Each antenna is positioned on its own trajectory, with its own offset from the vehicle. With exchanged logs, or a turned
+vehicle, both positions fit their ranges, but the front antenna appears as far behind the rear antenna as it should be
+ahead.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from railfix.core.arrays import Datetimes
 from railfix.screens.pairs import pair_epochs
 from railfix.track.trajectory import Trajectory
 
-#: Pairs of positions within so much of the line share their reflections, and count as one sample [m].
+#: Length of a line stretch whose pairs of positions share their reflections and count as one sample [m].
 _STRETCH_M: Final = 50.0
-#: Stretches before there is a verdict: a train at rest has too few.
+#: Minimum number of stretches for a verdict; a train at rest has too few.
 _LEAST_STRETCHES: Final = 4
-#: Sigmas by which the distance must be below zero.
+#: Number of sigmas by which the distance must be below zero.
 _CERTAIN: Final = 5.0
-#: Antennas nearer to each other than this have no order [m].
+#: Smallest antenna distance with a defined order [m].
 _LEAST_DISTANCE_M: Final = 0.5
 
 
 class AntennaOrder:
-    """Mean distance of the front antenna ahead of the rear one of a vehicle on one track, as the positions have it.
+    """Mean distance of the front antenna ahead of the rear antenna on one track, from their positions.
 
-    `distance_m` is that by the vehicle file [m], in the direction that the vehicle faces; tags of a pair of epochs
-    differ by `tolerance_s` at most.
+    `distance_m` is the distance by the vehicle file [m], in the direction that the vehicle faces; time tags of a pair
+    of epochs differ by at most `tolerance_s`.
     """
 
     def __init__(self, front: Trajectory, rear: Trajectory, *, tolerance_s: float) -> None:
@@ -43,15 +43,16 @@ class AntennaOrder:
         apart = float(np.median(front.chainage_at(arcs[0]) - rear.chainage_at(arcs[1])))
         self._facing = front.front_sign
         self.distance_m = self._facing * rising
-        self._reference_m = apart - rising  # chainages may be those of a point of the vehicle
+        self._reference_m = apart - rising  # chainages may refer to a point of the vehicle
         self._tolerance_s = tolerance_s
-        #: By stretch of line: pairs, sum of their distances [m], sum of their variances [m^2].
+        #: For each stretch: number of pairs, sum of distances [m], sum of variances [m^2].
         self._stretches: dict[int, tuple[float, float, float]] = {}
 
     def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
-        """Add the positions of more epochs; whether the train is on a stretch not seen before.
+        """Add the positions of more epochs; return whether the train is on a new stretch.
 
-        Of each antenna time tags, chainage [m] and its sigma [m], shape (F,) and (R,); NaN where there is no position.
+        For each antenna the arguments are time tags, chainage [m] and sigma [m], shape (F,) and (R,); NaN without a
+        position.
         """
         at_front, at_rear = pair_epochs(front[0], rear[0], tolerance_s=self._tolerance_s)
         (place, other), (sigma, other_sigma) = (
@@ -61,7 +62,7 @@ class AntennaOrder:
         measured = self._facing * (place - other - self._reference_m)
         variance = sigma**2 + other_sigma**2
         known = np.isfinite(measured) & np.isfinite(variance)
-        # a gross error counts as no more than the distance of logs that are neither right nor exchanged
+        # a gross error is clipped, so that it supports neither the correct nor the exchanged order
         bound = 3.0 * abs(self.distance_m)
         measured, variance = np.clip(measured[known], -bound, bound), variance[known]
         stretch, which = np.unique(np.floor(place[known] / _STRETCH_M).astype(np.int64), return_inverse=True)
@@ -73,10 +74,11 @@ class AntennaOrder:
         return len(self._stretches) > seen
 
     def measure(self) -> tuple[float, float]:
-        """Return the mean distance of the front antenna ahead of the rear one, and its sigma [m]; NaN before a verdict.
+        """Return the mean distance of the front antenna ahead of the rear antenna, and its sigma [m]; NaN before a
+        verdict.
 
-        A stretch has the mean of its distances with the variance of a single pair, as what disturbs the positions there
-        does not average out; where the stretches scatter more than that, the sigma grows.
+        A stretch contributes its mean distance with the variance of a single pair, because position errors on a stretch
+        do not average out; if the stretches scatter more, the sigma grows.
         """
         if len(self._stretches) < _LEAST_STRETCHES:
             return float("nan"), float("nan")
@@ -88,7 +90,7 @@ class AntennaOrder:
 
     @property
     def note(self) -> str | None:
-        """Sentence on antennas in the wrong order; None where their order is right, or not certain."""
+        """Return a sentence on antennas in the wrong order; None if the order is correct or uncertain."""
         mean, sigma = self.measure()
         right = abs(self.distance_m)
         ahead = float(np.sign(self.distance_m)) * mean

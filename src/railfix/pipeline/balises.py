@@ -1,8 +1,8 @@
-"""Balises and virtual balises: positions of the filter at the readings, and the passing of each.
+"""Balises and virtual balises: filter positions at the readings, and the passing of each balise.
 
 The train was over a balise at arc length m at some time while ``|m - s| <= L``, s the position of the filter and L its
-level along the line. The interval ends where the balise is certainly behind. A passing takes the train from one side to
-the other, also when it reverses.
+level along the line. The interval ends when the balise is certainly behind the train. A passing takes the train from
+one side of the balise to the other, in either direction of travel.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from railfix.motion.samples import BaliseReadings, ListedBalises
 from railfix.track.trajectory import Trajectory, short_distance_m
 from railfix.tracking import BaliseEpochs, Tracked
 
-#: An identity read again within this time belongs to the same passing [s]: a second balise of a group, or a standing
+#: Readings of the same identity within this time belong to one passing [s]: a second balise of a group, or a standing
 #: train.
 AGAIN_S: Final = 60.0
 
 
 class BaliseLimits(Settings):
-    """Reader of balises on the vehicle."""
+    """Balise reader on the vehicle."""
 
-    #: Position of the reader ahead of the vehicle's middle, for an antenna without a vehicle file.
+    #: Position of the reader ahead of the vehicle's middle, or of the antenna without a vehicle file.
     ahead_m: float = 0.0
-    #: Least standard deviation of a reading along the line: SUBSET-036 has 1 m for the vital use of a balise's
+    #: Minimum standard deviation of a reading along the line: SUBSET-036 requires 1 m for the vital use of a balise's
     #: position.
     sigma_m: float = Field(default=1.0, gt=0)
 
@@ -40,9 +40,9 @@ class BaliseLimits(Settings):
 class BaliseState:
     """Last balise read before a chunk."""
 
-    balise: str = ""  #: Identity; blank before the first.
+    balise: str = ""  #: Identity; blank before the first reading.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    turn: int = 1  #: Column of `railfix.tracking.BaliseEpochs` that it was in.
+    turn: int = 1  #: Its column in `railfix.tracking.BaliseEpochs`.
 
 
 def arcs_of_balises(listed: ListedBalises, trajectory: Trajectory, limits: BaliseLimits) -> Floats:
@@ -60,18 +60,18 @@ def balise_epochs(
     state: BaliseState,
     limits: BaliseLimits,
 ) -> tuple[BaliseEpochs, BaliseState]:
-    """Return the balises at the epoch after each reading, and the state to pass on.
+    """Return the balises at the epoch after each reading, and the state for the next chunk.
 
-    Balises that are not listed are left out, and so is an identity read again within `AGAIN_S`. Balises take turns in
-    two columns: a sub-filter of the level without one of them is right whichever single balise is wrong. `edges`: the
-    epoch before the chunk, and its epochs, shape (T + 1,).
+    Unlisted balises are left out, and so are repeated readings within `AGAIN_S`. Balises alternate between two columns,
+    so that one of the two sub-filters without a column is correct whichever single balise is wrong. `edges` has the
+    epoch before the chunk and the epochs of the chunk, shape (T + 1,).
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.find_index(readings.balise), arcs_of_balises(listed, trajectory, limits)
     epoch = np.searchsorted(edges, readings.time, side="left") - 1
     known = (index >= 0) & (epoch >= 0) & (epoch < len(edges) - 1)
     known[known] = np.isfinite(arc[index[known]])
-    for k in np.flatnonzero(known):  # a few balises
+    for k in np.flatnonzero(known):  # loop over a few balises
         balise, time = str(readings.balise[k]), readings.time[k]
         if balise == state.balise and seconds(time - state.time) < AGAIN_S:
             continue
@@ -83,39 +83,41 @@ def balise_epochs(
     return found, state
 
 
-#: Verdicts on a passing or a reading.
+#: Possible verdicts on a passing or a reading.
 VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
 #: Confidence of an odometer by SUBSET-041 5.2.1.1: a constant, and a fraction of the distance since the last balise
 #: read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
-#: Epochs farther apart are not connected [s]; largest distance of a reading from the interval of its passing.
+#: Epochs farther apart are not connected [s]; it is also the largest time between a reading and the interval of its
+#: passing.
 _APART_S: Final = 2.0
-#: A balise farther than this from the position of the filter is wrong.
+#: A balise farther than this from the filter's position is wrong [m].
 _CONTRADICTION_SIGMAS: Final = 5.0
 _NEVER: Final = np.datetime64("NaT", "ns")
-#: Values of the filter, at each epoch.
+#: Filter values at each epoch.
 _VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Passing:
-    """A passing of a listed point, or a reading of a balise where the filter is not."""
+    """Passing of a listed point, or reading of a balise that contradicts the filter."""
 
     balise: str
-    #: Index in `VERDICTS`: a point without a balise; a balise that was read, or was not read though it was passed; a
-    #: reading that contradicts the filter, or of a balise that is not listed.
+    #: Index in `VERDICTS`: point without a balise; balise passed with, or without, a reading; reading that contradicts
+    #: the filter; reading of an unlisted balise.
     verdict: int
-    chainage_m: float  #: As listed; NaN where it is not.
-    #: Time of the passing by the filter, with its interval; for a contradicting reading the time of the reading, NaT.
+    chainage_m: float  #: Listed chainage; NaN if unlisted.
+    #: Time of the passing by the filter, with its interval; for a contradicting reading, the time of the reading and
+    #: NaT.
     time: np.datetime64
     earliest: np.datetime64 = _NEVER
     latest: np.datetime64 = _NEVER
     read: np.datetime64 = _NEVER  #: Time of the reading; NaT without one.
-    read_error_m: float = float("nan")  #: Listed chainage less that of the filter at the reading.
-    here: str = ""  #: For a reading that contradicts: the listed balise nearest to the position of the filter.
+    read_error_m: float = float("nan")  #: Listed chainage less the filter's chainage at the reading.
+    here: str = ""  #: For a contradicting reading, the listed balise nearest to the filter's position.
     #: At the passing or reading: speed, standard deviation, level and over- and under-reading amount of the position,
-    #: and the error allowed to an odometer that meets SUBSET-041 since the previous balise.
+    #: and the error that SUBSET-041 permits an odometer since the previous balise.
     speed_mps: float = float("nan")
     sigma_m: float = float("nan")
     level_m: float = float("nan")
@@ -125,20 +127,20 @@ class Passing:
 
 @dataclass(frozen=True, kw_only=True)
 class PassingState:
-    """State after a chunk; M places."""
+    """State of the passings after a chunk; M points."""
 
     time: Datetimes  #: Shape (1,) or (0,).
-    values: Floats  #: Values of the last epoch with a position, as `_VALUES`; shape (1, 5) or (0, 5).
-    #: Last certain side of the train at each point: -1 before it, 1 beyond, 0 unknown; shape (M,).
+    values: Floats  #: `_VALUES` of the last epoch with a position; shape (1, 5) or (0, 5).
+    #: Last certain side of the train at each point: -1 before the point, 1 beyond, 0 unknown; shape (M,).
     side: Integers
-    #: Time when that ended, and when the filter's position was last over it; shape (M,).
+    #: Time at which that side ended, and time at which the filter's position was last over the point; shape (M,).
     since: Datetimes
     over: Datetimes
-    over_values: Floats  #: `_VALUES` then, and the odometer's confidence; shape (M, 6).
+    over_values: Floats  #: `_VALUES` at that time, and the odometer's confidence; shape (M, 6).
     read: Datetimes  #: Last reading, shape (M,).
-    #: Not yet compared, as the epoch after them is to come.
+    #: Readings not yet compared, as the next epoch is not known.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Correct readings, beginning with the last one `_APART_S` before the chunk's end, with the filter's position [m].
+    #: Correct readings with the filter's position [m], from the last one `_APART_S` before the chunk's end on.
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -160,9 +162,9 @@ def find_passings(
     state: PassingState | None,
     limits: BaliseLimits,
 ) -> tuple[tuple[Passing, ...], PassingState]:
-    """Return the passings that ended in a chunk and the readings in it that are wrong, and the state to pass on.
+    """Return the passings that ended in a chunk, its wrong readings, and the state for the next chunk.
 
-    `listed` has balises and virtual ones, `readings` are those since the previous chunk, `tracked` has levels.
+    `listed` has balises and virtual balises, `readings` the readings since the previous chunk; `tracked` has levels.
     """
     state = state or PassingState.empty(len(listed))
     own = trajectory.arc_at_chainage(listed.chainage_m)
@@ -191,12 +193,12 @@ def _judge(
     state: PassingState,
     limits: BaliseLimits,
 ) -> tuple[PassingState, list[Passing]]:
-    """Return the state with the readings that are right, and those that are wrong."""
+    """Return the state with the correct readings, and the wrong readings."""
     wrong: list[Passing] = []
     read, right = state.read.copy(), list(state.right)
     heard = readings.time <= time[-1]
     index = listed.find_index(readings.balise)
-    for k in np.flatnonzero(heard):  # a few balises
+    for k in np.flatnonzero(heard):  # loop over a few balises
         at, mark, balise = readings.time[k], int(index[k]), str(readings.balise[k])
         row = min(int(np.searchsorted(time, at)), len(time) - 1)
         arc, speed, sigma, level, amount = values[row]
@@ -223,7 +225,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Return the confidence of an odometer at a point since the previous balise that was read [m]; NaN without one."""
+    """Return an odometer's confidence at a point since the previous balise reading [m]; NaN without one."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 
@@ -231,7 +233,7 @@ def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.date
 def _pass(
     listed: ListedBalises, arcs_m: Floats, turn_m: float, time: Datetimes, values: Floats, state: PassingState
 ) -> tuple[list[Passing], PassingState]:
-    """Return the passings that ended, and the state after."""
+    """Return the passings that ended, and the new state."""
     level = np.where(np.isfinite(values[:, 3]), values[:, 3], np.inf)[:, None]
     ahead = short_distance_m(arcs_m - values[:, :1], turn_m)
     far = np.abs(ahead) > 0.25 * turn_m
@@ -244,14 +246,14 @@ def _pass(
     if not len(state.time):
         sure[:] = side[0]
     found: list[Passing] = []
-    for row, mark in np.argwhere(changed):  # a few a passing
+    for row, mark in np.argwhere(changed):  # a few per passing
         before, after = ahead[row - 1, mark], ahead[row, mark]
         if far[row, mark]:
             sure[mark] = 0
             continue
 
         def instant(first: float, last: float, k: int = int(row)) -> np.datetime64:
-            """When a value that changes its sign between the epochs is zero; the first epoch where that is unknown."""
+            """Return the time of a value's zero crossing between epochs; the first epoch if it is unknown."""
             span = float(seconds(time[k] - time[k - 1]))
             known = np.isfinite(first - last) and first != last and span <= _APART_S
             return np.datetime64(time[k - 1] + timedelta(span * first / (first - last) if known else 0.0))
@@ -281,7 +283,7 @@ def _pass(
 
 
 def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
-    """Return a sentence on each balise that was missed, or read where it is not."""
+    """Return a sentence on each balise that was missed, or read at a wrong position."""
     notes = []
     for passing in passings:
         at, name = str(passing.time)[:21], f"{antenna}: balise {passing.balise}"
@@ -294,8 +296,8 @@ def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
             which = f", next to {passing.here}" if passing.here and passing.here != passing.balise else ""
             notes.append(
                 f"{name}, read at {at}, contradicts the filter: it is listed at {passing.chainage_m:.1f} m, the train "
-                f"was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; a wrong "
-                "identity, or a wrong place in the list"
+                f"was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; its "
+                "identity, or its position in the list, is wrong"
             )
         elif passing.verdict == NOT_LISTED:
             notes.append(f"{name}, read at {at}, is not listed on this line; the reading is not used")

@@ -1,4 +1,4 @@
-"""Range errors of a base station from its observations, corrected like those of the train."""
+"""Range errors of a base station from its observations, with the corrections of the train's ranges."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from railfix.track.trajectory import Trajectory
 #: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
 _NO_EPOCH: Final = "base station: no epoch of known position so far, nothing subtracted"
-#: Positions of a station that differ by no more than this are equal [m].
+#: Station positions within this distance are equal [m].
 _SAME_PLACE_M: Final = 0.01
 
 
@@ -43,14 +43,14 @@ class Stations(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BaseState:
-    """Errors of a base station so far, None at the start, and state of its carrier-phase stages."""
+    """Errors of a base station so far (None at the start), and state of its carrier-phase stages."""
 
     errors: BaseErrors | None = None
     carrier: CarrierState = field(default_factory=CarrierState)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Missing data of the station, one sentence."""
+        """One sentence on missing data of the station."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
@@ -62,16 +62,16 @@ class BaseState:
 class BaseStation:
     """A base station at a known position in the frame of the satellites, shape (3,) [m].
 
-    Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase where
-    available, which reduces the station's own noise. The station's own multipath remains. With "stream" the position is
-    that in the headers of its observations; a station that moves by more than a centimetre (the next virtual one)
+    Its pseudoranges are corrected as the train's, with the same settings, and smoothed by carrier phase where
+    available, which reduces the station's noise. The station's multipath remains. With "stream" the position is taken
+    from the headers of its observations; a station that moves by more than a centimetre (the next virtual station)
     restarts.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:
         if config.dual_frequency_sbas:
             raise SettingsError(
-                "SBAS on L5 corrects codes of two frequencies, and those of a base station are of one; "
+                "SBAS on L5 corrects codes of two frequencies, but a base station has codes of one; "
                 "leave one of the two out, or set sbas_band = L1"
             )
         self._config = config.replaced(frequencies="one")
@@ -82,7 +82,9 @@ class BaseStation:
     def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
-        """Return the state after more observations of the station, without data that no epoch from `began` on needs."""
+        """Return the state after more observations of the station, without data that is not needed from epoch `began`
+        on.
+        """
         state = state or BaseState()
         if obs is not None and len(obs):
             place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m
@@ -99,7 +101,7 @@ class BaseStation:
         return replace(state, errors=state.errors.drop_before(began - kept))
 
     def _rows(self, ecef_m: Floats) -> AntennaRows:
-        """Return a short line through the station."""
+        """Return a short trajectory through the station."""
         if self._antenna is None or np.any(self._antenna[0] != ecef_m):
             latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
             ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
@@ -110,7 +112,7 @@ class BaseStation:
     def errors(
         self, obs: Observations, received: Received, carrier: CarrierState, ecef_m: Floats
     ) -> tuple[BaseErrors, CarrierState]:
-        """Return the errors of some epochs, and the state of the carrier-phase stages after them."""
+        """Return the errors at the given epochs, and the state of the carrier-phase stages after them."""
         own = replace(received, base=None)
         channels = self._book.of(obs, received.navigation)
         rows, source = self._rows(ecef_m), correction_source(own, self._config)
@@ -147,7 +149,7 @@ class BaseStation:
 
 
 def check_base(config: Config, base: BaseStation | None) -> None:
-    """Raise SettingsError where settings need a base station that is not there, or replace one that is."""
+    """Raise SettingsError if settings require a missing base station, or exclude a given one."""
     if config.carrier == "fixed" and base is None:
         raise SettingsError("carrier = fixed: integers need a base station; give one (--base), or carrier = float")
     if config.sbas and base is not None:

@@ -39,13 +39,13 @@ from railfix.positioning.two_frequencies import Combined
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.track.trajectory import Trajectory
 
-#: Phases of satellites below this elevation are weighted as if at it [deg].
+#: Elevation below which the weights of phases no longer fall [deg].
 LOWEST_WEIGHTED_DEG = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarrierState:
-    """State of the carrier-phase stages of one antenna; None before the first epoch.
+    """Carrier-phase state of one antenna; None before the first epoch.
 
     `base_arc`: last arc of a base station's phase, by satellite and signal.
     """
@@ -80,9 +80,9 @@ def smooth_ranges(
     config: Config,
     states: Sequence[CarrierState],
 ) -> tuple[CorrectedRanges, list[CarrierState]]:
-    """Return the ranges with smoothed codes; the weights remain those of raw codes.
+    """Return the ranges with smoothed codes and the weights of raw codes.
 
-    Multipath and the error floor are not averaged out as white noise is.
+    Multipath and the error floor do not average out as white noise does.
     """
     obs = corrected.observations
 
@@ -114,8 +114,8 @@ def code_and_phase(
 ) -> tuple[PhasePositions, CarrierState]:
     """Return positions from code and phase, each from its own and earlier epochs, and the state (requirement A5; P4).
 
-    A phase is used where its code is. `slips`: of all channels of the observations; `arc_m`: positions from the codes
-    alone, shape (T,).
+    A phase is used if its code is used. `slips` covers all channels of the observations; `arc_m` has positions from
+    codes only, shape (T,).
     """
     time, columns, satellites = corrected.time, corrected.columns, corrected.satellites
     satellite, signal = corrected.satellite, corrected.signal
@@ -152,7 +152,7 @@ def code_and_phase(
 
 
 def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks, dict[tuple[str, str], int]]:
-    """Return where an arc of the base station's phase has ended, shape (T, K), and its last arcs."""
+    """Return the mask of ended arcs of the base station's phase, shape (T, K), and its last arcs."""
     assert corrected.base is not None
     keys = list(zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True))
     before = np.array([state.base_arc.get(key, -1) for key in keys], dtype=np.int64)
@@ -163,9 +163,9 @@ def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks,
 def _lasting(
     corrected: CorrectedRanges, ranges: Ranges, phases: Phases, limits: PhaseLimits, state: CarrierState
 ) -> tuple[Ranges, Phases]:
-    """Return ranges and phases for multipath that lasts `PhaseLimits.correlation_s`: weights are reduced accordingly.
+    """Return ranges and phases with weights reduced for multipath correlated over `PhaseLimits.correlation_s`.
 
-    The first epoch of an arc counts in full, so that the weights of an arc add up to its independent epochs.
+    The first epoch of an arc has full weight, so that the weights of an arc sum to its number of independent epochs.
     """
     before = last_arcs(corrected.satellite, corrected.signal, state.arcs)
     latest = np.maximum.accumulate(np.concatenate([before[None], phases.arc_id]))

@@ -1,6 +1,6 @@
 """Channels of a log that the settings allow.
 
-Computed once for each set of channels: a log of a day has few, and most live epochs have the same one.
+They are computed once for each set of channels: a daily log has few sets, and most live epochs have the same one.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ def missing_notes(received: Received, config: Config, second: SecondCodes | None
     if known.precise is None and not len(known.kepler) and not len(known.glonass):
         notes.append("no navigation record is known; give navigation to EpochProcessor or to process")
     if config.frequencies == "two" and second is None:
-        why = "SBAS on L1 corrects one" if config.sbas else "no satellite has a second code"
-        why = why if received.base is None else "a base station subtracts errors of one"
-        notes.append(f"frequencies: two asked for, one used: {why}")
+        why = "SBAS on L1 corrects a single frequency" if config.sbas else "no satellite has a second code"
+        why = why if received.base is None else "a base station corrects a single frequency"
+        notes.append(f"frequencies: two requested, one used: {why}")
     return tuple(notes)
 
 
@@ -47,7 +47,7 @@ class ChannelBook:
         self._known: dict[tuple[object, ...], Channels] = {}
 
     def of(self, obs: Observations, navigation: Navigation) -> Channels:
-        """Return the channels of some observations; GLONASS frequencies are those of the log, or of the records."""
+        """Return the channels of observations; GLONASS frequencies are taken from the log or from the records."""
         glonass = {**glonass_channels(navigation), **obs.header.glonass_channel}
         key = (
             obs.satellite.tobytes(),

@@ -1,4 +1,4 @@
-"""A chunk of epochs between the stages of the pipeline."""
+"""Chunk of epochs between the stages of the pipeline."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from railfix.screens import PairedEpochs, Screened
 class Chunk:
     """Epochs of all antennas, concatenated, and the outputs of the stages so far."""
 
-    names: tuple[str, ...]  #: Of the antennas.
-    antennas: AntennaRows  #: Their trajectories and rows.
+    names: tuple[str, ...]  #: Observations of the antennas.
+    antennas: AntennaRows  #: Trajectories and rows of the antennas.
     corrected: CorrectedRanges  #: Corrected ranges with the verdicts so far.
     pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
-    sensors: SensorSamples | None  #: Samples of the sensors on board since the previous chunk.
+    sensors: SensorSamples | None  #: On-board sensor samples since the previous chunk.
     notes: tuple[str, ...]
-    screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metric and verdict of each screen of observations.
-    combined: Combined | None = None  #: How codes of two frequencies were combined.
-    slips: Slips | None = None  #: Of all channels of the observations, where the carrier phase is used.
+    screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metric and verdict of each observation screen.
+    combined: Combined | None = None  #: Combination of the codes of two frequencies.
+    slips: Slips | None = None  #: Cycle slips of all channels of the observations, if the carrier phase is used.
     solution: Solution | None = None  #: Positions of single epochs.
-    interference: Sequence[Interference | None] = ()  #: Of each antenna.
-    #: Verdicts of the screens of positions, by antenna and screen.
+    interference: Sequence[Interference | None] = ()  #: Single-epoch interference result of each antenna.
+    #: Verdicts of the position screens, by antenna and screen.
     judged: Mapping[str, Mapping[str, Screened]] = field(default_factory=dict)
 
     @property
     def rows(self) -> dict[str, slice]:
-        """Epochs of each antenna among those of all."""
+        """Rows of each antenna's epochs."""
         return dict(zip(self.names, self.antennas.parts, strict=True))

@@ -1,6 +1,6 @@
 """Settings of a run: one frozen model, from Python or from TOML; misspelt keys are rejected.
 
-Each package defines its own limits; this module collects them under the names that the configuration file uses::
+Each package defines its own limits; this module collects them under their names in the configuration file::
 
     preset = "default"
     systems = ["G", "J", "E", "C"]
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
 
 
-#: Measurements that the filter along the track can use, as its column `sources` names them.
+#: Measurements that the filter along the track can use, with their names in the column `sources`.
 FilterSource = Literal["code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range"]
 FILTER_SOURCES: Final[tuple[FilterSource, ...]] = (
     "code", "phase", "doppler", "wheel", "radar", "force", "feature", "balise", "range",
@@ -62,8 +62,8 @@ FILTER_SOURCES: Final[tuple[FilterSource, ...]] = (
 #: Names of the screens, in the order in which they are run.
 SCREEN_NAMES: Final = tuple(screen.name for screen in SCREENS)
 
-#: Settings by the name of their preset. "strict": accuracy before availability. "p1": exactly table 6
-#: of P1, for geodetic receivers at 10 Hz.
+#: Settings of each preset. "strict" prefers accuracy to availability; "p1" is exactly table 6 of P1, for geodetic
+#: receivers at 10 Hz.
 PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
     "default": {},
     "strict": {"largest_sigma_m": 10.0, "failed_checks": "drop"},
@@ -86,7 +86,7 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
 if TYPE_CHECKING:
 
     class ScreenSettings(Settings):
-        """Limits of the screens, one group each; the class below has those of `railfix.screens.SCREENS`."""
+        """Limits of the screens, one group each; the class below has the groups of `railfix.screens.SCREENS`."""
 
         elevation: ElevationLimits = ElevationLimits()
         cn0: Cn0Limits = Cn0Limits()
@@ -99,13 +99,13 @@ else:
         "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
     )
 
-#: Time off the map after which the filter drops its position, or on it after which it restarts. On the recordings, with
-#: a right map, no two positions in a row are off it.
+#: Time off the map after which the filter drops its position, and time on the map after which it restarts. On the
+#: recordings, with a correct map, no two consecutive positions are off the map.
 OFF_MAP_S: Final = 10.0
 
 
 class Config(ScreenSettings):
-    """Settings of the positioning, each with its default and the default's source.
+    """Positioning settings, each with its default and the default's source.
 
     Attributes
     ----------
@@ -124,11 +124,12 @@ class Config(ScreenSettings):
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     #: Signals of each constellation in order of preference; the first one observed is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    frequencies: Literal["one", "two"] = "one"  #: Codes of a satellite combined (not with SBAS on L1).
-    two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of that.
-    #: Screens that are on; health and validity of the satellites are always checked.
+    #: Number of codes per satellite that are combined (not with SBAS on L1).
+    frequencies: Literal["one", "two"] = "one"
+    two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of two codes.
+    #: Active screens; health and validity of the satellites are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
-    #: File of the mean C/N0 over elevation (``railfix cn0-curve``); without it only the floor is used.
+    #: File with the mean C/N0 over elevation (``railfix cn0-curve``); without it only the floor is used.
     cn0_curve: Path | None = None
     #: Coordinates of positions with a failed check (`reasons.CHECK_FAILED`): kept, with the status of the check, or
     #: dropped as P1 does.
@@ -137,62 +138,65 @@ class Config(ScreenSettings):
     #: `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared. P4 takes
     #: a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed checks.
     largest_sigma_m: float = Field(default=20.0, gt=0)
-    #: Satellites that a position needs. P1 3.2: 3; 2 is possible and ambiguous on curves.
+    #: Minimum number of satellites for a position. P1 3.2 uses 3; 2 is possible and ambiguous on curves.
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)  #: Largest along-track dilution [m/m] of a position.
-    #: Probability that noise alone puts a position off the map; the noise is judged by the residuals of the 3-D fit.
+    #: Probability that noise alone moves a position off the map; the noise is estimated from the residuals of the 3-D
+    #: fit.
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
     #: Probability of another track above which no position on a network is `ok`, `tracking` or has a level. `railfix
-    #: which-track` allows the same.
+    #: which-track` uses the same limit.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the delay.
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the delay.
     #: Limit on the age of a record, tighter than its validity.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
-    #: Replacement of the track's own map error (P1: 0.30 m, 0.60 m).
+    #: Map error that replaces the track's own (P1: 0.30 m, 0.60 m).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
-    lasting_errors: LastingErrorLimits = LastingErrorLimits()  #: Satellites that are wrong for a minute and longer.
-    #: Selection of the ranges of an epoch that agree with each other; clock offsets and noise are estimated from them.
+    #: Test for persistent range errors of a minute and longer.
+    lasting_errors: LastingErrorLimits = LastingErrorLimits()
+    #: Selection of consistent ranges of an epoch, from which clock offsets and noise are estimated.
     robust_fit: RobustFitLimits = RobustFitLimits()
     map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
     interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
     noise: CodeNoise = CodeNoise()  #: Limits of the weights and the screens.
-    #: Logs of SBAS messages, or "stream" for those of the receivers: their corrections replace the models, and
-    #: satellites without a valid one are rejected. Empty: no SBAS.
+    #: Logs of SBAS messages, or "stream" for the receivers' messages. SBAS corrections replace the models, and
+    #: satellites without a valid correction are rejected. Empty for no SBAS.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
-    #: Messages to use: those of L1 correct GPS L1 C/A, those of L5 (dual-frequency) the ionosphere-free codes of GPS L1
-    #: C/A and L5, Galileo E1 and E5a. Satellites without both codes are rejected.
+    #: Messages to use: L1 messages correct GPS L1 C/A; L5 messages (dual-frequency) correct the ionosphere-free codes
+    #: of GPS L1 C/A and L5, and of Galileo E1 and E5a. Satellites without both codes are rejected.
     sbas_band: Literal["L1", "L5"] = "L1"
     #: GEO whose messages are used; "best" is the GEO with the most usable fast corrections (L5: most corrections).
     sbas_prn: int | Literal["best"] = "best"
-    sbas_limits: SbasLimits = SbasLimits()  #: Time-outs, use of message type 0, treatment of missing degradation data.
+    #: SBAS time-outs, use of message type 0, and treatment of missing degradation data.
+    sbas_limits: SbasLimits = SbasLimits()
     base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
-    #: Errors by direction and C/N0 (``railfix error-model``): in the protection level the sigma of no range falls below
-    #: their overbounds. Weights, screens and RAIM still use `noise`. Without it the level is based on `noise` times
-    #: the scale estimated so far, which bounds no tails.
+    #: Errors by direction and C/N0 (``railfix error-model``): in the protection level no range sigma is below their
+    #: overbounds. Weights, screens and RAIM still use `noise`. Without it the level is based on `noise` times the scale
+    #: estimated so far, which does not bound the tails.
     error_model: Path | None = None
-    #: Satellite and atmospheric errors, added to a model of local errors where SBAS does not give them.
+    #: Satellite and atmospheric errors that are added to a model of local errors without SBAS.
     nominal: NominalErrors = NominalErrors()
-    protection: Literal["on", "off"] = "on"  #: Protection level along the line with its parts.
+    protection: Literal["on", "off"] = "on"  #: Whether the protection level along the line is computed, with its parts.
     #: Integrity risk per hour, its allocation, and the fault probabilities that the level assumes.
     risk: RiskBudget = RiskBudget()
-    #: Integrity support message (TOML, ``docs/protection-level.md``): its satellites get additional ARAIM levels, along
-    #: the track and in 3-D. Not with SBAS.
+    #: Integrity support message (TOML, ``docs/protection-level.md``) for additional ARAIM levels, along the track and
+    #: in 3-D. Not with SBAS.
     integrity_support: Path | None = None
-    araim: AraimBudget = AraimBudget()  #: Allocation of the risk of these.
+    araim: AraimBudget = AraimBudget()  #: Risk allocation of the ARAIM levels.
     #: Largest protection level of an available position. P4 takes a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
-    #: Chainages from and to where local faults cannot be bounded: no level there (``railfix error-model`` prints those
-    #: of its runs).
+    #: Chainage intervals in which local faults cannot be bounded and no level is given (``railfix error-model`` prints
+    #: the intervals of its runs).
     no_level_m: tuple[tuple[float, float], ...] = ()
     #: Whether positions also get P4's level: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
-    #: Use of the carrier phase: none; codes smoothed by it; or code and phase together with float ambiguities, from
-    #: this and earlier epochs, or with integer ambiguities, which need a base station ("fixed"). On recordings
-    #: smoothing helps most on a phone, float ambiguities under open sky; in towns, where arcs last seconds, neither
-    #: removes large errors.
+    #: Use of the carrier phase: none; smoothing of codes; or code and phase together from this and earlier epochs, with
+    #: float ambiguities, or with integer ambiguities, which require a base station ("fixed"). On recordings, smoothing
+    #: helps most on a phone, float ambiguities under open sky; in towns, where arcs last seconds, neither removes large
+    #: errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
@@ -201,15 +205,15 @@ class Config(ScreenSettings):
     smoothing: SmoothingLimits = SmoothingLimits()
     continuity: ContinuityLimits = ContinuityLimits()
     phase: PhaseLimits = PhaseLimits()
-    #: Filter along the track: codes, Dopplers, changes of the carrier phase and sensors, from this and earlier epochs.
-    #: `railfix run` and `railfix demo` request it.
+    #: Filter along the track over codes, Dopplers, carrier-phase changes and sensors, from this and earlier epochs.
+    #: `railfix run` and `railfix demo` switch it on.
     filter: Literal["track", "off"] = "track"
-    #: Measurements that the filter uses: `code`, `phase` and `doppler` of the satellites, and `wheel`, `radar`,
-    #: `force`, `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the sensors on board.
+    #: Measurements of the filter: `code`, `phase` and `doppler` of the satellites, and `wheel`, `radar`, `force`,
+    #: `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the on-board sensors.
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
-    tracking: TrackingLimits = TrackingLimits()  #: Noise of motion and measurements of that filter.
-    sensors: SensorLimits = SensorLimits()  #: Noise of the sensors on board, and the wheel of the tachometer.
-    #: Limits of these stages.
+    tracking: TrackingLimits = TrackingLimits()  #: Process and measurement noise of the filter.
+    sensors: SensorLimits = SensorLimits()  #: Noise of the on-board sensors, and the tachometer's wheel.
+    #: Limits of the sensor stages.
     clock_offsets: ClockOffsetLimits = ClockOffsetLimits()
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()
@@ -218,7 +222,7 @@ class Config(ScreenSettings):
     @model_validator(mode="before")
     @classmethod
     def _on_preset(cls, values: Any) -> Any:
-        """Return the given settings over those of the preset; an unknown preset is rejected by its own field."""
+        """Merge the given settings over the preset; an unknown preset is rejected by its own field."""
         if not isinstance(values, dict):
             return values
         return _over(PRESETS.get(str(values.get("preset", "default")), {}), values)
@@ -251,7 +255,7 @@ class Config(ScreenSettings):
     def _codes_with_l5(self) -> Self:
         if self.dual_frequency_sbas and self.carrier in ("float", "fixed"):
             raise ValueError(
-                f"sbas_band = L5 corrects codes of two frequencies, carrier = {self.carrier} takes the phase of one: "
+                f"sbas_band = L5 corrects codes of two frequencies, carrier = {self.carrier} uses the phase of one: "
                 "give carrier = off or smoothed"
             )
         return self
@@ -264,27 +268,27 @@ class Config(ScreenSettings):
     @model_validator(mode="after")
     def _support_without_sbas(self) -> Self:
         if self.integrity_support is not None and self.sbas:
-            raise ValueError("integrity_support states what SBAS does: give one of the two")
+            raise ValueError("integrity_support and SBAS both state satellite errors: give one of the two")
         return self
 
     @cached_property
     def fix_limits(self) -> FixLimits:
-        """Limits of the stages from 3-D position to position on the line."""
+        """Limits of the stages from the 3-D position to the position on the line."""
         return FixLimits(self.min_satellites, self.single_point, self.section, self.constrained)
 
     @cached_property
     def local_risk(self) -> RiskBudget:
-        """Risk budget of local faults alone, where SBAS covers satellite faults."""
+        """Risk budget of local faults only, as SBAS covers satellite faults."""
         none = dict.fromkeys(self.risk.satellite_prior, 0.0)
         return self.risk.replaced(satellite_prior=none, constellation_prior={})
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return the settings as plain values for JSON."""
         return self.model_dump(mode="json")
 
 
 def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings over those of a preset: groups are merged by key, limits given as an object are unchanged."""
+    """Merge settings over a preset: groups are merged by key, limits given as an object are unchanged."""
     both = {**preset, **values}
     for name, group in preset.items():
         given = values.get(name)
@@ -299,7 +303,7 @@ def parse_config(values: Mapping[str, Any], *, source: str = "settings") -> Conf
     Raises
     ------
     SettingsError
-        Names the source, the setting, and what was expected.
+        The message names the source, the setting, and the expected value.
     """
     return validate(Config, values, source=source)
 

@@ -1,4 +1,4 @@
-"""Coordinates of positions along a trajectory, computed when they are first asked for."""
+"""Coordinates of positions along a trajectory, computed at their first use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from railfix.track.trajectory import Trajectory
 
 
 class LineCoordinates:
-    """Base of dataclasses with arc lengths of T epochs on a trajectory: `arc_m`, NaN where there is no position."""
+    """Base of dataclasses with arc lengths `arc_m` of T epochs on a trajectory; NaN without a position."""
 
     if TYPE_CHECKING:  # fields of the dataclass
 
@@ -26,12 +26,12 @@ class LineCoordinates:
 
     @cached_property
     def chainage_m(self) -> Floats:
-        """Distance along the line, of the point of the vehicle that the trajectory names, shape (T,) [m]."""
+        """Distance along the line of the trajectory's vehicle point, shape (T,) [m]."""
         return self.trajectory.chainage_at(self.arc_m)
 
     @cached_property
     def kilometrage_m(self) -> Floats:
-        """The line's own marking, shape (T,) [m]; NaN where the map has none."""
+        """Kilometrage as marked on the line, shape (T,) [m]; NaN where the map has none."""
         line = self.trajectory
         return interpolate_kilometrage(self.chainage_m, line.chainage_m, line.kilometrage_m)
 

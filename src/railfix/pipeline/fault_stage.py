@@ -1,4 +1,4 @@
-"""Ranges without satellites that are wrong for long and without single faults, and noise scales, of a chunk."""
+"""Exclusion of persistent and single faults from the ranges of a chunk, and noise scales."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Larger variances of an epoch's ranges against their weights are errors, not noise: 100 sigmas.
+#: Largest variance ratio of an epoch's ranges that counts as noise: 100 sigmas; larger ratios are errors.
 _LARGEST_VARIANCE: Final = 1e4
 
 
@@ -37,11 +37,11 @@ class CheckedRanges(NamedTuple):
     corrected: CorrectedRanges
     ranges: Ranges
     fix: LineFix
-    model: LinearModel  #: Of the positions.
+    model: LinearModel  #: Linear model of the positions.
     raim: RaimResult
     scale: Floats  #: Noise scale of the receiver, shape (T,).
-    off_map: Masks  #: Epochs whose ranges contradict the map, shape (T,).
-    lasting: Masks  #: Satellites that are wrong for long, shape (T, K).
+    off_map: Masks  #: Epochs with ranges inconsistent with the map, shape (T,).
+    lasting: Masks  #: Satellites with persistent errors, shape (T, K).
 
 
 def check_ranges(
@@ -52,10 +52,10 @@ def check_ranges(
     config: Config,
     states: Sequence[AntennaState],
 ) -> tuple[CheckedRanges, list[AntennaState]]:
-    """Return positions without satellites that are wrong for long, then without single faults, and noise scales.
+    """Return positions after the exclusion of persistent and then of single faults, and noise scales.
 
-    The robust scale, which RAIM tests with, is learnt from ranges that agree with each other; the stated one from those
-    that RAIM left.
+    The robust scale, which RAIM uses, is estimated from mutually consistent ranges; the reported scale from the ranges
+    after RAIM.
     """
     time, near = corrected.time, corrected.near_ecef_m
     on, noises = "raim" in config.screens, [state.noise for state in states]
@@ -115,15 +115,15 @@ def check_ranges(
 
 @lru_cache
 def _chi_square_limit(risk: float, freedom: int) -> float:
-    """Return the chi-square value that noise exceeds with a probability of `risk`."""
+    """Return the chi-square quantile that noise exceeds with the probability `risk`."""
     return float(scipy.special.chdtri(freedom, risk))
 
 
 def contradict_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Masks:
-    """Return the epochs whose ranges contradict the map at the position, or pull it beyond an end, shape (T,).
+    """Return the epochs whose ranges contradict the map at the position, or move it beyond an end, shape (T,).
 
-    The line fits worse than the 3-D position, in variances that the 3-D fit itself shows (1 at least): the misfit of
-    the line must not be measured by itself.
+    At these epochs the line fits worse than the 3-D position, in units of the residual variance of the 3-D fit (at
+    least 1), so that the misfit of the line does not enter its own unit.
     """
     point, constrained = fix.point, fix.constrained
     wsse = constrained.wsse

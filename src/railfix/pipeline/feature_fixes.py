@@ -1,4 +1,4 @@
-"""Positions by the features of a line that the body has passed."""
+"""Positions from features of the line that the vehicle body has passed."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from railfix.tracking import Line
 
 #: Below this speed the rates are not used [m/s].
 SLOWEST_MPS: Final = 1.0
-#: Rates over a length are the mean over this many metres: the body's oscillations are shorter.
+#: Averaging length of the rates, in metres; the body's oscillations are shorter.
 _LEAST_POINTS: Final = 30
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineFeatures:
-    """Gradient and curvature of a line, and its features in order; arc lengths are those of the line itself."""
+    """Gradient, curvature and ordered features of a line; arc lengths refer to the line itself."""
 
     series: LineSeries
     features: tuple[Feature, ...]
-    #: Arc lengths of the antenna's trajectory, and of the body's middle on the line then: the body turns about it;
-    #: shape (V,).
+    #: Arc lengths of the antenna's trajectory, and of the body's middle, about which the body turns, on the line; shape
+    #: (V,).
     antenna_m: Floats
     body_m: Floats
-    line: Line  #: Shows whether it is closed.
+    line: Line  #: Trajectory, which states whether the line is closed.
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
-        """Return the features of a track for the body that carries an antenna."""
+        """Return the features of a track for the vehicle body with an antenna."""
         line = curved_line(track)
         series = line_series(line)
         body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
@@ -59,7 +59,7 @@ class LineFeatures:
 
 
 def ahead_m(trajectory: Trajectory) -> float:
-    """Return how far an antenna is ahead of the vehicle's middle in rising arc length [m]; 0 without a vehicle."""
+    """Return the distance of an antenna ahead of the vehicle's middle in rising arc length [m]; 0 without a vehicle."""
     if trajectory.body_chainage_m is None:
         return 0.0
     return float(np.median(trajectory.chainage_m - trajectory.body_chainage_m))
@@ -69,16 +69,16 @@ def ahead_m(trajectory: Trajectory) -> float:
 class RateSeries:
     """Rates of the body at K ticks."""
 
-    #: Times for which they are valid, and when they became known; shape (K,).
+    #: Times of validity, and times at which the rates became known; shape (K,).
     time: Datetimes
     known: Datetimes
-    distance_m: Floats  #: Wheel's distance since the tick before the first, in rising arc length; shape (K,).
-    arc_m: Floats  #: Position of the antenna by the wheel; NaN where it is not known; shape (K,).
+    distance_m: Floats  #: Wheel distance since the tick before the first, in rising arc length; shape (K,).
+    arc_m: Floats  #: Antenna position by the wheel; NaN if unknown; shape (K,).
     #: Change of heading (+ to the right) and of pitch (+ nose up) since the previous tick, shape (K,).
     turned_rad: Floats
     climbed_rad: Floats
-    speed_mps: Floats  #: In rising arc length, shape (K,).
-    rolls: Masks  #: The wheel rolls, shape (K,).
+    speed_mps: Floats  #: Speed in rising arc length, shape (K,).
+    rolls: Masks  #: True where the wheel rolls, shape (K,).
 
     def arc_at(self, time: Datetimes) -> Floats:
         """Return positions at times after the first tick, from the preceding tick [m]."""
@@ -91,14 +91,14 @@ class RateSeries:
 class FeatureState:
     """State of the feature search after a chunk."""
 
-    distance_m: float = 0.0  #: Distance at the last tick.
-    angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch there, from any beginning [rad].
+    distance_m: float = 0.0  #: Wheel distance at the last tick.
+    angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch at the last tick, from an arbitrary origin [rad].
     #: Whole metres passed without a break, in the order of travel; shape (M,).
     metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    #: At each, shape (M,).
+    #: Heading and pitch at each metre, shape (M,).
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))
     pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
-    #: Position of the last accepted feature, its standard deviation, and the distance there [m].
+    #: Position of the last accepted feature, its standard deviation, and the wheel distance at the feature [m].
     last: tuple[float, float, float] | None = None
     done_m: float = float("nan")  #: Position up to which features have been compared; NaN before the first.
 
@@ -107,13 +107,13 @@ class FeatureState:
 class FeatureFix:
     """Verdict on one feature."""
 
-    tick: int  #: After which of the ticks it was passed.
+    tick: int  #: Index of the tick after which the feature was passed.
     feature: Feature
     located: LocatedFeature
 
     @property
     def correction_m(self) -> float:
-        """Position less that by the wheel [m]; NaN unless accepted."""
+        """Position less wheel position [m]; NaN unless accepted."""
         return self.located.arc_m - self.feature.arc_m
 
 
@@ -121,10 +121,10 @@ class _Stretch(NamedTuple):
     """Ticks without a break from `first` on, and the whole metres passed up to the last of them."""
 
     first: int
-    sense: float  #: 1 toward rising arc length, else -1.
-    distance_m: Floats  #: At all ticks of the chunk, the preceding tick at index 0.
+    sense: float  #: Direction: 1 toward rising arc length, else -1.
+    distance_m: Floats  #: Values at all ticks of the chunk, with the preceding tick at index 0.
     body_m: Floats  #: Position of the body's middle at each tick of the stretch.
-    behind_m: Floats  #: And the position that a feature must be behind to be compared.
+    behind_m: Floats  #: Position behind which a feature must be to be compared.
     metre: Integers
     heading_rad: Floats
     pitch_rad: Floats
@@ -142,11 +142,11 @@ def _fix_feature(
     facing: float,
     last: tuple[float, float, float] | None,
 ) -> FeatureFix | None:
-    """Compare the passed profile with a feature; `noise` is of the wheel's position and of the profile."""
+    """Compare the measured profile with a feature; `noise` covers the wheel position and the profile."""
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
-    # In rising arc length: for a vehicle that reverses or faces the other way the signs of pitch change, heading does
-    # not.
+    # Rates are in rising arc length: for a reversing or turned vehicle the sign of pitch changes, the sign of heading
+    # does not.
     passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
     place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
     profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])
@@ -169,12 +169,12 @@ def feature_fixes(
     *,
     noise: tuple[float, float],
 ) -> tuple[list[FeatureFix], FeatureState]:
-    """Return verdicts on the features that were passed, and the state to pass on.
+    """Return verdicts on the passed features, and the state for the next chunk.
 
-    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only distances without a slip and faster
-    than 1 m/s count: heading and pitch are integrals, and a break restarts them. `facing`: 1 where the front points to
-    rising arc length, else -1; `sigma_m`: standard deviation of the position by the wheel; `noise`: standard deviations
-    of gradient and curvature in one metre.
+    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only distances without slip and faster
+    than 1 m/s are used: heading and pitch are integrals, which a break restarts. `facing` is 1 if the front points to
+    rising arc length, else -1; `sigma_m` is the standard deviation of the wheel position; `noise` has the standard
+    deviations of gradient and curvature over one metre.
     """
     distances = np.concatenate([[0.0], rates.distance_m]) + state.distance_m
     heading, pitch = (
@@ -246,7 +246,9 @@ def _compare(
     last: tuple[float, float, float] | None,
     noise: tuple[float, float],
 ) -> LocatedFeature | None:
-    """Verdict on one feature by arc lengths, headings and pitches; None where it was not passed without a break."""
+    """Return the verdict on one feature from arc lengths, headings and pitches; None if it was not passed without a
+    break.
+    """
     arc_m, heading_rad, pitch_rad = profile
     about = arc_m - feature.arc_m
     near = np.flatnonzero(np.abs(about) <= HALF_LENGTH_M)

@@ -26,10 +26,10 @@ from railfix.tracking.result import is_bounded
 
 @dataclass(frozen=True, kw_only=True)
 class FilterFix:
-    """Position by the filter at its last epoch, from which dead reckoning by the wheel restarts every few seconds."""
+    """Filter position at the last epoch, from which dead reckoning by the wheel restarts every few seconds."""
 
     time: np.datetime64
-    #: NaN where the filter has not decided on a position.
+    #: Arc length; NaN if the filter has no unique position.
     arc_m: float
     sigma_m: float
     speed_mps: float
@@ -43,35 +43,35 @@ class FilterFix:
 class SingleEpochs:
     """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
-    noise_scale: Floats  #: Noise of the receiver's codes against their sigmas.
-    #: Position: after an outage codes are used again when it agrees with the dead-reckoned position.
+    noise_scale: Floats  #: Ratio of the receiver's code noise to the sigmas.
+    #: Single-epoch position; after an outage codes are used again when it agrees with the dead-reckoned position.
     arc_m: Floats
     sigma_m: Floats
     near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
-    off_map: Masks  #: The train is away from the line: `railfix.pipeline.off_map`.
-    map_offset: Masks  #: 3-D positions of the last minutes lie beside or above the line.
+    off_map: Masks  #: True where the train is away from the line (`railfix.pipeline.off_map`).
+    map_offset: Masks  #: True where the 3-D positions of the last minutes are beside or above the line.
     suspicion: Codes  #: `railfix.integrity.interference.Suspicion`.
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilterState(NotebookTable):
-    """State of the filter along the track of one antenna after a chunk."""
+    """Filter state of one antenna after a chunk."""
 
     slips: CycleSlipState | None = None  #: State of the carrier phases.
     track: TrackState | None = None
-    level: LevelState = field(default_factory=LevelState)  #: State of the filter that gives the levels.
+    level: LevelState = field(default_factory=LevelState)  #: State of the filter that computes the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
-    #: Position of the filter at the last epoch, and at the last epoch before the present block.
+    #: Filter position at the last epoch, and at the last epoch before the current block.
     fixed: FilterFix | None = None
     anchor: FilterFix | None = None
 
     gate: ReturnState = field(default_factory=ReturnState)
-    #: State of the comparison of distances by the wheel with those of single epochs, and of the filter.
+    #: State of the comparison of wheel distances with single-epoch distances, and with filter distances.
     wheel: WheelState = field(default_factory=WheelState)
     pulled: WheelState = field(default_factory=WheelState)
-    #: Last epoch at which positions or speeds of the two antennas disagreed.
+    #: Last epoch at which positions or speeds of the two antennas were inconsistent.
     disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    passings: PassingState | None = None  #: State of balises and virtual ones.
+    passings: PassingState | None = None  #: State of balises and virtual balises.
 
     def __repr__(self) -> str:
         if self.track is None or not self.track.hypotheses:
@@ -90,19 +90,21 @@ class FilterState(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True)
 class AlongTrack(LineCoordinates, NotebookTable):
-    """Positions of one antenna by the filter along the track, T epochs."""
+    """Filtered positions of one antenna at T epochs."""
 
-    tracked: Tracked  #: Output of the filter; channels as those of `AntennaResult.corrected`.
-    trajectory: Trajectory  #: Of the antenna.
-    arc_m: Floats  #: Positions on the trajectory, those just beyond an end on it; NaN further out; shape (T,).
-    direction: Codes  #: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
+    tracked: Tracked  #: Output of the filter, with the channels of `AntennaResult.corrected`.
+    trajectory: Trajectory  #: Trajectory of the antenna.
+    #: Positions on the trajectory; positions slightly beyond an end are moved to it, NaN further out; shape (T,).
+    arc_m: Floats
+    #: Direction: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
+    direction: Codes
     standstill: Masks  #: Shape (T,).
-    sensed: SensedMotion  #: Motion since the epoch before and the line under the body, by wheel and inertial unit.
-    #: Distance from the position of the other antenna less that of the antennas; NaN where it was not examined; shape
-    #: (T,).
+    #: Motion since the previous epoch, and properties of the line under the body, by wheel and inertial unit.
+    sensed: SensedMotion
+    #: Distance to the other antenna's position less the antenna spacing; NaN where not examined; shape (T,).
     spacing_error_m: Floats
-    wheel: WheelSigns | None = None  #: Distances by satellites against those of the wheel; None without a wheel.
-    passings: tuple[Passing, ...] = ()  #: Balises and virtual ones that were passed, and readings that are wrong.
+    wheel: WheelSigns | None = None  #: Comparison of satellite with wheel distances; None without a wheel.
+    passings: tuple[Passing, ...] = ()  #: Passed balises and virtual balises, and wrong readings.
 
     @property
     def time(self) -> Datetimes:
@@ -111,7 +113,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
 
     @property
     def motion(self) -> FilteredMotion:
-        """Positions and speeds, for the comparison with those of another antenna."""
+        """Positions and speeds, for the comparison with another antenna."""
         found = self.tracked
         return FilteredMotion(self.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
 

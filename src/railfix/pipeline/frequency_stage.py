@@ -18,12 +18,13 @@ from railfix.ranges.atmosphere import thin_shell_obliquity
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.screens import Screened, Verdict
 
-#: Key of the verdict.
+#: Key of this stage's verdict.
 NAME: Final = "two_frequencies"
-#: Arc, of 1000 km, over which the error of the ionosphere's model changes by its own size [rad].
+#: Correlation arc of the ionospheric model error, 1000 km [rad].
 _IONOSPHERE_ARC: Final = 0.157
-#: A delay about a plane over the sky, of itself: Galileo's have 0.06 of 1.5 m at a station in a solar minimum, 0.02 of
-#: 3.9 m on a drive in Japan, 0.05 of 6.4 m on a roof there in 2024 (0.35 m: Walter et al., Navigation 48, 2001).
+#: Deviation of a delay from a plane over the sky, as a fraction of the delay. Galileo delays deviate by 0.06 of 1.5 m
+#: at a station in a solar minimum, 0.02 of 3.9 m on a drive in Japan, 0.05 of 6.4 m on a roof in Japan in 2024 (0.35 m:
+#: Walter et al., Navigation 48, 2001).
 _IONOSPHERE_REST: Final = 0.05
 
 
@@ -34,7 +35,9 @@ def combine_frequencies(
     ionosphere_sigma_m: float,
     states: Sequence[TwoFrequencyState],
 ) -> tuple[CorrectedRanges, Combined, Verdict, list[TwoFrequencyState]]:
-    """Return the ranges with two codes combined, how, a verdict that weighs down where the two disagree, and states."""
+    """Return the ranges with two codes combined, the combination, a verdict that lowers weights of inconsistent codes,
+    and states.
+    """
     usable, second = corrected.reason == 0, corrected.second
     assert second is not None
     code = np.where(usable, corrected.corrected_code_m, np.nan)
@@ -72,7 +75,9 @@ def combine_frequencies(
 
 
 def _field_of_ionosphere(ranges: CorrectedRanges, vertical_m: float) -> Floats:
-    """Return sigmas of the modelled ionosphere by offset, gradients and the satellite's rest, shape (T, K, 4) [m]."""
+    """Return sigmas of the ionospheric model error: offset, two gradients and satellite remainder, shape (T, K, 4)
+    [m].
+    """
     obliquity, azimuth = thin_shell_obliquity(ranges.elevation_deg), np.radians(ranges.azimuth_deg)
     offset = vertical_m * obliquity
     to_pierce_point = np.radians(90.0 - ranges.elevation_deg) - np.arccos(1.0 / obliquity)

@@ -1,4 +1,4 @@
-"""Interference of each epoch: the signs of `railfix.integrity.interference` on the ranges and positions of a chunk."""
+"""Interference of each epoch: signs of `railfix.integrity.interference` in the ranges and positions of a chunk."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Reasons that ranges get because they contradict others, as those of a spoofer do.
+#: Rejection reasons of ranges that contradict others, as a spoofer's ranges do.
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )
-#: Reasons of satellites that are wrong separately, where they are few.
+#: Rejection reasons of satellites with separate errors, if they are few.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
-#: Largest number of satellites that are wrong by residuals, and of one clock by gross errors; a spoofer that gives a
-#: position of its own affects more.
+#: Largest number of satellites with separate errors by residuals, and per clock by gross errors; a spoofer with a
+#: consistent position affects more.
 _MOST_WRONG: Final = 2
 _MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
@@ -58,7 +58,7 @@ _FAILED: Final = np.isin(np.arange(len(Status)), [
     Status.OFF_MAP, Status.INCONSISTENT, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
 ])  # fmt: skip
 _IN_DOUBT: Final = _FAILED | (np.arange(len(Status)) == Status.UNCERTAIN)
-#: Statuses that causes give, and those that they outrank.
+#: Statuses assigned by causes, and the statuses that they outrank.
 _STATUS_BY_CAUSE: Final = (
     (Suspicion.JAMMING_SUSPECTED, np.arange(len(Status)) == Status.OK, Status.JAMMING_SUSPECTED),
     (Suspicion.SPOOFING_SUSPECTED, _UNDER_SPOOFING, Status.SPOOFING_SUSPECTED),
@@ -67,29 +67,29 @@ _STATUS_BY_CAUSE: Final = (
 )
 #: Interval between the checks for interference [ns].
 _SECOND_NS: Final = 1_000_000_000
-#: Where seconds begin: tags may be 5 ms before the whole one [ns].
+#: Start of a second: time tags may be 5 ms before the whole second [ns].
 _FIRST_NS: Final = int(GPS_EPOCH.astype(np.int64)) - 5_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class InterferenceState:
-    """State of the signs after a chunk."""
+    """State of the interference signs after a chunk."""
 
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
-    second: int = -1  #: GPS second of the last epoch that was checked.
-    #: Break and the receiver's alarms since then.
+    second: int = -1  #: GPS second of the last checked epoch.
+    #: Break and receiver alarms since then.
     broken: bool = False
     alarm: int = 0
-    latest: Interference | None = None  #: Of that epoch.
+    latest: Interference | None = None  #: Result at that epoch.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Interference(NotebookTable):
     """Interference of T epochs."""
 
-    causes: Bits  #: `Sign` bits, each for as long as its time of release; shape (T,).
+    causes: Bits  #: `Sign` bits, each held for its release time; shape (T,).
     power: PowerSigns
     motion: MotionSigns
 
@@ -102,7 +102,9 @@ class Interference(NotebookTable):
 def _motion_inputs(
     corrected: CorrectedRanges, single: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
-    """Return the ranges of some epochs, which have all reasons; `broken`: breaks since the previous epoch."""
+    """Return the inputs of selected epochs, whose ranges have all rejection reasons; `broken` marks breaks since the
+    previous epoch.
+    """
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
     near = np.where(np.isnan(consistent), single.point.ecef_m[rows], consistent)
@@ -132,7 +134,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return the satellites that are wrong individually, not by a spoofer of a whole clock; shape (T, K)."""
+    """Return the satellites with individual errors, not by a spoofer of a whole clock; shape (T, K)."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -150,10 +152,10 @@ def _find_interference(
     state: InterferenceState,
     limits: InterferenceLimits,
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of some epochs of one antenna, and the state for the next chunk.
+    """Return the interference at selected epochs of one antenna, and the state for the next chunk.
 
-    `cn0`: of the codes, shape (T, K); `gain`: of the front end; `alarm`: alarms of the receiver since the previous
-    epoch, of each; `failed`: their position failed a check.
+    `cn0` has the C/N0 of the codes, shape (T, K); `gain` the front-end gain; `alarm` the receiver alarms since the
+    previous epoch; `failed` marks positions that failed a check.
     """
     power, power_state = power_signs(inputs.time, inputs.channel, cn0, gain, state.power, limits)
     motion, motion_state = motion_signs(inputs, state.motion, limits, fitted)
@@ -166,7 +168,7 @@ def _find_interference(
 
 
 def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, limits: InterferenceLimits) -> Masks:
-    """Return which signs the epochs show separately, shape (T, causes)."""
+    """Return the signs of each epoch before holding, shape (T, causes)."""
     sigmas = limits.jump_sigmas
     by_cause = {
         Sign.RECEIVER_JAMMING: (alarm & 1) != 0,
@@ -180,7 +182,7 @@ def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, 
         Sign.POSITION_JUMP: (motion.position_jump_m >= limits.position_jump_m)
         & (motion.position_jump_sigmas >= sigmas),
         Sign.CONSTELLATIONS_PART: motion.part_sigmas >= limits.part_sigmas,
-        Sign.WHEEL_PARTS: np.zeros(len(alarm), dtype=np.bool_),  # by the filter along the track
+        Sign.WHEEL_PARTS: np.zeros(len(alarm), dtype=np.bool_),  # set by the filter along the track
         Sign.LEFT_MAP: (motion.off_line_m >= limits.off_map_m) & (motion.off_line_sigmas >= sigmas),
         Sign.TIME_TAGS: (np.abs(motion.tag_error_s) >= limits.tag_error_s)
         & (motion.tag_error_sigmas >= limits.tag_sigmas),
@@ -191,7 +193,7 @@ def _signs(alarm: Bytes, failed: Masks, power: PowerSigns, motion: MotionSigns, 
 
 @lru_cache
 def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return times of holding and of release by cause [s]."""
+    """Return holding and release times by cause [s]."""
     hold = {
         Sign.CN0_FALL: limits.hold_s, Sign.GAIN_FALL: limits.hold_s, Sign.EQUAL_CN0: limits.hold_s,
         Sign.LEFT_MAP: limits.hold_s, Sign.CONSTELLATIONS_PART: limits.part_hold_s,
@@ -206,18 +208,19 @@ def _times(limits: InterferenceLimits) -> tuple[Floats, Floats]:
 
 
 class _Due(NamedTuple):
-    """Epochs of one antenna at which interference is checked: the first of each second."""
+    """Epochs of one antenna at which interference is checked: the first epoch of each second."""
 
-    rows: Indices  #: Rows among those of all antennas, shape (n,).
-    group: Indices  #: How many there have been up to each epoch of the antenna, shape (T,).
-    #: Alarms of the receiver and breaks up to each of them, and those that count at the next one; shape (n + 1,).
+    rows: Indices  #: Row indices among all antennas, shape (n,).
+    group: Indices  #: Number of checked epochs up to each epoch of the antenna, shape (T,).
+    #: Receiver alarms and breaks up to each checked epoch, and alarms and breaks for the next checked epoch; shape (n +
+    #: 1,).
     alarm: Bytes
     broken: Masks
-    last: int  #: GPS second of the last epoch.
+    last: int  #: GPS second of the last epoch of the chunk.
 
 
 def _due(second: Integers, rows: slice, alarms: Bytes, breaks: Masks, state: InterferenceState) -> _Due:
-    """Return the epochs of one antenna at which interference is checked, by the GPS second of each; shapes (T,)."""
+    """Return the epochs of one antenna at which interference is checked, from their GPS seconds; shapes (T,)."""
     due = np.empty(len(second), dtype=np.bool_)
     due[:1], due[1:] = second[:1] != state.second, second[1:] != second[:-1]
     group = due.cumsum()
@@ -234,7 +237,9 @@ def _due(second: Integers, rows: slice, alarms: Bytes, breaks: Masks, state: Int
 def _on_all_epochs(
     due: _Due, found: Interference | None, state: InterferenceState
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of all epochs of one antenna; each has the result of the first epoch of its second."""
+    """Return the interference of all epochs of one antenna; each epoch gets the result of the first epoch of its
+    second.
+    """
     known = [each for each in (state.latest, found) if each is not None]
     if len(due.group) == 1:
         every = latest = known[-1]
@@ -250,9 +255,9 @@ def _on_all_epochs(
 
 
 def with_statuses(status: Codes, suspected: Sequence[Codes]) -> Codes:
-    """Return the statuses of positions (T,) with those of interference, where they are more serious.
+    """Return the statuses of positions (T,), replaced by interference statuses where these are more serious.
 
-    `suspected`: `Suspicion` of the epochs of each antenna, concatenated; empty where the check is off.
+    `suspected` is the `Suspicion` of all antennas' epochs, concatenated; empty if the check is off.
     """
     if not suspected:
         return status
@@ -271,8 +276,8 @@ def judge_interference(
 ) -> tuple[Sequence[Interference | None], list[InterferenceState]]:
     """Return interference and new state of each antenna; None where `InterferenceLimits.use` is off.
 
-    It is checked at the first epoch of each second; the others have that result. A break or an alarm
-    between counts at the next one.
+    It is checked at the first epoch of each second, whose result applies to the other epochs of the second. A break or
+    an alarm in between counts at the next check.
     """
     if limits.use == "off":
         return [None] * len(states), states

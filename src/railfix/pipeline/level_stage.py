@@ -35,23 +35,22 @@ from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Basis of a level: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
-#: satellites' own faults as well (ARAIM).
+#: Kinds of levels: SBAS integrity with fault hypotheses of local causes; or with hypotheses of satellite faults as well
+#: (ARAIM).
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
-#: Whether a status raises an alarm, by its number.
+#: Whether a status raises an alarm, by status number.
 _ALARMING: Final = np.array(
     [status in (*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET) for status in range(max(Status) + 1)]
 )
 
-#: Standing of a level: whether its priors were measured on the line, or assumed. An indicative level carries no risk
-#: an hour.
+#: Basis of a level: priors measured on the line, or assumed. For an indicative level no hourly risk is claimed.
 BASES: Final[tuple[str, str]] = ("measured", "indicative")
 
 
 def choose_basis(config: Config) -> str:
-    """Return which of `BASES` the levels of a run are."""
+    """Return the entry of `BASES` for the levels of a run."""
     return BASES[0] if config.risk.priors == "measured" else BASES[1]
 
 
@@ -73,7 +72,7 @@ def prior_basis_text(facts: Mapping[str, Any]) -> str:
 
 
 def choose_kind(config: Config) -> str:
-    """Return which of `KINDS` the levels of a run are."""
+    """Return the entry of `KINDS` for the levels of a run."""
     return KINDS[0] if config.sbas else KINDS[1]
 
 
@@ -82,7 +81,7 @@ def level_facts(config: Config) -> dict[str, Any]:
     if config.protection == "off":
         return {}
     risk = get_risk_budget(config)
-    sigmas = "noise settings times the receiver's estimated scale, 1 at least: no promise about tails"
+    sigmas = "noise settings times the receiver's estimated scale, at least 1: the tails are not bounded"
     return {
         "kind": choose_kind(config),
         "basis": choose_basis(config),
@@ -102,19 +101,19 @@ def level_facts(config: Config) -> dict[str, Any]:
 
 
 def get_risk_budget(config: Config) -> RiskBudget:
-    """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones remain."""
+    """Return the risk budget in use; SBAS covers satellite faults, so that only local faults remain with it."""
     return config.risk if choose_kind(config) == "separation" else config.local_risk
 
 
 def level_scale(scale: Floats, config: Config) -> Floats:
-    """Return the noise scale of the levels, shape (T,): 1 at least, unless an error model states the least sigmas."""
+    """Return the noise scale of the levels, shape (T,): at least 1, unless an error model states minimum sigmas."""
     return np.maximum(scale, 1.0) if config.error_model is None or config.sbas else scale
 
 
 def level_stage(
     checked: CheckedRanges, antennas: AntennaRows, offset: MapOffset, config: Config
 ) -> tuple[ProtectionResult | None, Masks]:
-    """Return the protection levels, None where they are off, and the epochs with open positions beyond them, (T,)."""
+    """Return the protection levels (None if off), and the epochs with possible positions beyond them, (T,)."""
     corrected, ranges, fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)
@@ -149,8 +148,8 @@ def protection_levels(
     """Return the protection levels of the positions of a chunk, from their model on the line.
 
     The part of the map's offset beyond its own sigma is a bias of the level; an undetected offset is covered by the
-    hypothesis of a wrong map. Quiet residuals shrink no level: the receiver's noise scale, shape (T,), counts as 1 at
-    least, and with an error model the sigma of no range falls below the model's. `sides`: `late_sides`.
+    hypothesis of a wrong map. Small residuals do not reduce a level: the receiver's noise scale, shape (T,), counts as
+    at least 1, and with an error model no range sigma is below the model's. `sides`: `late_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = protection_level(
@@ -164,7 +163,7 @@ def protection_levels(
 
 
 def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
-    """Return the model of positions whose sigmas (T, K) bound the errors of the ranges, and its scale."""
+    """Return the position model with overbounding range sigmas (T, K), and its scale."""
     weight = np.where(ranges.weight > 0, 1.0 / sigma_m**2, 0.0)
     found = fix.constrained
     model = linear_model(replace(ranges, weight=weight), antennas, found.arc_m, section=found.section)
@@ -172,9 +171,11 @@ def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix:
 
 
 def late_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, risk: RiskBudget) -> Masks:
-    """Return the satellites that can be late together, shape (T, S, K); `heading_deg` is the track's azimuth (T,).
+    """Return the sets of satellites whose codes can be late together, shape (T, S, K); `heading_deg` is the track's
+    azimuth (T,).
 
-    Low ones left and right of the track, and with `RiskBudget.late_sides` "all" those ahead and behind.
+    The sets are low satellites left and right of the track, and with `RiskBudget.late_sides` "all" also satellites
+    ahead and behind.
     """
     off_heading = np.radians(azimuth_deg - heading_deg[:, None])
     right, low = np.sin(off_heading) > 0, elevation_deg < risk.side_elevation_deg
@@ -190,10 +191,10 @@ def apply_verdicts(
 ) -> ProtectionResult:
     """Return the levels with the verdicts on the positions applied.
 
-    A level is valid at the position where the ranges were linearised. Where another position fits them equally well, or
-    they put it beyond an end of the map, the level is unavailable. Where a check has failed, or ranges and map
-    contradict each other: alarm. Epochs that lose their coordinates (`has`) lose the level; where it reaches a stretch
-    of `Config.no_level_m` it is infinite.
+    A level is valid at the position where the ranges were linearised. If another position fits the ranges equally well,
+    or they place it beyond an end of the map, the level is unavailable. A failed check, or a contradiction of ranges
+    and map, is an alarm. Epochs without coordinates (`has`) have no level; a level that reaches a stretch of
+    `Config.no_level_m` is infinite.
     """
     level, verdict = protection.level, protection.status
     if config.no_level_m or not has.all():
@@ -229,10 +230,10 @@ def compute_araim(
     support: IntegritySupport,
     config: Config,
 ) -> AraimResult:
-    """Return ARAIM levels of positions on the line, shape (T,).
+    """Compute ARAIM levels of positions on the line, shape (T,).
 
-    Integrity: URA of the message, atmosphere of `Config.nominal` and the noise of the ranges by its scale; accuracy and
-    thresholds: URE instead of URA. The ranges have all reasons.
+    The integrity sigmas combine the message's URA, the atmosphere of `Config.nominal` and the scaled range noise;
+    accuracy and thresholds use URE instead of URA. The ranges have all rejection reasons.
     """
     place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
@@ -272,7 +273,7 @@ def compute_araim(
 
 
 def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, Masks]:
-    """Return unit vectors (T, M, 3) and columns of the clocks (M, G) of the M channels that are used at any epoch."""
+    """Return unit vectors (T, M, 3) and clock columns (M, G) of the M channels used at any epoch."""
     channels = (corrected.reason == 0).any(axis=0)
     to_satellite = corrected.satellites.position_ecef_m[:, channels] - place[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2, keepdims=True)
@@ -282,7 +283,7 @@ def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, M
 
 
 def _rotate_geometry(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
-    """Return the geometry with the position along other axes, rows of shape (T, 3, 3)."""
+    """Return the geometry rotated to other position axes, given as rows of shape (T, 3, 3)."""
     design = geometry.design.copy()
     design[..., :_SPACE] = design[..., :_SPACE] @ axes.swapaxes(1, 2)
     return copy_with(geometry, design=design)

@@ -1,6 +1,6 @@
-"""Signs and units of Dopplers and carrier phases, by the range rates of the satellites.
+"""Check of signs and units of Dopplers and carrier phases against satellite range rates.
 
-A satellite's own motion changes its range by up to 800 m/s, much more than a train's or a receiver clock's. The factor
+A satellite's motion changes its range by up to 800 m/s, much more than a train or a receiver clock does. The factor
 between a constellation's Dopplers, or changes of its phases, and its range rates is 1; it is -1 with the wrong sign,
 and the wavelength if metres are given for cycles.
 """
@@ -19,10 +19,11 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Least range rate of a satellite, relative to the median of its constellation, for a factor [m/s].
+#: Minimum range rate of a satellite, relative to its constellation's median, for a factor [m/s].
 _LEAST_RATE_MPS: Final = 100.0
-#: Satellites that give a factor, and how far their factors are from the median one: all, or all but one of at least
-#: `_MANY`. With four satellites, one cycle slip moves the median rate, and with it the factors of the others.
+#: Minimum number of satellites for a factor, and largest deviation of their factors from the median; it applies to all
+#: satellites, or to all except one of at least `_MANY`. With four satellites, one cycle slip moves the median rate, and
+#: with it the factors of the others.
 _LEAST_SATELLITES: Final = 3
 _MANY: Final = 6
 _SPREAD: Final = 0.3
@@ -39,11 +40,11 @@ _NAMES: Final = {"G": "GPS", "J": "QZSS", "E": "Galileo", "C": "BeiDou", "R": "G
 class ObservableState:
     """State of the checks of one antenna after a chunk."""
 
-    #: Last factors of Dopplers and of phases, NaN before the first, shape (2, L), by letter of the constellation, ""
-    #: for all together, shape (L,).
+    #: Last factors of Dopplers and of phases, NaN before the first, shape (2, L), and constellation letters, "" for all
+    #: together, shape (L,).
     factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
     letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
-    #: Phases of the last epoch that gave factors and range rates of the satellites, shape (K,).
+    #: Phases and satellite range rates of the last epoch with factors, shape (K,).
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U6"))
     phase_m: Floats = field(default_factory=lambda: np.zeros(0))
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
@@ -53,9 +54,10 @@ class ObservableState:
 def check_observables(
     corrected: CorrectedRanges, state: ObservableState
 ) -> tuple[CorrectedRanges, list[str], ObservableState]:
-    """Return the ranges of one antenna without Dopplers and phases whose sign or unit is wrong, a sentence on each.
+    """Return the ranges of one antenna without Dopplers and phases of wrong sign or unit, and one sentence on each.
 
-    A factor is valid until the next one of its constellation; before the first one, that of all constellations is used.
+    A factor is valid until its constellation's next factor; before the first one, the factor of all constellations is
+    used.
     """
     second = corrected.time.astype("datetime64[s]")
     chosen = np.diff(second, prepend=np.array([state.time], dtype=second.dtype)) != np.timedelta64(0, "s")
@@ -92,9 +94,9 @@ def check_observables(
 
 
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
-    """Return the factor between observed rates and those of the satellites, shape (T,); NaN where it is unclear.
+    """Return the factor between observed and computed satellite rates, shape (T,); NaN where it is unclear.
 
-    The median over satellites of one constellation, shape (T, K), each relative to their median.
+    It is the median over the satellites of one constellation, shape (T, K), each relative to their median.
     """
     known = np.isfinite(observed_mps) & np.isfinite(expected_mps)
     few = known.sum(axis=1) <= _LEAST_SATELLITES
@@ -111,7 +113,7 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
 
 
 def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
-    """Return the factor of each epoch, shape (T,): the last known one of the `chosen` epochs; at first `before`."""
+    """Return the factor of each epoch, shape (T,): the last known factor of the `chosen` epochs, initially `before`."""
     values = np.concatenate([[before], factor])
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     return np.asarray(values[last][np.cumsum(chosen)])
@@ -120,7 +122,7 @@ def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
 def _phase_rates(
     time: Datetimes, channel: Strings, phase_m: Floats, rate_mps: Floats, state: ObservableState
 ) -> tuple[tuple[Floats, Floats], ObservableState]:
-    """Return changes of the phases since the epoch before and mean range rates [m/s], shape (T, K), and the state."""
+    """Return phase changes since the previous epoch and mean range rates [m/s], shape (T, K), and the state."""
     if not len(time):
         return (phase_m, rate_mps), state
     joined = join_channels(channel, [state.channel])
@@ -137,7 +139,9 @@ def _phase_rates(
 
 
 def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]) -> CorrectedRanges:
-    """Return the ranges without Dopplers and phases, all signals of the constellations; `bad`: by kind, (T, K)."""
+    """Return the ranges without bad Dopplers and phases, for all signals of the constellations; `bad` has a mask (T, K)
+    per kind.
+    """
     obs: Observations = corrected.observations
     of_channel: Indices = (obs.satellite.astype("<U1")[:, None] == letters).astype(np.intp)
     values = {"doppler_hz": obs.doppler_hz, "phase_cycles": obs.phase_cycles}
@@ -149,7 +153,7 @@ def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]
 
 
 def _sentence(kind: int, letter: str, factor: float, wavelength_m: float) -> str:
-    """Return the fault of the Dopplers or phases of a constellation."""
+    """Return a sentence on the fault of a constellation's Dopplers or phases."""
     if abs(factor + 1.0) <= _RIGHT:
         wrong = "have the wrong sign"
     elif abs(abs(factor) - wavelength_m) < 0.1:

@@ -1,4 +1,4 @@
-"""Whether a train is away from its line: positions of single epochs over some seconds."""
+"""Detection of a train away from its line, from single-epoch positions over some seconds."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from railfix.core.timescale import seconds
 _NEVER: Final = np.datetime64("NaT", "ns")
 #: Time for which the offset of a train off the map is stored [s].
 _REMEMBERED_S: Final = 30.0
-#: A train is back where the mean offset of its positions is a smaller share of what it was away; or metres.
+#: A train is back on the line if the mean offset of its positions is below this fraction of the offset while away, or
+#: below this many metres.
 _BACK_SHARE: Final = 0.5
 _BACK_M: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class OffMapState:
-    """State of the test after a chunk."""
+    """State of the off-map test after a chunk."""
 
-    off: bool = False  #: The train was off the map at the last epoch.
-    known: bool = False  #: A position has been tested; the first one of a log decides alone.
-    #: First of the last positions in a row that contradict `off`; NaT where the last one agrees with it.
+    off: bool = False  #: True if the train was off the map at the last epoch.
+    known: bool = False  #: True once a position has been tested; the first position of a log decides alone.
+    #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
+    #: it.
     since: np.datetime64 = _NEVER
-    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of the offsets since then.
-    #: Decayed sum and number of the offsets while it is away, and the time of the last one.
+    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of offsets since then.
+    #: Decayed sum and number of offsets while the train is away, and time of the last offset.
     away: Floats = field(default_factory=lambda: np.zeros(2))
     away_at: np.datetime64 = _NEVER
 
@@ -36,13 +38,14 @@ class OffMapState:
 def off_map_epochs(
     time: Datetimes, on_map: Masks, off_map: Masks, offset_m: Floats, state: OffMapState, *, least_s: float
 ) -> tuple[Masks, OffMapState]:
-    """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
+    """Return the epochs at which the train is off the map, shape (T,), and the state for the next chunk.
 
-    The train leaves the map once all positions of the last `least_s` are off it: a single position can be off it by
-    reflected signals. It returns once all of that time are on it, and their mean offset is within a metre or half of
-    what it was before: beside the line, on a track that the map lacks, positions are on it by chance. The first
-    position of a log decides alone. `on_map`, `off_map`: positions that the ranges fit, and that they contradict;
-    `offset_m`: 3-D positions right of the line, NaN for none; shapes (T,).
+    The train leaves the map once all positions of the last `least_s` are off the map; a single position can be off the
+    map by reflected signals. The train returns once all positions of that time are on the map, and their mean offset is
+    within a metre or half of the earlier offset: beside the line, on an unmapped track, positions are on the map by
+    chance. The first position of a log decides alone. `on_map` and `off_map` mark positions that fit the ranges, and
+    that contradict them; `offset_m` is the offset of 3-D positions to the right of the line, NaN if unknown; shapes
+    (T,).
     """
     off, known, since, back = state.off, state.known, state.since, state.back
     away, away_at = state.away, state.away_at

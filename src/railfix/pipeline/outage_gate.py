@@ -1,4 +1,4 @@
-"""Codes after an outage are used again once single epochs agree with the dead-reckoned position."""
+"""Gate of codes after an outage: they are used again once single epochs agree with the dead-reckoned position."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from railfix.core.timescale import seconds
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.tracking import Line
 
-#: Without codes for this time the position is that of the sensors [s].
+#: Time without codes after which the position counts as dead-reckoned [s].
 _OUTAGE_S: Final = 2.0
-#: Positions that must agree before codes count again.
+#: Number of positions that must agree before codes are used again.
 _AGREEING: Final = 3
-#: Standard deviation of a distance by the sensors since the beginning of a block, as a fraction.
+#: Relative standard deviation of a sensor distance since the start of a block.
 _DISTANCE_SHARE: Final = 0.01
-#: Least standard deviation of a single epoch at the end of a tunnel [m]: multipath of the portal.
+#: Minimum standard deviation of a single epoch at the end of a tunnel [m], because of multipath at the portal.
 _LEAST_SIGMA_M: Final = 2.0
 _NEVER: Final = np.datetime64("NaT", "ns")
 
@@ -27,13 +27,13 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 class ReturnState:
     """State after a chunk."""
 
-    time: np.datetime64 = _NEVER  #: Last epoch whose codes counted; NaT before the first.
-    #: Dead-reckoned position at the last epoch and its standard deviation; NaN where no sensor gives a distance.
+    time: np.datetime64 = _NEVER  #: Last epoch whose codes were used; NaT before the first.
+    #: Dead-reckoned position at the last epoch and its standard deviation; NaN without a sensor distance.
     place_m: float = float("nan")
     sigma_m: float = float("nan")
-    distance_m: float = 0.0  #: Since the filter's own position.
-    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without.
-    agreeing: int = 0  #: Positions in a row that agreed since.
+    distance_m: float = 0.0  #: Distance since the filter's own position.
+    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT if there is none.
+    agreeing: int = 0  #: Number of consecutive positions that have agreed since then.
 
 
 def gated_codes(
@@ -46,15 +46,15 @@ def gated_codes(
     line: Line,
     limits: SensorLimits,
 ) -> tuple[Masks, ReturnState]:
-    """Return the epochs whose codes are not yet used, shape (T,), and the state to pass on.
+    """Return the epochs whose codes are not yet used, shape (T,), and the state for the next chunk.
 
     After an outage single-epoch positions are compared with the position dead-reckoned by the sensors: codes are used
-    again with the third in a row that lies within `SensorLimits.return_sigmas` of both standard deviations together,
-    and after `SensorLimits.return_s` in any case. Where no sensor gives a distance nothing is refused.
+    again with the third consecutive position within `SensorLimits.return_sigmas` of the combined standard deviation,
+    and after `SensorLimits.return_s` in any case. Without a sensor distance no code is rejected.
 
-    Shape (T,): `observed`, epochs with codes; `distance_m`, by the sensors since the previous epoch; `place_m`,
-    `sigma_m` of each epoch by itself; NaN where missing. `state` has the position of the filter at the epoch before the
-    first.
+    Arguments of shape (T,): `observed`, epochs with codes; `distance_m`, sensor distance since the previous epoch;
+    `place_m` and `sigma_m`, single-epoch positions; NaN where missing. `state` has the filter's position at the epoch
+    before the first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     distances = state.distance_m + np.cumsum(distance_m)

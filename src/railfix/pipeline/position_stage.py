@@ -1,4 +1,4 @@
-"""Positions of antennas: conventional and on the line, with faults excluded, sigma, level and status.
+"""Antenna positions: conventional and on the line, with fault exclusion, sigma, level and status.
 
 The stages in their order (P1 figure 1): 3-D position, inter-system biases, section search, constrained fix, persistent
 biases and single faults, noise scale, test of the map, protection level, carrier phase, status.
@@ -54,9 +54,9 @@ def position_stage(
     config: Config,
     states: Sequence[AntennaState],
 ) -> tuple[CorrectedRanges, Solution, list[AntennaState]]:
-    """Return the ranges with the reasons of this stage, the positions, and the new state of each antenna.
+    """Return the ranges with this stage's rejection reasons, the positions, and the new state of each antenna.
 
-    The ranges are those after the screens of the observations, the states by antenna.
+    The ranges are given after the observation screens, the states by antenna.
     """
     time = corrected.time
     points, offsets = tie_constellations(
@@ -72,7 +72,7 @@ def position_stage(
     checked, states = check_ranges(corrected, points.ranges, antennas, fix, config, states)
     corrected, fix, model, scale = checked.corrected, checked.fix, checked.model, checked.scale
     constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
-    # ranges that contradict each other in space contradict every map
+    # ranges that are inconsistent in space contradict every map
     unresolved = corrected.unsure | _contradict(fix.point, checked.ranges.space_redundancy, scale)
     off_map = checked.off_map & ~unresolved
 
@@ -121,7 +121,7 @@ def position_stage(
 
 
 def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBiases) -> Masks:
-    """Return the satellites that are the only ones of a clock without a known bias, shape (T, K)."""
+    """Return the satellites that are alone on a clock without a known bias, shape (T, K)."""
     alone = np.zeros(reason.shape, dtype=bool)
     for g, group in enumerate(groups):
         used = reason[:, group] == 0
@@ -130,7 +130,7 @@ def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBias
     return alone
 
 
-#: Ratio of the variance of an epoch's ranges in 3-D to that of the receiver from which on they contradict each other.
+#: Ratio of an epoch's range variance in 3-D to the receiver's from which on the ranges are inconsistent.
 _CONTRADICT: Final = 25.0
 
 
@@ -138,7 +138,7 @@ def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
     """Return ranges and 3-D positions for the test of the map: without the `excluded` satellites where all ranges
-    together contradict each other, NaN where they still do or the wrong one cannot be identified.
+    together are inconsistent, NaN where they still are or the faulty range cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing.space_redundancy, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
@@ -152,17 +152,17 @@ def _consistent(
 
 
 def _contradict(point: SinglePoint, freedom: Integers, scale: Floats) -> Masks:
-    """Return the epochs whose ranges, so many redundant ones, contradict each other in space, shape (T,)."""
+    """Return the epochs whose ranges, with the given redundancy, are inconsistent in space, shape (T,)."""
     return np.asarray((freedom >= 1) & (point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2))
 
 
 class PublishedPositions(NamedTuple):
-    """Positions that are published, T epochs: from the codes, or from code and phase; shape (T,) each."""
+    """Published positions of T epochs, from the codes or from code and phase; shape (T,) each."""
 
     arc_m: Floats
     along_m: Floats  #: Standard deviation along the line.
     epoch_m: Floats  #: Single-epoch sigma.
-    judged_m: Floats  #: Sigma that is compared with `Config.largest_sigma_m`.
+    judged_m: Floats  #: Sigma compared with `Config.largest_sigma_m`.
     phase: PhasePositions | None
 
 
@@ -173,7 +173,7 @@ def _published(
     config: Config,
     carriers: Sequence[CarrierState | None],
 ) -> tuple[PublishedPositions, Sequence[CarrierState | None]]:
-    """Return the positions with their standard deviations, and the states of the carrier phases."""
+    """Return the positions with their standard deviations, and the carrier-phase states."""
     corrected, ranges, fix, scale = checked.corrected, checked.ranges, checked.fix, checked.scale
     constrained = fix.constrained
     own = epoch_sigma_m(ranges.redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
@@ -192,7 +192,8 @@ def _published(
 
         phase, carriers = antennas.each_with_state(own_phase, carriers)
         arc, exact, total, variance = phase.arc_m, phase.noise_sigma_m, phase.sigma_m, scale**2
-        nominal = np.where(phase.n_fixed > 0, 0.0, nominal)  # satellites and atmosphere are in the integers' noise
+        # the integer solution's noise includes satellite and atmospheric errors
+        nominal = np.where(phase.n_fixed > 0, 0.0, nominal)
     along = np.sqrt(variance * exact**2 + (total**2 - exact**2) + nominal)
     judged = own if phase is None else along
     along = np.sqrt(along**2 + _ambiguity_variance_m2(ranges, antennas, fix, arc, config))
@@ -200,7 +201,7 @@ def _published(
 
 
 def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) -> Floats:
-    """Return the variance along the line by satellites and atmosphere, where the ranges' sigmas leave them out."""
+    """Return the variance along the line by satellite and atmospheric errors, if not in the range sigmas."""
     share = (
         model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal_elevation_sigma_m, 0.0), 0.0)
     )
@@ -208,10 +209,10 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
-    """Return the mean square distance to the best other position of ambiguous epochs, shape (T,).
+    """Return the mean square distance to the best alternative position of ambiguous epochs, shape (T,).
 
-    The other position fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
-    (normal likelihoods, equal priors).
+    The alternative fits worse by the excess x, so that it is the true position with the probability ``1/(1 +
+    exp(x/2))`` (normal likelihoods, equal priors).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
@@ -233,8 +234,8 @@ def _status(
 ) -> Codes:
     """Return the status of each epoch, shape (T,): the first condition that is true, the most serious first.
 
-    `counts`: ranges that are used, and redundant ones; `failed`: ranges that contradict the map, or each other, and
-    other possible positions; shape (T,) each.
+    `counts` has the numbers of used and of redundant ranges; `failed` marks ranges that contradict the map,
+    inconsistent ranges, and other possible positions; shape (T,) each.
     """
     off_map, inconsistent, open_elsewhere = failed
     (n_used, redundancy), constrained, section = counts, solution.fix.constrained, solution.fix.section

@@ -61,17 +61,17 @@ from railfix.tracking import Line
 
 
 class EpochProcessor:
-    """Positions along the line from chunks of observations.
+    """Positions on the line from chunks of observations.
 
     Parameters
     ----------
     config : Config
-        The files that it names are not read here; pass their contents (`railfix.run.make_processor` does).
+        The files named in it are not read here; pass their contents (`railfix.run.make_processor` does).
     trajectories : mapping of str to Trajectory
         The trajectory of each antenna, one or two ("front", "rear").
     navigation : Navigation, optional
-        Navigation records known from the start; others may come with each chunk. Without any, the first chunk brings
-        some: `process` raises otherwise.
+        Navigation records known from the start; others may be given with each chunk. Without any, the first chunk must
+        have some, otherwise `process` raises.
     messages : SbasMessages, optional
         SBAS messages known from the start. SBAS corrections are used once messages are given, here or with a chunk.
     models : Models, optional
@@ -88,9 +88,9 @@ class EpochProcessor:
         Navigation records and SBAS corrections known from the start.
     units, balises : GroundUnits or None, ListedBalises or None
     indices : dict of str to SearchIndex
-        Of the trajectories.
+        Search indices of the trajectories.
     screens : tuple
-        Screens that are on, with their limits.
+        Active screens with their limits.
     setup : ScreenSetup
     notes : tuple of str
         Differences between what was requested and what is used, one sentence each.
@@ -98,7 +98,8 @@ class EpochProcessor:
     Raises
     ------
     SettingsError
-        SBAS and precise ephemerides together, no SBAS message of the GEO requested, or an argument of another type.
+        SBAS and precise ephemerides are combined, there is no SBAS message of the requested GEO, or an argument has a
+        wrong type.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class EpochProcessor:
             check_type(screen, Screen, "screens")
         _check_received(navigation, messages)
         if len({(t.sigma_plan_m, t.sigma_height_m) for t in trajectories.values()}) > 1:
-            raise ValueError("the trajectories of the antennas have different sigmas of the map; they are of one map")
+            raise ValueError("the antennas' trajectories have different map sigmas; they must be on one map")
         self.config = config
         plan, height = config.map_plan_sigma_m, config.map_height_sigma_m
         self.trajectories = {
@@ -172,17 +173,17 @@ class EpochProcessor:
         return ThreadPoolExecutor(len(self.trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything but the threads, which another process creates itself."""
+        """Return everything except the threads, which another process creates itself."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
 
     @cached_property
     def lines(self) -> dict[str, Line]:
-        """The trajectories as the filter along the track takes them, by antenna."""
+        """Lines of the filter along the track, by antenna."""
         return {name: Line(trajectory) for name, trajectory in self.trajectories.items()}
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the data known from the start, and on screens that cannot be run."""
+        """Notes on the initial data, and on screens that cannot be run."""
         return (*self.received.notes, *self._lacking)
 
     def _inactive_notes(self) -> tuple[str, ...]:
@@ -197,15 +198,15 @@ class EpochProcessor:
         check_base(self.config, self._base)
         conditions = None if self._error_model is None else self._error_model.conditions
         if conditions and (differences := condition_differences(conditions, collect_conditions(self.config))):
-            notes.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
+            notes.append(f"error model: its conditions differ from this run's: {'; '.join(differences)}")
         faults = None if self._error_model is None else self._error_model.faults
         if faults is not None and "side_upper" not in faults.model_fields_set:
             notes.append(
-                "error model: it does not state how often low satellites of one side are faulty together "
-                "(faults.side_upper), as one of an earlier version; railfix error-model measures it"
+                "error model: faults.side_upper, the frequency of common faults of low satellites on one side, is "
+                "missing; the file is of an earlier version, so make it again with railfix error-model"
             )
         if self.config.protection == "on" and self.config.carrier in ("float", "fixed"):
-            notes.append("protection level: asked for, but there is none for positions from code and phase together")
+            notes.append("protection level: requested, but not available for positions from code and phase together")
         return tuple(notes)
 
     def antenna_order(self) -> AntennaOrder | None:
@@ -227,32 +228,31 @@ class EpochProcessor:
     ) -> tuple[Result, State]:
         """Return the positions of one chunk, and the state for the next one.
 
-        Each note of the result and each doubt about it is a `RailfixWarning`, but for screens that are on by default
-        and lack their input.
+        Each note and each doubt of the result is a `RailfixWarning`, except for default screens that lack their input.
 
         Parameters
         ----------
         observations : mapping of str to Observations
             By antenna; each antenna keeps its own epochs.
         state : State, optional
-            State after the chunk before this one; None at the start of a log.
+            State after the previous chunk; None at the start of a log.
         navigation : Navigation, optional
-            Records received since the previous chunk. Results equal those with all records given at the start,
-            where each record is given before the first epoch that uses it.
+            Records received since the previous chunk. If each record is given before the first epoch that uses it, the
+            results equal those with all records given at the start.
         messages : SbasMessages, optional
             SBAS messages received since the previous chunk.
         sensors : SensorSamples, optional
-            Samples of the sensors on board since the previous chunk, for the filter along the track. An antenna without
-            observations in this chunk has them with its next one.
+            On-board sensor samples since the previous chunk, for the filter along the track. For an antenna without
+            observations in this chunk they are used with its next one.
         base : Observations, optional
-            Of the base station since the previous chunk, up to the last epoch of this one.
+            Observations of the base station since the previous chunk, up to the last epoch of this one.
 
         Raises
         ------
         ValueError
-            The epochs of an antenna do not rise in time, from those of `state` on.
+            The epochs of an antenna do not rise in time, or begin before the end of `state`.
         SettingsError
-            As the class; an antenna has no trajectory; no navigation records were given.
+            As for the class, or an antenna has no trajectory, or no navigation records were given.
         """
         if navigation is None and state is None and not self._navigation_given:
             raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")
@@ -353,7 +353,7 @@ class EpochProcessor:
         Parameters
         ----------
         state : State
-            Of it only what the filter left after the previous chunk is used, and replaced.
+            State after the previous chunk; only the filter's part is used and replaced.
         """
         fusion, filter_states, sensors = {}, dict(state.fusion), chunk.sensors
         replays: dict[str, tuple[Replay, ...]] = {}
@@ -378,7 +378,7 @@ class EpochProcessor:
     def _filter_antennas(
         self, chunk: Chunk, state: State
     ) -> dict[str, tuple[AlongTrack, tuple[Replay, ...], FilterState]]:
-        """Return the positions of the filter along the track by antenna, what it was given, and its states.
+        """Return the filtered positions by antenna, the filter's input, and its states.
 
         Two antennas are filtered in two threads.
         """
@@ -398,13 +398,15 @@ class EpochProcessor:
         return dict(zip(chunk.names, over_antennas(one_antenna, chunk.names), strict=True))
 
     def _curve_notes(self, headers: Mapping[str, ObservationHeader]) -> Iterator[str]:
-        """Yield notes on a C/N0 curve of another antenna or receiver."""
+        """Yield notes on a C/N0 curve of a different antenna or receiver."""
         if (curve := self.setup.cn0_curve) is not None and "cn0" in self.config.screens:
             for name, header in headers.items():
                 yield from (f"{name}: {note}" for note in curve.notes_for(header))
 
     def _line_references(self, name: str, sensors: SensorSamples | None) -> LineReferences:
-        """Return the ground units, balises, and the features of the line: made when there is an inertial unit."""
+        """Return ground units, balises, and features of the line; the features are computed if there is an inertial
+        unit.
+        """
         wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
         if wanted and self._track is not None and name not in self._features:
             self._features[name] = LineFeatures.of(self._track, self.trajectories[name])
@@ -422,14 +424,14 @@ class EpochProcessor:
 
 
 def _check_received(navigation: Navigation | None, messages: SbasMessages | None) -> None:
-    """Raise SettingsError where navigation records or SBAS messages are of another type."""
+    """Raise SettingsError if navigation records or SBAS messages have a wrong type."""
     for value, expected, what in ((navigation, Navigation, "navigation"), (messages, SbasMessages, "messages")):
         if value is not None:
             check_type(value, expected, what)
 
 
 def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> None:
-    """Raise ValueError where an epoch is not after the preceding one, of the chunk `before` or its own."""
+    """Raise ValueError if an epoch is not after the preceding epoch of this chunk or of the state `before`."""
     if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; give epochs in order of time")

@@ -1,4 +1,4 @@
-"""State carried from one chunk to the next."""
+"""State passed from one chunk to the next."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ from railfix.positioning.two_frequencies import TwoFrequencyState
 class AntennaState(NotebookTable):
     """State of one antenna after a chunk."""
 
-    noise: NoiseState = field(default_factory=NoiseState)  #: Sums behind the noise scales.
-    map_offset: MapOffsetState = field(default_factory=MapOffsetState)  #: Sums behind the test of the map.
-    lasting: LastingErrorState = field(default_factory=LastingErrorState)  #: Means of the residuals of each satellite.
-    off_map: OffMapState = field(default_factory=OffMapState)  #: Whether the train was away from the line.
+    noise: NoiseState = field(default_factory=NoiseState)  #: Sums for the noise scales.
+    map_offset: MapOffsetState = field(default_factory=MapOffsetState)  #: Sums for the test of the map.
+    lasting: LastingErrorState = field(default_factory=LastingErrorState)  #: Mean residuals of each satellite.
+    off_map: OffMapState = field(default_factory=OffMapState)  #: State of the off-map test.
     offsets: OffsetState = field(default_factory=OffsetState)  #: Inter-system biases estimated so far.
-    screens: Mapping[str, Any] = field(default_factory=dict)  #: State of each screen that has one, by its name.
-    carrier: CarrierState | None = None  #: State of the carrier-phase stages, where they are used.
+    screens: Mapping[str, Any] = field(default_factory=dict)  #: States of the screens with memory, by name.
+    carrier: CarrierState | None = None  #: State of the carrier-phase stages, if used.
     #: Last epoch; NaT before the first.
     ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    #: Mean differences of the two codes of satellites.
+    #: Mean differences of the satellites' two codes.
     two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
 
     interference: InterferenceState = field(default_factory=InterferenceState)
-    observables: ObservableState = field(default_factory=ObservableState)  #: Signs and units of Dopplers and phases.
+    #: State of the checks of Doppler and phase signs and units.
+    observables: ObservableState = field(default_factory=ObservableState)
 
     def __repr__(self) -> str:
         screens = ", ".join(sorted(self.screens)) or "none"
@@ -49,10 +50,10 @@ class AntennaState(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True)
 class State(NotebookTable):
-    """State after a chunk: everything that the next one needs."""
+    """State after a chunk: everything that the next chunk needs."""
 
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
-    #: Navigation records and SBAS messages so far; None: those given to the processor.
+    #: Navigation records and SBAS messages so far; None for those given to the processor.
     received: Received | None = None
     base: BaseState | None = None  #: State of the base station.
     fusion: Mapping[str, FilterState] = field(default_factory=dict)  #: State of the filter along the track, by antenna.

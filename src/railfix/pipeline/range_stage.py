@@ -1,4 +1,4 @@
-"""Satellite states, approximate positions and corrected pseudoranges of a chunk, by the settings of a run."""
+"""Satellite states, approximate positions and corrected pseudoranges of a chunk."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from railfix.screens import Verdict, suspicion_sigma_m
 
 
 class Models(NamedTuple):
-    """Measured models: weights in place of `Config.noise`, C/N0 curve, support message of ARAIM levels."""
+    """Measured models: error model, C/N0 curve, and integrity support message of ARAIM levels."""
 
     error_model: ErrorModel | None = None
     cn0_curve: Cn0Curve | None = None
@@ -39,9 +39,9 @@ def correct_ranges(
     *,
     error_model: ErrorModel | None = None,
 ) -> tuple[CorrectedRanges, ApproximatePosition]:
-    """Return corrected ranges of a chunk, and where the antennas are about.
+    """Return corrected ranges of a chunk, and approximate antenna positions.
 
-    An error model gives the least sigmas of the protection level; the weights are those of ``config.noise``.
+    An error model gives minimum sigmas for the protection level; the weights follow ``config.noise``.
     """
     satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)
     near = approximate_position(
@@ -55,14 +55,14 @@ def correct_ranges(
 
 
 def raw_ranges(obs: Observations, channels: Channels, satellites: SatelliteRanges) -> Ranges:
-    """Return the codes with satellite clock and group delay applied, of equal weight."""
+    """Return the codes corrected for satellite clock and group delay, with equal weights."""
     code = np.where(satellites.reason == 0, obs.code_m[:, channels.columns] + satellites.correction_m, np.nan)
     sigma = np.full(code.shape, ANCHOR_SIGMA_M)
     return weighted_ranges(satellites.states.position_ecef_m, code, sigma, channels.clock)
 
 
 def fit_ranges(corrected: CorrectedRanges) -> Ranges:
-    """Return the ranges without a reason against them, ready to be fitted."""
+    """Return the ranges without a rejection reason, ready to be fitted."""
     return weighted_ranges(
         corrected.satellites.position_ecef_m, corrected.used_code_m, corrected.sigma_m, corrected.channels.clock
     )
@@ -77,7 +77,7 @@ def reject(corrected: CorrectedRanges, mask: Masks, reason: Reason) -> Corrected
 
 
 def apply_verdict(corrected: CorrectedRanges, verdict: Verdict) -> CorrectedRanges:
-    """Apply the verdict of a screen to ranges: suspected ones are rejected, or weighted down."""
+    """Apply the verdict of a screen to ranges: suspected ranges are rejected, or their weights are lowered."""
     failed = verdict.screened.reject
     if verdict.error_m is None:
         return reject(corrected, failed, verdict.reason)
@@ -89,7 +89,7 @@ def apply_verdict(corrected: CorrectedRanges, verdict: Verdict) -> CorrectedRang
 def _apply_error_model(
     model: ErrorModel, corrected: CorrectedRanges, antennas: AntennaRows, arc_m: Floats, config: Config
 ) -> CorrectedRanges:
-    """Return the ranges with overbounding sigma and bias by an error model; those that it does not bound rejected."""
+    """Return the ranges with overbounding sigma and bias by an error model; unbounded ranges are rejected."""
     front_deg = antennas.each(lambda index, rows: index.trajectory.body_azimuth_deg(arc_m[rows]))
     turned = corrected.azimuth_deg - front_deg[:, None]
     bound, bias = model.at(corrected.elevation_deg, turned, corrected.cn0_dbhz)
@@ -102,7 +102,7 @@ def _apply_error_model(
 
 
 def collect_conditions(config: Config) -> Conditions:
-    """Collect settings that the errors of ranges depend on: the conditions of an error model fitted on such a run."""
+    """Collect settings that affect range errors: the conditions of an error model fitted on such a run."""
     return Conditions(
         systems=config.systems, signals={letter: config.signals.get(letter, ()) for letter in config.systems},
         screens=config.screens, elevation_mask_deg=config.elevation.mask_deg,

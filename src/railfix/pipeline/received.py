@@ -33,7 +33,7 @@ _EMPTY: Final[dict[str, tuple[int, ...]]] = {
     **dict.fromkeys(("position_ecef_m", "velocity_ecef_mps", "acceleration_ecef_mps2"), (0, 3)),
     "inter_signal_s": (0, 6),
 }
-#: Fields that distinguish two Keplerian records of one satellite.
+#: Fields that distinguish Keplerian records of one satellite.
 _KEPLER_KEY: Final = ("satellite", "message", "toe", "toc", "iode", "iodc", "health")
 _GLONASS_KEY: Final = ("satellite", "toe", "health")
 
@@ -53,21 +53,21 @@ def no_navigation() -> Navigation:
 
 @dataclass(frozen=True, kw_only=True)
 class Received:
-    """Data received besides the observations, up to the current epoch."""
+    """Data received in addition to the observations, up to the current epoch."""
 
     navigation: Navigation = field(default_factory=no_navigation)
-    messages: SbasState | None = None  #: SBAS messages of the GEO in use; None: SBAS is not used.
-    sbas: SbasCorrections | DfmcService | None = None  #: Corrections by these messages.
-    #: Ionospheric coefficients in use; None: the ionosphere is uncorrected, or corrected by SBAS; shape (8,).
+    messages: SbasState | None = None  #: SBAS messages of the GEO in use; None without SBAS.
+    sbas: SbasCorrections | DfmcService | None = None  #: Corrections from these messages.
+    #: Ionospheric coefficients in use, shape (8,); None if the ionosphere is uncorrected, or corrected by SBAS.
     klobuchar: Floats | None = None
-    #: Standard deviation of the vertical delay by coefficients that were not received; otherwise 0.
+    #: Standard deviation of the vertical delay if default coefficients are used, otherwise 0.
     ionosphere_sigma_m: float = 0.0
-    notes: tuple[str, ...] = ()  #: Requested data, and the data used instead, one sentence each.
-    base: BaseErrors | None = None  #: Range errors that a base station has measured.
+    notes: tuple[str, ...] = ()  #: One sentence on each replacement of requested data.
+    base: BaseErrors | None = None  #: Range errors measured by a base station.
 
 
 def broadcast_source(received: Received, config: Config) -> BroadcastSource:
-    """Return the source of corrections by the records and models alone."""
+    """Return the source of corrections from records and models only."""
     return BroadcastSource(
         navigation=received.navigation, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
         troposphere=config.troposphere, nominal=config.nominal,
@@ -75,13 +75,18 @@ def broadcast_source(received: Received, config: Config) -> BroadcastSource:
 
 
 def correction_source(received: Received, config: Config) -> CorrectionSource:
-    """Return the source of corrections of what has been received."""
+    """Return the source of corrections from the received data."""
     models = broadcast_source(received, config)
     source: CorrectionSource = models
     if isinstance(received.sbas, DfmcService):
         source = DfmcSource(models=models, service=received.sbas)
     elif received.sbas is not None:
         source = SbasSource(navigation=received.navigation, corrections=received.sbas)
+    return with_base_station(source, received, config)
+
+
+def with_base_station(source: CorrectionSource, received: Received, config: Config) -> CorrectionSource:
+    """Return a source with the errors that a base station has measured; the source itself without a station."""
     if received.base is None:
         return source
     return BaseStationSource(
@@ -92,7 +97,7 @@ def correction_source(received: Received, config: Config) -> CorrectionSource:
 def known_from_start(
     config: Config, *, navigation: Navigation | None = None, messages: SbasMessages | None = None
 ) -> Received:
-    """Return the data known before the first epoch: all of it where files are read, nothing on a running train.
+    """Return the data known before the first epoch: all data when reading files, none on a running train.
 
     In recorded messages the GEO is chosen if the settings request the best. SettingsError: SBAS and precise ephemerides
     together, or no message of the requested GEO.
@@ -124,13 +129,13 @@ def receive(
     navigation: Navigation | None = None,
     messages: SbasMessages | None = None,
 ) -> Received:
-    """Return the received data after new navigation records and SBAS messages; `before` where nothing has.
+    """Return the received data after new navigation records and SBAS messages; `before` if there are none.
 
-    `time` is that of the next epoch, NaT without one: SBAS messages that neither it nor a later one can use are
-    dropped, and so are records received again, and those that have expired, but for the newest of a satellite. Newer
-    coefficients and precise ephemerides replace the older ones. Without any message so far, every satellite is rejected
-    until the corrections are complete. SettingsError: SBAS and precise ephemerides together, or messages while the
-    settings leave the GEO open.
+    `time` is the time of the next epoch, NaT if unknown. SBAS messages that no epoch from `time` on can use are
+    dropped, and so are repeated and expired records, except for a satellite's newest record. Newer coefficients and
+    precise ephemerides replace the older ones. Without any message so far, every satellite is rejected until the
+    corrections are complete. SettingsError: SBAS and precise ephemerides together, or messages while the settings leave
+    the GEO open.
     """
     if navigation is None and messages is None:
         return before
@@ -149,7 +154,7 @@ def receive(
 
 
 def _empty_state(config: Config) -> SbasState:
-    """Return SBAS corrections without a message so far."""
+    """Return the SBAS corrections before the first message."""
     if config.sbas_prn == "best":
         raise SettingsError(
             "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN (sbas_prn = 137)"
@@ -178,7 +183,7 @@ def _current(navigation: Navigation, time: np.datetime64) -> Navigation:
 
 
 def _drop_expired(table: Records, label: Strings, validity: Floats, time: np.datetime64) -> Records:
-    """Return the rows of a table that are valid at `time` or later, and the newest one of each label."""
+    """Return the rows of a table that are valid at `time` or later, and the newest row of each label."""
     kept = table.toe + timedelta(validity) >= time
     if kept.all():
         return table
@@ -188,7 +193,7 @@ def _drop_expired(table: Records, label: Strings, validity: Floats, time: np.dat
 
 
 def merge_navigation(old: Navigation, new: Navigation) -> Navigation:
-    """Return old and new navigation data together."""
+    """Return the union of old and new navigation data."""
     return Navigation(
         kepler=_unite(old.kepler, new.kepler, _KEPLER_KEY),
         glonass=_unite(old.glonass, new.glonass, _GLONASS_KEY),
@@ -202,7 +207,7 @@ def merge_navigation(old: Navigation, new: Navigation) -> Navigation:
 
 
 def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
-    """Return the rows of two tables, without rows of the second that the first has."""
+    """Return the rows of two tables, without duplicates from the second."""
     known = set(zip(*(getattr(old, name).tolist() for name in key), strict=True))
     rows = zip(*(getattr(new, name).tolist() for name in key), strict=True)
     fresh = np.array([row not in known for row in rows], dtype=bool)
@@ -210,17 +215,17 @@ def _unite(old: Records, new: Records, key: tuple[str, ...]) -> Records:
 
 
 def _with_ionosphere(received: Received, config: Config) -> Received:
-    """Return the data with the Klobuchar coefficients in use, and notes where they are not the requested ones."""
+    """Return the data with the Klobuchar coefficients in use, and notes if these are not the requested ones."""
     if isinstance(received.sbas, DfmcService):  # the model helps the screens, and cancels in the combination
         modelled = _with_ionosphere(replace(received, sbas=None), config)
         note = (
-            f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} asked for, ionosphere-free codes used "
-            f"in their place; troposphere: {config.troposphere} asked for, that of SBAS used"
+            f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} requested, ionosphere-free codes used "
+            f"instead; troposphere: {config.troposphere} requested, SBAS model used"
         )
         return replace(modelled, sbas=received.sbas, notes=(note,))
     if received.sbas is not None:
         asked = f"ionosphere: {config.ionosphere}, troposphere: {config.troposphere}"
-        note = f"{asked} asked for, those of SBAS used in their place"
+        note = f"{asked} requested, SBAS models used instead"
         return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=(note,))
     coefficients, sigma, notes = choose_ionosphere(received.navigation, config.ionosphere, config.nominal)
     return replace(received, klobuchar=coefficients, ionosphere_sigma_m=sigma, notes=notes)

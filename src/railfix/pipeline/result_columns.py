@@ -35,20 +35,20 @@ UNITS: Final[Mapping[str, str]] = {
     "m": "m", "mm": "mm", "mps": "m/s", "mps2": "m/s^2", "deg": "deg", "dbhz": "dB-Hz", "permille": "permille",
     "1pm": "1/m", "s": "s", "db": "dB",
 }  # fmt: skip
-#: Decimals of a number in CSV files, 0.1 mm for lengths, and of an angle.
+#: Decimals in CSV files: of a number, 0.1 mm for lengths, and of an angle.
 DECIMALS: Final = 4
 DECIMALS_DEG: Final = 9
 
 
 @dataclass(frozen=True)
 class Column(Generic[Source]):
-    """One column."""
+    """Column of the result tables."""
 
-    name: str  #: Ends with the unit where there is one: ``along_sigma_m``.
+    name: str  #: Name, ending with the unit if there is one: ``along_sigma_m``.
     meaning: str
-    #: Path of the values in the source of a table (``raim.statistic``), by default the name; or a function of it, or
-    #: None where the source has none. Their values are an array with epochs on axis 0, or one value for all rows; words
-    #: are given by their number.
+    #: Path of the values in the source of a table (``raim.statistic``), by default the name; or a function of the
+    #: source, or None if the source lacks them. The values are an array with epochs on axis 0, or one value for all
+    #: rows; words are given by number.
     values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
     words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words by number.
@@ -64,7 +64,7 @@ class Column(Generic[Source]):
         return decimals(self.name)
 
     def of(self, source: Source) -> Any:
-        """Return the values from the source of a table; None where it has none."""
+        """Return the values from the source of a table; None if it has none."""
         if not isinstance(self.values, str):
             return None if self.values is None else self.values(source)
         found: Any = source
@@ -92,7 +92,7 @@ class Column(Generic[Source]):
 
 
 def decimals(name: str) -> int:
-    """Return the decimals that a number of a column gets in CSV files."""
+    """Return the decimals of a column's numbers in CSV files."""
     return DECIMALS_DEG if UNITS.get(name.rsplit("_", 1)[-1]) == "deg" else DECIMALS
 
 
@@ -102,7 +102,7 @@ def by_name(columns: Iterable[Column[Source]]) -> dict[str, Column[Source]]:
 
 
 def of_one_meaning(meaning: str, **values: str | Callable[[Any], NDArray[Any] | None]) -> Iterator[Column[Any]]:
-    """Return columns of floats with one meaning and separate values."""
+    """Return columns of floats with the same meaning and separate values."""
     return (Column(name, meaning, source) for name, source in values.items())
 
 
@@ -112,19 +112,19 @@ def float_column(values: Floats) -> pl.Series:
 
 
 def make_table(columns: Mapping[str, Column[Source]], source: Source, rows: int, **given: str) -> pl.DataFrame:
-    """Return a table of columns with one row per epoch; `given` has the value of columns that the source has not."""
+    """Return a table of columns with one row per epoch; `given` has the values of columns missing in the source."""
     return pl.DataFrame(
         {name: column.series(given.get(name, column.of(source)), rows) for name, column in columns.items()}
     )
 
 
 def _get_screened(result: AntennaResult, column: ScreenColumn) -> Floats | None:
-    """Return the array of a column that a screen fills; None where the screen is off."""
+    """Return the array of a column filled by a screen; None if the screen is off."""
     return getattr(result.screens[column.verdict], column.field) if column.verdict in result.screens else None
 
 
 def _get_screened_channels(observed: Observed, column: ScreenColumn) -> Floats:
-    """Return the array of a column that a screen of observations fills, on all channels."""
+    """Return the array of a column filled by an observation screen, on all channels."""
     return observed.on_all_channels(_get_screened(observed.result, column))
 
 
@@ -136,17 +136,17 @@ def _screen_columns(table: str, get: Callable[..., Floats | None]) -> Iterator[C
 
 @dataclass(frozen=True)
 class Observed:
-    """Results of one antenna by channel, with those of the filter along the track where it is on."""
+    """Results of one antenna by channel, including filter results if the filter is on."""
 
     result: AntennaResult
     tracked: AlongTrack | None = None
 
     def on_all_channels(self, values: Floats | None) -> Floats:
-        """Return values of the channels that were positioned with, on all channels: shape (T, M), NaN elsewhere."""
+        """Return values of the positioning channels on all channels: shape (T, M), NaN elsewhere."""
         return self.result.on_all_channels(np.nan if values is None else values)
 
     def innovation(self, kind: Kind) -> Floats:
-        """Return the filter's innovations of a kind of measurement of each channel, shape (T, M); NaN without it."""
+        """Return the filter's innovations of one measurement kind per channel, shape (T, M); NaN without it."""
         return self.on_all_channels(None if self.tracked is None else self.tracked.tracked.innovation[:, kind])
 
 
@@ -157,7 +157,7 @@ EPOCH: Final[tuple[Column[Any], ...]] = (
 )
 ON_LINE: Final[tuple[Column[Any], ...]] = (
     Column("chainage_m", "distance along the line from the first point of the track"),
-    Column("kilometrage_m", "the line's own marking, where the track has one"),
+    Column("kilometrage_m", "kilometrage as marked on the line, if the track has it"),
 )
 IN_SPACE: Final[tuple[Column[Any], ...]] = (
     Column("latitude_deg", "antenna, WGS 84"),
@@ -173,7 +173,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         *EPOCH,
         Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
         *ON_LINE,
-        Column("along_sigma_m", "standard deviation along the line, other positions of an ambiguous epoch included"),
+        Column("along_sigma_m", "standard deviation along the line, including alternatives of an ambiguous epoch"),
         Column(
             "own_sigma_m",
             "single-epoch sigma, from the codes of the epoch alone; `uncertain` above its limit",
@@ -182,7 +182,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         *IN_SPACE,
         Column("n_used", "satellites used", dtype=pl.Int16()),
         Column("n_rejected", "satellites with a pseudorange that were not used", dtype=pl.Int16()),
-        Column("noise_scale", "ratio of this receiver's noise to that of the weights, as estimated so far"),
+        Column("noise_scale", "ratio of the receiver's noise to the noise assumed by the weights, as estimated so far"),
         Column(
             "raim_outcome",
             "result of RAIM: `passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
@@ -194,23 +194,23 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
             "raim.statistic",
         ),
-        Column("raim_scale", "noise scale of that statistic: of the ranges of earlier epochs that agree", "raim.scale"),
+        Column("raim_scale", "noise scale of that statistic, from consistent ranges of earlier epochs", "raim.scale"),
         Column("raim_threshold", "threshold of the statistic, above which a fault is detected", "raim.threshold"),
         Column(
             "raim_level_m",
-            "P4's level: error by a fault that RAIM misses, and noise; infinite with a satellite unchecked, "
-            "empty with a fault left",
+            "P4's level: error by a fault that RAIM misses, plus noise; infinite with an unchecked satellite, "
+            "empty with a remaining fault",
             "raim.protection_level_m",
         ),
         Column(
             "integers_fixed",
-            "differences of carrier phases fixed to whole cycles; 0: float or codes (`carrier = fixed`)",
+            "number of carrier-phase differences fixed to integers; 0 for a float or code solution (`carrier = fixed`)",
             "phase.n_fixed",
             dtype=pl.Int16(),
         ),
         Column(
             "integer_risk_ppm",
-            "probability that one of them, or of the best candidates, is wrong [1e-6]",
+            "probability that one of these integers, or of the best candidates, is wrong [1e-6]",
             lambda r: None if r.phase is None else 1e6 * r.phase.integer_risk,
         ),
         Column(
@@ -230,7 +230,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             protection_two_faults_m="protection.level.two_fault_m",
         ),
         *of_one_meaning(
-            "K of each part",
+            "factor K of each part",
             protection_k_fault_free="protection.level.k_fault_free",
             protection_k_one_fault="protection.level.k_one_fault",
             protection_k_two_faults="protection.level.k_two_faults",
@@ -242,7 +242,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_kind",
-            "basis: `sbas` with local faults, or `separation`, with satellites' own faults as well",
+            "basis: `sbas` with local faults, or `separation`, with satellite faults as well",
             "protection.kind",
             words=KINDS,
         ),
@@ -296,15 +296,15 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "mean of the 3-D positions of the last minutes, right of the line with rising chainage",
             "map_offset.across_m",
         ),
-        Column("map_offset_up_m", "the same, above the line", "map_offset.up_m"),
+        Column("map_offset_up_m", "mean of the 3-D positions of the last minutes, above the line", "map_offset.up_m"),
         *of_one_meaning(
-            "smallest offset, across and up, that the status `map_offset` names (99 %)",
+            "smallest offset, across and up, that the status `map_offset` detects (99 %)",
             map_detectable_across_m=lambda r: r.map_offset.detectable_m[:, 0],
             map_detectable_up_m=lambda r: r.map_offset.detectable_m[:, 1],
         ),
         Column(
             "map_offset_statistic",
-            "square of that offset in its own sigmas; status `map_offset` from 13.8 on",
+            "squared normalised offset; status `map_offset` from 13.8 on",
             "map_offset.statistic",
         ),
         Column(
@@ -316,7 +316,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference_causes",
-            "signs of it joined by `+`, see `railfix.integrity.interference.Sign`",
+            "signs of interference joined by `+`, see `railfix.integrity.interference.Sign`",
             lambda r: None if r.interference is None else cause_text(r.interference.causes),
             dtype=pl.String(),
         ),
@@ -331,7 +331,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
 
 
 def _second(observed: Observed, values: Callable[[Combined, SecondCodes], Floats]) -> Floats | None:
-    """Return values of the combination of two codes on all channels; None with one frequency."""
+    """Return values of the two-code combination on all channels; None with one frequency."""
     combined, second = observed.result.combined, observed.result.corrected.second
     return None if combined is None or second is None else observed.on_all_channels(values(combined, second))
 
@@ -351,7 +351,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         Column("sigma_m", "standard deviation that the weights assume", "result.sigma_m"),
         Column(
             "corrected_code_m",
-            "pseudorange, satellite clock, group delay and atmosphere applied",
+            "pseudorange corrected for satellite clock, group delay and atmosphere",
             "result.corrected_code_m",
         ),
         *_screen_columns("observations", _get_screened_channels),
@@ -378,7 +378,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "raim_own_error_m",
-            "screen `raim`: error against all other ranges, of satellites named as faulty; empty where the "
+            "screen `raim`: error of faulty satellites relative to all other ranges; empty where the "
             "robust fit rejected them",
             lambda o: o.on_all_channels(o.result.raim.own_error_m),
         ),
@@ -395,7 +395,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "weight_code",
-            "weight of the code in the filter; 1 is that of an error of one standard deviation",
+            "weight of the code in the filter; 1 for an error of one standard deviation",
             lambda o: o.on_all_channels(None if o.tracked is None else o.tracked.tracked.weight[:, Kind.CODE]),
         ),
     )
@@ -408,7 +408,7 @@ OBSERVATION_COLUMNS: Final[Mapping[str, Column[Any]]] = by_name(
         Column("satellite", "`G01`, `J02`", None, dtype=pl.String()),
         Column("signal", "RINEX 3 code without its type letter, `1C`", None, dtype=pl.String()),
         _REASON,
-        Column("reason_text", "their names joined by `+`, `used` for 0", None, dtype=pl.String()),
+        Column("reason_text", "names of these reasons joined by `+`, `used` for 0", None, dtype=pl.String()),
         *(column for column in CHANNEL_COLUMNS.values() if column is not _REASON),
     )
 )

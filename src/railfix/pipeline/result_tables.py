@@ -1,6 +1,6 @@
 """Results as tables: polars for files and analysis, xarray for arrays with names.
 
-Times are GPS time without a time zone, to the nanosecond. Absent values are null in polars and NaN in xarray.
+Times are in GPS time without a time zone, to the nanosecond. Absent values are null in polars and NaN in xarray.
 """
 
 from __future__ import annotations
@@ -104,9 +104,9 @@ def to_xarray(
     ----------
     result : AntennaResult
     tracked : AlongTrack, optional
-        Of the filter along the track (`Result.fusion`).
+        Filtered positions (`Result.fusion`).
     attributes : mapping, optional
-        Put on the dataset (name of the antenna, provenance).
+        Attributes of the dataset (name of the antenna, provenance).
 
     Returns
     -------
@@ -145,7 +145,7 @@ def to_xarray(
 
 
 def _sources(result: AlongTrack) -> Strings:
-    """Return the kinds of measurements that each epoch used, joined by ``+``, shape (T,)."""
+    """Return the kinds of measurements used at each epoch, joined by ``+``, shape (T,)."""
     used = result.tracked.used
     kinds = np.array([*(kind.name.lower() for kind in Kind), "carry"])
     carried = (used[:, Kind.WHEEL] > 0) & np.isin(result.sensed.state, CARRIED)
@@ -162,7 +162,7 @@ def _innovation(result: AlongTrack, kind: Kind) -> Floats:
     return np.asarray(np.fmax.reduce([result.tracked.sensed[:, each - Kind.WHEEL] for each in kinds]))
 
 
-#: Columns of the table of the filter along the track.
+#: Columns of the filter's table.
 TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
     (
         *EPOCH,
@@ -205,22 +205,20 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "level of the straight distance on the ground, also on another lap or off the map",
             "tracked.ground_level_m",
         ),
-        Column("protection_noise_m", "its part by noise without a fault", "tracked.level_noise_m"),
-        Column("protection_separation_m", "largest distance of a sub-filter of the level", "tracked.separation_m"),
+        Column("protection_noise_m", "part of that level by fault-free noise", "tracked.level_noise_m"),
+        Column("protection_separation_m", "largest separation of a sub-filter of the level", "tracked.separation_m"),
         Column(
             "protection_unchecked",
-            "probability of faults that the level does not bound: one of the only constellation in view",
+            "probability of faults that the level does not bound: a fault of the only constellation in view",
             "tracked.unchecked_prior",
         ),
         Column(
             "over_reading_m",
-            "how far the train may be behind: the level, at least 2 % of the distance since codes were used "
+            "largest distance of the train behind: the level, at least 2 % of the distance since codes were used "
             "(`L_DOUBTOVER` less `Q_LOCACC`)",
             "tracked.amount_m",
         ),
-        Column(
-            "under_reading_m", "how far the train may be ahead, in the same way (`L_DOUBTUNDER`)", "tracked.amount_m"
-        ),
+        Column("under_reading_m", "largest distance of the train ahead, likewise (`L_DOUBTUNDER`)", "tracked.amount_m"),
         Column(
             "motion",
             "by tachometer and inertial unit together, see `docs/sensors.md`",
@@ -229,56 +227,55 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "sources",
-            "measurements used with a weight of more than a half: `code` (once a second), `phase`, `doppler`, `wheel`"
-            " (`carry` where inertia takes its place), `radar`, `force`, `place` (by a feature of the line), `balise`, "
-            "`range`",
+            "measurements used with a weight above 0.5: `code` (once per second), `phase`, `doppler`, `wheel` (`carry` "
+            "where inertia replaces it), `radar`, `force`, `place` (from a feature of the line), `balise`, `range`",
             _sources,
             dtype=pl.String(),
         ),
         *IN_SPACE,
         Column(
             "code_weight",
-            "mean weight of codes; 1 is that of an error of one standard deviation",
+            "mean weight of codes; 1 for an error of one standard deviation",
             "tracked.code_weight",
         ),
         Column("motion_weight", "mean weight of Dopplers and phases", "tracked.motion_weight"),
-        Column("wheel_scale", "estimated scale error of its distance, + where too short", "tracked.wheel_scale"),
-        Column("radar_scale", "share that its distance is too short by, as estimated", "tracked.radar_scale"),
-        Column("force_offset_mps2", "offset of the accelerometer, as estimated", "tracked.force_offset_mps2"),
+        Column("wheel_scale", "estimated scale-factor error, positive for too short a distance", "tracked.wheel_scale"),
+        Column("radar_scale", "estimated scale-factor error, positive for too short a distance", "tracked.radar_scale"),
+        Column("force_offset_mps2", "estimated offset of the accelerometer", "tracked.force_offset_mps2"),
         Column(
             "map_scale",
-            "factor on 0.03 m per square root of a metre: above 1 where pseudoranges keep moving against the map",
+            "factor on the map's length error of 0.03 m per root metre; above 1 if pseudoranges contradict it",
             "tracked.map_scale",
         ),
         Column(
             "measured_chainage_m",
-            "chainage of the vehicle's middle, or the antenna, for the next three: means since the epoch before",
+            "chainage of the vehicle's middle, or of the antenna, for the means of the next three columns",
             "sensed.under_m",
         ),
         Column(
             "measured_gradient_permille",
-            "gradient by tachometer and accelerometer, + where the line rises with chainage; empty in slips and "
-            "below 1 m/s",
+            "gradient by tachometer and accelerometer, positive if the line rises with chainage; empty in slips "
+            "and below 1 m/s",
             lambda r: 1e3 * r.sensed.gradient,
         ),
         Column(
             "measured_curvature_1pm",
-            "curvature there by the yaw rate, + to the right in rising chainage",
+            "curvature at that chainage by the yaw rate, positive to the right in rising chainage",
             "sensed.curvature_1pm",
         ),
         Column(
             "measured_cant_mm",
-            "cant there by the lean of the body, + with the left rail higher; needs a vehicle file",
+            "cant at that chainage by the roll of the body, positive with the left rail higher; needs a vehicle file",
             lambda r: 1e3 * r.sensed.cant_m,
         ),
         Column(
             "metric_antenna_spacing_m",
-            "distance of the two positions less that of the antennas; empty for one antenna",
+            "distance of the two positions less the antenna spacing; empty for one antenna",
             "spacing_error_m",
         ),
         Column(
             "wheel_difference_m",
-            "distance by satellites over the last two minutes less that of the wheel",
+            "satellite distance over the last two minutes less wheel distance",
             "wheel.difference_m",
         ),
         *(
@@ -288,11 +285,11 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
                 partial(_innovation, kind=kind),
             )
             for kind, unit, what in (
-                (Kind.WHEEL, "m", "distance since the epoch before"),
-                (Kind.RADAR, "m", "distance since the epoch before"),
+                (Kind.WHEEL, "m", "distance since the previous epoch"),
+                (Kind.RADAR, "m", "distance since the previous epoch"),
                 (Kind.FORCE, "mps2", "mean specific force forward"),
-                (Kind.PLACE, "m", "position by a feature of the line"),
-                (Kind.BALISE, "m", "place of a balise"),
+                (Kind.PLACE, "m", "position from a feature of the line"),
+                (Kind.BALISE, "m", "position of a balise"),
                 (Kind.RANGE, "m", "range to a ground unit"),
             )
         ),
@@ -308,12 +305,12 @@ class SmoothedAntenna:
     trajectory: Trajectory
 
 
-#: Columns that smoothing adds (`railfix run --smooth`).
+#: Columns added by smoothing (`railfix run --smooth`).
 SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
     (
         Column(
             "smoothed_chainage_m",
-            "distance along the line by everything measured before and after the epoch",
+            "distance along the line from all measurements before and after",
             lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
         ),
         Column("smoothed_sigma_m", "its standard deviation", "track.sigma_m"),
@@ -366,11 +363,11 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
     (
         Column("time_gpst", "time of the passing by the filter; or of a contradicting reading", _getter("time"),
                dtype=_TIME),
-        Column("earliest_gpst", "begin of the interval of the passing, by the level: before, the train was not there",
+        Column("earliest_gpst", "start of the passing's interval by the level; the train was not at the point before",
                _getter("earliest"), dtype=_TIME),
         Column("latest_gpst", "its end", _getter("latest"), dtype=_TIME),
         EPOCH[1],
-        Column("balise", "name in the list, or as read", _getter("balise"), dtype=pl.String()),
+        Column("balise", "name in the list, or identity read", _getter("balise"), dtype=pl.String()),
         Column(
             "verdict",
             "`virtual`: no balise; `read`, `missing`: passed with and without a reading; `contradicts`: read where the "
@@ -379,13 +376,14 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
         ),
         Column("chainage_m", "as listed", _getter("chainage_m")),
         Column("read_gpst", "time of the reading", _getter("read"), dtype=_TIME),
-        Column("read_error_m", "of a reading that contradicts: listed chainage less that of the filter",
+        Column("read_error_m", "for a contradicting reading, listed chainage less the filter's",
                _getter("read_error_m")),
         Column("speed_mps", "at the passing, + toward rising chainage", _getter("speed_mps")),
         Column("protection_level_m", "protection level of the position at the passing", _getter("level_m")),
-        Column("doubt_over_m", "how far the train may be behind the position: `L_DOUBTOVER` less `Q_LOCACC`",
+        Column("doubt_over_m", "largest distance of the train behind the position: `L_DOUBTOVER` less `Q_LOCACC`",
                _getter("amount_m")),
-        Column("doubt_under_m", "how far it may be ahead: `L_DOUBTUNDER` less `Q_LOCACC`", _getter("amount_m")),
+        Column("doubt_under_m", "largest distance of the train ahead: `L_DOUBTUNDER` less `Q_LOCACC`",
+               _getter("amount_m")),
         Column("odometer_m", "for comparison: 5 m and 5 % of the distance since the last balise read (SUBSET-041)",
                _getter("odometer_m")),
     )

@@ -1,4 +1,4 @@
-"""Results of the pipeline: the outputs of its stages by antenna, and what tables show of them."""
+"""Results of the pipeline: stage outputs by antenna, and values for the tables."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaResult(Solution, LineCoordinates, NotebookTable):
-    """Results of one antenna, T epochs: positions without those that the status drops, and what they rest on.
+    """Results of one antenna at T epochs: positions that the status keeps, and their intermediate results.
 
-    Arrays of the ranges have the K channels that settings allow (`corrected`); those of properties have all M channels
-    of the observations given, of all antennas where few epochs of several are given together.
+    Range arrays have the K channels that the settings allow (`corrected`). Arrays of properties have all M channels of
+    the given observations, of all antennas if few epochs of several antennas are given together.
     """
 
-    trajectory: Trajectory  #: Of the antenna.
-    corrected: CorrectedRanges  #: Corrected ranges, with all reasons against them.
-    combined: Combined | None  #: How codes of two frequencies were combined.
-    #: Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which judges positions,
-    #: has shape (T,).
+    trajectory: Trajectory  #: Trajectory of the antenna.
+    corrected: CorrectedRanges  #: Corrected ranges with all rejection reasons.
+    combined: Combined | None  #: Combination of the codes of two frequencies.
+    #: Metric and verdict of each active screen, by name, shape (T, K); "antenna_spacing", a position screen, has shape
+    #: (T,).
     screens: Mapping[str, Screened]
-    interference: Interference | None  #: Jamming and spoofing suspected; None where that is off.
+    interference: Interference | None  #: Suspected jamming and spoofing; None if the check is off.
 
     @property
     def time(self) -> Datetimes:
@@ -87,14 +87,14 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def n_rejected(self) -> Integers:
-        """Satellites with a code of which no signal was used, shape (T,)."""
-        of_satellite = self.corrected.channels.member.astype(np.float32)  # floats are multiplied in blocks
+        """Satellites with a code but no used signal, shape (T,)."""
+        of_satellite = self.corrected.channels.member.astype(np.float32)  # float products are computed in blocks
         seen = ((self.reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
         used = (self.reason == 0).astype(np.float32) @ of_satellite > 0
         return np.asarray((seen & ~used).sum(axis=1), dtype=np.int64)
 
     def on_all_channels(self, values: Floats | float) -> Floats:
-        """Return values of the channels that settings allow, shape (T, K), on all channels: (T, M), NaN elsewhere."""
+        """Return values of the allowed channels, shape (T, K), on all channels: (T, M), NaN elsewhere."""
         full = np.full(self.corrected.observations.code_m.shape, np.nan)
         full[:, self.corrected.columns] = values
         return full
@@ -116,7 +116,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def bound_sigma_m(self) -> Floats:
-        """Least sigma of each range in the level, by the error model; 0 without one; shape (T, M)."""
+        """Minimum sigma of each range in the level, by the error model; 0 without one; shape (T, M)."""
         return self.on_all_channels(self.corrected.bound_sigma_m)
 
     @property
@@ -126,7 +126,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def residual_m(self) -> Floats:
-        """Residuals of the position on the line, NaN for ranges that were not used, shape (T, M)."""
+        """Residuals of the position on the line, NaN for unused ranges, shape (T, M)."""
         residual = self.fix.constrained.residual_m
         return self.on_all_channels(np.where(self.corrected.reason == 0, residual, np.nan))
 
@@ -156,7 +156,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
         return f"<AntennaResult: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return how many epochs have the status OK: ``1,827 of 2,000 epochs ok``."""
+        """Return the number of epochs with the status OK: ``1,827 of 2,000 epochs ok``."""
         return f"{int((self.status == Status.OK).sum()):,} of {plural(self, 'epoch')} ok"
 
     def summary(self) -> dict[str, str]:
@@ -166,9 +166,9 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
 
 def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Config) -> dict[str, AntennaResult]:
-    """Return the results of single epochs by antenna, without the coordinates that the last status drops.
+    """Return the single-epoch results by antenna, without coordinates that the final status drops.
 
-    The filter along the track, where it is on, gives the sign of interference by the wheel.
+    The filter along the track, if on, adds the sign of interference by the wheel.
     """
     results = {}
     for k, (name, rows) in enumerate(chunk.rows.items()):
@@ -196,7 +196,7 @@ def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Conf
 
 
 def add_wheel_sign(solution: Solution, interference: Interference, wheel: WheelSigns) -> tuple[Solution, Interference]:
-    """Return positions and interference with the sign of the wheel where distances by satellites part from its own."""
+    """Return positions and interference, with the wheel sign where satellite and wheel distances differ."""
     causes = np.where(wheel.parted, interference.causes | int(Sign.WHEEL_PARTS), interference.causes)
     interference = replace(interference, causes=causes)
     status = with_statuses(solution.status, [interference.suspicion])
@@ -208,18 +208,18 @@ class Result(NotebookTable):
     """Results of one chunk."""
 
     antennas: Mapping[str, AntennaResult]
-    notes: tuple[str, ...]  #: Differences between the requested and the used data, one sentence each.
-    #: Positions of the filter along the track, by antenna; empty where it is off.
+    notes: tuple[str, ...]  #: One sentence on each difference between requested and used data.
+    #: Filtered positions by antenna; empty if the filter is off.
     fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
-    #: What the filter was given, by antenna, to smooth its positions (`railfix.pipeline.smoothed_track`).
+    #: Filter input by antenna, for smoothing (`railfix.pipeline.smoothed_track`).
     replays: Mapping[str, tuple[Replay, ...]] = field(default_factory=dict)
 
     def __getitem__(self, antenna: str) -> AntennaResult:
-        """Return the single-epoch results of an antenna; KeyError where no antenna has that name."""
+        """Return the single-epoch results of an antenna; KeyError for an unknown name."""
         return self.antennas[antenna]
 
     def doubts(self) -> Iterator[str]:
-        """Yield a sentence for each antenna without positions, or whose positions contradict the map."""
+        """Yield a sentence on each antenna without positions, or with positions that contradict the map."""
         for name, result in self.antennas.items():
             observed = result.status != Status.NO_OBSERVATION
             off = np.isin(result.status, (Status.OFF_MAP, Status.MAP_OFFSET))

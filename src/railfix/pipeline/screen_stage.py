@@ -1,4 +1,4 @@
-"""Screens of observations and positions, combination of frequencies and carrier smoothing, over all antennas."""
+"""Observation and position screens, combination of frequencies and carrier smoothing, over all antennas."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def screen_antennas(
     ionosphere_sigma_m: float,
     states: Sequence[AntennaState],
 ) -> tuple[Chunk, list[AntennaState]]:
-    """Return the chunk after the screens that judge one antenna alone (`screens`, with their limits), and new states.
+    """Return the chunk after the screens of single antennas (`screens`, with their limits), and new states.
 
-    Dopplers and phases of the wrong sign or unit are left out first. Codes of two frequencies are combined here, and
+    Dopplers and phases of wrong sign or unit are removed first. Codes of two frequencies are combined here, and
     smoothed by the carrier phase where the settings request it.
     """
     corrected, antennas = chunk.corrected, chunk.antennas
@@ -96,9 +96,9 @@ def screen_positions(
     screens: Sequence[tuple[Any, Any]],
     config: Config,
 ) -> tuple[Codes, dict[str, dict[str, Screened]]]:
-    """Return the statuses (T,) after the screens that compare positions of two antennas, and verdicts by antenna.
+    """Return the statuses (T,) after the screens that compare two antennas' positions, and verdicts by antenna.
 
-    Both antennas get the status of a screen.
+    A rejection sets the screen's status on both antennas.
     """
     status, judged = solution.status.copy(), {name: dict[str, Screened]() for name in rows}
     if pair is None or not screens:
@@ -118,7 +118,7 @@ def screen_positions(
 def screen_filtered(
     screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, filtered: Mapping[str, FilteredMotion]
 ) -> dict[str, Screened]:
-    """Return the verdicts of the screens of positions on those of the filter, by antenna."""
+    """Return the verdicts of the position screens on the filtered positions, by antenna."""
     judged: dict[str, Screened] = {}
     for screen, limits in screens if pair is not None else ():
         assert pair is not None

@@ -1,4 +1,4 @@
-"""Motion between the epochs by wheel and inertial unit: slips, carried distances, and the line under the body."""
+"""Motion between epochs by wheel and inertial unit: slips, inertial distances, and the line under the body."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from railfix.motion.tachometer import (
 from railfix.pipeline.feature_fixes import SLOWEST_MPS, RateSeries
 from railfix.track.trajectory import Trajectory
 
-#: Spacing of the samples of the slip detection, at multiples of it in GPS time [ns].
+#: Sample spacing of the slip detection; samples are at its multiples in GPS time [ns].
 _TICK_NS: Final = 20_000_000
-#: Accelerations of the wheel and means of the inertial unit are over this [ns].
+#: Averaging time of wheel accelerations and inertial means [ns].
 _MEAN_NS: Final = 200_000_000
-#: A lost or doubled pulse disturbs the acceleration for this time [ns].
+#: Time for which a lost or doubled pulse disturbs the acceleration [ns].
 _FAULT_NS: Final = _MEAN_NS + 150_000_000
-#: Samples before the last epoch that the next chunk needs [ns].
+#: Time before the last epoch whose samples the next chunk needs [ns].
 REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
-#: States whose distance is that of the inertial unit.
+#: States whose distance is taken from the inertial unit.
 CARRIED: Final = (
     MotionState.STANDING,
     MotionState.LOW_SPEED,
     MotionState.INERTIAL_SPIN,
     MotionState.INERTIAL_SLIDE,
     MotionState.ROLLING,
-)  # The state of an interval is its most informative one.
+)  # The state of an interval is its most informative sample state.
 _RANK: Final = np.array(
     [
         {
@@ -65,17 +65,17 @@ _RANK: Final = np.array(
 
 @dataclass(frozen=True, kw_only=True)
 class SensedMotion:
-    """Motion of T intervals between epochs; forward is that of the vehicle."""
+    """Motion of T intervals between epochs; forward is the vehicle's direction."""
 
     state: Codes  #: `railfix.motion.slip.MotionState`; INIT without both sensors; shape (T,).
-    distance_m: Floats  #: Forward by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
-    doubt_mps: Floats  #: Speed that a slip not detected yet may have had, shape (T,).
-    #: Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro; shape (T,).
+    distance_m: Floats  #: Forward distance by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
+    doubt_mps: Floats  #: Largest speed of a slip not yet detected, shape (T,).
+    #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
-    #: Properties of the line under the body, toward rising arc length (P2 2.3): climb over distance by wheel and
-    #: accelerometer (an offset of 0.01 m/s2 is 0.001), curvature by the yaw rate, + to the right, lean of the body over
-    #: the contact points of the wheels, + with the left rail higher; and chainage of the body's middle then. NaN where
-    #: the wheel does not roll faster than `SLOWEST_MPS`; cant without a vehicle; shape (T,).
+    #: Properties of the line under the body, toward rising arc length (P2 2.3): gradient by wheel and accelerometer (an
+    #: offset of 0.01 m/s2 is 0.001); curvature by the yaw rate, positive to the right; cant by the roll of the body
+    #: over the wheels' contact points, positive with the left rail higher; and chainage of the body's middle. They are
+    #: NaN where the wheel is slower than `SLOWEST_MPS`; cant is also NaN without a vehicle; shape (T,).
     gradient: Floats
     curvature_1pm: Floats
     cant_m: Floats
@@ -86,20 +86,20 @@ class SensedMotion:
 class SensedState:
     """State after a chunk."""
 
-    tick: int = 0  #: Number of the last sample since the beginning of GPS time; 0 before the first.
-    #: Position of the antenna then, by the wheel since the filter's last position; NaN where it is not known.
+    tick: int = 0  #: Number of the last sample since the start of GPS time; 0 before the first.
+    #: Antenna position at that sample, by the wheel since the filter's last position; NaN if unknown.
     arc_m: float = float("nan")
-    sigma_m: float = float("nan")  #: Standard deviation of that position of the filter.
+    sigma_m: float = float("nan")  #: Standard deviation of the filter's last position.
     slip: SlipState | None = None
 
     @property
     def time(self) -> np.datetime64:
-        """Of the last sample."""
+        """Time of the last sample."""
         return np.datetime64(self.tick * _TICK_NS, "ns")
 
 
 def nothing_sensed(intervals: int) -> SensedMotion:
-    """Return the motion without a sensor."""
+    """Return the motion without sensors."""
     distance, gradient, curvature, cant, under = np.full((5, intervals), np.nan)
     doubt, swing = np.zeros((2, intervals))
     return SensedMotion(
@@ -119,11 +119,11 @@ def sensed_motion(
     tachometer: TachometerLimits,
     limits: SlipLimits,
 ) -> tuple[SensedMotion, RateSeries | None, SensedState]:
-    """Return the motion between instants, the rates of the body (None without a sample), and the state to pass on.
+    """Return the motion between instants, the body rates (None without a sample), and the state for the next chunk.
 
-    Pulses with a direction and inertial samples are from `REACH` before the first of the T + 1 `edges` on. `sine_at`
-    gives the sine of the gradient in rising arc length at arc lengths; the trajectory of the antenna determines the
-    direction of the front, and the position of the body.
+    Signed pulses and inertial samples begin `REACH` before the first of the T + 1 `edges`. `sine_at` gives the sine of
+    the gradient in rising arc length at arc lengths; the trajectory of the antenna determines the direction of the
+    front, and the position of the body.
     """
     facing = trajectory.front_sign
     ends = edges.astype("datetime64[ns]").astype(np.int64)
@@ -146,8 +146,8 @@ def sensed_motion(
     distances = distance_m(pulses, np.concatenate([[start], when]), limits=tachometer)
     arc = state.arc_m + facing * (distances[1:] - distances[0])
     line_sine = facing * sine_at(arc)
-    # the speed by pulses is that of the middle of their time: a delay of 0.065 s, which is 0.2 m after a slip of 3 s
-    # begun at 1 m/s2
+    # the speed by pulses refers to the middle of their interval: a delay of 0.065 s, or 0.2 m after a slip of 3 s at 1
+    # m/s2
     ago = seconds(when - speed.time)
     found, slip = find_slips(
         MotionSamples(
@@ -167,7 +167,7 @@ def sensed_motion(
     doubt = GRAVITY_MPS2 * lag * np.abs(found.smooth)
     at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
     turned, rolls = heading_rate_radps(force, rates, known_speed), found.state == MotionState.NORMAL
-    # mean rates are those of the middle of their time
+    # mean rates refer to the middle of their interval
     middle = (ticks * _TICK_NS - _MEAN_NS // 2).astype("datetime64[ns]")
     passed = distance_m(
         pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer
@@ -196,14 +196,14 @@ def _slope_and_bend(sine: Floats, turned_radps: Floats, speed_mps: Floats) -> tu
 def _wheel_acceleration(
     pulses: TachometerPulses, ticks: Integers, speed: PulseSpeeds, limits: TachometerLimits
 ) -> Floats:
-    """Return the acceleration by the wheel at the ticks; NaN from a lost tooth, which is no slip."""
+    """Return the wheel acceleration at the ticks; NaN after a lost tooth, which is not a slip."""
     when, earlier, before = ((ticks * _TICK_NS - ago).astype("datetime64[ns]") for ago in (0, _MEAN_NS, _FAULT_NS))
     acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=limits), speed)
     return np.where(faults_until(pulses, when) > faults_until(pulses, before), np.nan, acceleration)
 
 
 def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Floats:
-    """Return the mean force and rate between instants, shape (N, 6)."""
+    """Return mean forces and rates between instants, shape (N, 6)."""
     values = np.concatenate([inertial.force_mps2, inertial.rate_radps], axis=1)
     total = np.concatenate([np.zeros((1, 6)), np.cumsum(values, axis=0)])
     first, last = (np.searchsorted(inertial.time, at, side="right") for at in (begin, end))
@@ -214,7 +214,7 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 def _by_interval(
     state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Return samples grouped by interval: `at` is the first sample after each instant, 0 after the first.
+    """Group samples by interval; `at` is the index of the first sample after each instant, 0 after the first.
 
     `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """
@@ -223,7 +223,7 @@ def _by_interval(
     result = nothing_sensed(len(count))
     first, end = at[some], int(at[-1])
     rank = _RANK[state[:end]]
-    # the last sample of the highest rank names the interval
+    # the last sample of the highest rank determines the interval's state
     top = rank == np.repeat(np.maximum.reduceat(rank, first), count[some])
     named = state[np.maximum.reduceat(np.where(top, np.arange(end), -1), first)]
     mean = np.add.reduceat(speed_mps[:end], first) / count[some]

@@ -31,19 +31,19 @@ from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedS
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import RangeEpochs, SensorEpochs
 
-#: Longest time between epochs over which a distance or a mean force is taken [s].
+#: Longest interval between epochs with a distance or a mean force [s].
 _LONGEST_S: Final = 5.0
-#: Fraction of the samples of an interval that its mean requires.
+#: Minimum fraction of finite samples for the mean of an interval.
 _COMPLETE: Final = 0.9
-#: Standard deviation of the speed that the inertial unit carries through a slip, a stop or a start [m/s].
+#: Standard deviation of the inertial speed during a slip, a stop or a start [m/s].
 _CARRY_SIGMA_MPS: Final = 0.1
-#: Standard deviations in one metre of distance: swings of the body of 1 mrad, and of its heading [1/m].
+#: Standard deviations over one metre of distance: body oscillations of 1 mrad, and of its heading [1/m].
 _GRADIENT_NOISE: Final = 1e-3
 _CURVATURE_NOISE_1PM: Final = 1e-4
 #: Length over which the errors of the map change (as `railfix.kernels.tracking.constants.MAP_CORRELATION_M`) [m]: with
 #: a map of 0.3 m features are located to no better than some metres, with one of 0.05 m to half a metre.
 _MAP_LENGTH_M: Final = 50.0
-#: Least standard deviation of the position of a feature: the map's, and that of the body on its bogies [m].
+#: Minimum standard deviation of a feature's position: the map's, and the body's on its bogies [m].
 _FEATURE_SIGMA_M: Final = 0.5
 
 Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges, BaliseReadings)
@@ -51,7 +51,7 @@ Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, Sta
 
 @dataclass(frozen=True, kw_only=True)
 class LineReferences:
-    """References that sensors are compared with."""
+    """References of the sensor measurements."""
 
     features: LineFeatures | None = None
     units: GroundUnits | None = None
@@ -65,7 +65,7 @@ _RADAR_SIGMA_MPS: Final = 0.1
 
 
 class SensorLimits(Settings):
-    """Noise of the sensors as the filter sees them."""
+    """Sensor noise of the filter."""
 
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
     #: Detection of slip and slide by tachometer and inertial unit together.
@@ -77,22 +77,22 @@ class SensorLimits(Settings):
     range_above_m: float = 0.0
 
     balise: BaliseLimits = Field(default_factory=BaliseLimits)
-    #: After an outage codes are used again when three positions in a row are within this many sigmas, or after this
+    #: After an outage codes are used again when three consecutive positions are within this many sigmas, or after this
     #: time.
     return_sigmas: float = Field(default=4.0, gt=0)
     return_s: float = Field(default=60.0, ge=0)
     #: Standard deviation of a distance between two epochs in addition to the pulse: creep of a braked or driven wheel.
     wheel_sigma_m: float = Field(default=0.01, gt=0)
-    #: Standard deviation of one speed, and the usual interval of two.
+    #: Standard deviation of a speed sample, and usual interval of speed samples.
     radar_step_s: float = Field(default=0.1, gt=0)
-    #: Standard deviation of a mean force between two epochs: pitching of the body in addition to the sensor's noise (1
-    #: mrad is 0.01 m/s2), and the map's gradient.
+    #: Standard deviation of a mean force between two epochs: body pitching in addition to the sensor's noise (1 mrad is
+    #: 0.01 m/s2), and errors of the map's gradient.
     force_sigma_mps2: float = Field(default=0.05, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorState:
-    """Samples that the next chunk still needs."""
+    """Samples needed by the next chunk."""
 
     time: np.datetime64  #: Last epoch; NaT before the first.
     samples: SensorSamples
@@ -107,12 +107,12 @@ class SensorState:
 
 
 def with_samples(state: SensorState, samples: SensorSamples | None) -> SensorState:
-    """Return the state with samples that wait for the next epoch."""
+    """Return the state with samples for the next epoch."""
     return replace(state, samples=state.samples.merge(samples)) if samples else state
 
 
 def waiting_samples(state: SensorState, samples: SensorSamples) -> SensorState:
-    """Return the state of an antenna without an epoch, with the samples that its next one can use."""
+    """Return the state of an antenna without an epoch, with the samples for its next epoch."""
     state = with_samples(state, samples)
     newest = max(rows.time[-1] for rows in state.samples.tables.values() if len(rows))
     oldest = newest - REACH - timedelta(np.asarray(_LONGEST_S))
@@ -130,12 +130,13 @@ def sensor_epochs(
     sources: Container[str] = ("wheel", "radar", "force", "feature", "balise", "range"),
     references: LineReferences | None = None,
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
-    """Return distances and forces between the epochs, the motion that wheel and inertia agree on, and the new state.
+    """Return distances and forces between the epochs, the combined motion of wheel and inertial unit, and the new
+    state.
 
-    Samples are those since the previous chunk, epochs those of the antenna, shape (T,); the trajectory determines the
-    direction of the front, `sine_at` the sine of the gradient at arc lengths (without it the line is unknown).
-    `sources` names the requested ones of `wheel`, `radar`, `force`, `feature`, `balise` and `range`, `references` has
-    features of the line, ground units and listed balises.
+    Samples are given since the previous chunk, epochs for the antenna, shape (T,). The trajectory determines the
+    direction of the front, `sine_at` the sine of the gradient at arc lengths (None if the line is unknown). `sources`
+    has the requested names among `wheel`, `radar`, `force`, `feature`, `balise` and `range`; `references` has features
+    of the line, ground units and listed balises.
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
@@ -185,7 +186,7 @@ def sensor_epochs(
             "force_mps2": np.where(known, mean - sensed.swing_mps2, np.nan),
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
         }
-    # + toward rising chainage
+    # positive toward rising chainage
     values |= {name: facing * values[name] for name in ("wheel_m", "radar_m", "force_mps2") if name in values}
     if len(ranging) and "range" in sources and references is not None and references.units is not None:
         values["ranges"] = _ranges(ranging, edges, references.units, ranging_lever_m(trajectory, limits))
@@ -201,7 +202,7 @@ def sensor_epochs(
 def _wheel_values(
     pulses: TachometerPulses, edges: Datetimes, sensed: SensedMotion, limits: SensorLimits, *, known: Masks
 ) -> dict[str, Any]:
-    """Return the distances by the wheel toward the front, by inertia while it slips, where `known` or carried."""
+    """Return the wheel distances toward the front, by inertia during slips, where `known` or inertial."""
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     distance = np.diff(distance_m(pulses, edges, limits=limits.tachometer))
@@ -237,10 +238,10 @@ def _latest_samples(samples: SensorSamples, end: np.datetime64, limits: SensorLi
 
 
 def _with_map(trajectory: Trajectory) -> tuple[float, float]:
-    """Return the noise of gradient and curvature in one metre, the errors of the map in it.
+    """Return the noise of gradient and curvature over one metre, map errors included.
 
-    A map off by sigma across the track over a length L has curvatures off by ``sqrt(3) sigma / L^2`` for about L: as
-    white noise in one metre times ``sqrt(L)``. Its gradients have the error ``sigma / L``.
+    A lateral map error sigma over a length L causes curvature errors of ``sqrt(3) sigma / L^2`` over about L, as white
+    noise over one metre times ``sqrt(L)``. The gradient error is ``sigma / L``.
     """
     gradient = trajectory.sigma_height_m / np.sqrt(_MAP_LENGTH_M)
     curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / _MAP_LENGTH_M**1.5
@@ -248,7 +249,7 @@ def _with_map(trajectory: Trajectory) -> tuple[float, float]:
 
 
 def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes) -> dict[str, Floats]:
-    """Return the positions of the antenna by the accepted features, at the first epoch after each."""
+    """Return the antenna positions from accepted features, at the first epoch after each."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
     for fix in fixes:
@@ -268,7 +269,7 @@ def ranging_lever_m(trajectory: Trajectory, limits: SensorLimits) -> Floats:
 
 
 def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_m: Floats) -> RangeEpochs:
-    """Return ranges by the epoch that comes after each."""
+    """Group ranges by the next epoch after each."""
     index = {str(name): k for k, name in enumerate(units.name)}
     unit = np.array([index.get(str(name), -1) for name in ranging.station], dtype=np.intp)
     epoch = np.searchsorted(edges, ranging.time, side="left") - 1
@@ -287,7 +288,7 @@ def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_
 
 
 def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:
-    """Return the first pulse that speeds after an instant may need."""
+    """Return the first pulse needed for speeds after an instant."""
     last = int(np.searchsorted(pulses.time, end, side="right")) - 1
     if last < 1:
         return 0
@@ -307,11 +308,11 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Return the intervals that a sensor's samples do not cover to the end: the last one, or none."""
+    """Return the mask of intervals that a sensor's samples do not cover to the end: the last one, or none."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 
 
 def _latest(samples: Samples, first: int | np.integer[Any]) -> Samples:
-    """Return samples from an index on."""
+    """Return the samples from an index on."""
     return samples.take(slice(max(int(first), 0), None))

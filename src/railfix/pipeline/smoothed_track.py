@@ -1,4 +1,4 @@
-"""Smoothed positions of a run: the filter run again over its stored input, then backward."""
+"""Smoothed positions of a run: the filter is repeated over its stored input, then processed backward."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _EPOCHS: Final = 300
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Input of the filter for some epochs."""
+    """Filter input for a piece of the run."""
 
     epochs: GnssEpochs
     sensors: SensorEpochs
-    before: TrackState | None  #: State before them.
+    before: TrackState | None  #: Filter state before these epochs.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -47,7 +47,7 @@ class SmoothedTrack(NotebookTable):
 
 
 def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> SmoothedTrack:
-    """Return the positions of all epochs from the input of the filter, the last first."""
+    """Return the smoothed positions of all epochs from the filter's input, last piece first."""
     parts: list[SmoothedTrack] = []
     later: BackwardInformation | None = None
     for replay in backward:
@@ -63,7 +63,7 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
 
 
 def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
-    """Short pieces and the states before them; those with sensors are short already."""
+    """Yield short pieces and the states before them; pieces with sensors are short already."""
     size = len(replay.epochs)
     sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
     if size <= _EPOCHS or sensed:

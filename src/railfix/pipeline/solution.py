@@ -1,4 +1,4 @@
-"""Outputs of the stages of positioning, from the 3-D position to the protection level."""
+"""Outputs of the positioning stages, from the 3-D position to the protection level."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from railfix.positioning.range_arrays import InterSystemBiases
 class ProtectionResult(NotebookTable):
     """Protection levels of T epochs."""
 
-    #: NaN without a position, and where RAIM has left a fault in it. Channels are those of the ranges.
+    #: Levels, NaN without a position and with a fault remaining after RAIM. The channels are those of the ranges.
     level: ProtectionLevel
     status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
     kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
@@ -33,40 +33,40 @@ class ProtectionResult(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Solution(NotebookTable):
-    """Outputs of the stages of positioning, T epochs."""
+    """Outputs of the positioning stages at T epochs."""
 
-    point: SinglePoint  #: Conventional position: every constellation with a clock of its own.
-    #: 3-D positions of the ranges that agree, without excluded ones; NaN where they contradict each other; (T, 3).
+    point: SinglePoint  #: Conventional position, with one clock per constellation.
+    #: 3-D positions of consistent ranges after exclusions; NaN where the ranges are inconsistent; (T, 3).
     consistent_ecef_m: Floats
-    #: `railfix.integrity.PointStatus` of the conventional position, which is kept as it is; shape (T,).
+    #: `railfix.integrity.PointStatus` of the conventional position, which stays unchanged; shape (T,).
     conventional_status: Codes
-    fix: LineFix  #: Positions from the codes, after exclusions.
+    fix: LineFix  #: Positions from codes after exclusions.
     ties: InterSystemBiases  #: Inter-system biases known before each epoch, by `Channels.clocks`.
     raim: RaimResult  #: Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
     status: Codes  #: `reasons.Status`, shape (T,).
-    #: Standard deviation of this receiver's ranges against the one the weights assume: root mean square of what RAIM
-    #: left in the epochs before, with forgetting; shape (T,).
+    #: Ratio of the receiver's range standard deviation to the one assumed by the weights: root mean square of the
+    #: residuals after RAIM over previous epochs, with exponential forgetting; shape (T,).
     noise_scale: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of the
     #: receiver's noise and the noise of these residuals, widened by Student's t where few ranges are redundant. Also
     #: given where the position is dropped; shape (T,).
     epoch_sigma_m: Floats
-    #: Position along the antenna's trajectory: from the codes, or from code and phase; shape (T,).
+    #: Position along the antenna's trajectory, from codes or from code and phase; shape (T,).
     arc_m: Floats
-    #: Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
-    #: itself; satellites and atmosphere; the map error; and the distance to an unresolved alternative position,
+    #: Standard deviation along the line. It combines the noise by the weights, the residuals of the window and of the
+    #: epoch; satellite and atmospheric errors; the map error; and the distance to an unresolved alternative position,
     #: weighted by its probability; shape (T,).
     along_sigma_m: Floats
-    #: Positions from code and phase, where ``Config.carrier`` is "float" or "fixed"; they are what `arc_m` is.
+    #: Positions from code and phase if ``Config.carrier`` is "float" or "fixed"; `arc_m` then has these positions.
     phase: PhasePositions | None
-    protection: ProtectionResult | None  #: Protection levels along the line; None where they are off.
+    protection: ProtectionResult | None  #: Protection levels along the line; None if off.
     map_offset: MapOffset  #: Mean offset of the 3-D positions of the last minutes from the line.
-    off_map: Masks  #: The train is away from the line: `railfix.pipeline.off_map`; shape (T,).
+    off_map: Masks  #: True where the train is away from the line (`railfix.pipeline.off_map`); shape (T,).
     araim: AraimResult | None = None  #: ARAIM levels; None without an integrity support message.
 
 
 @lru_cache
 def with_coordinates(failed_checks: str) -> Masks:
-    """Return which statuses come with coordinates, by the number of the status; of `Config.failed_checks`."""
+    """Return which statuses have coordinates, by status number, for a value of `Config.failed_checks`."""
     dropped = CHECK_FAILED if failed_checks == "drop" else ()
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))

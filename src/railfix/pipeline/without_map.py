@@ -1,4 +1,4 @@
-"""Positions and ranges of a log without a track map: conventional positions, epochs of a survey."""
+"""Positions and ranges of a log without a track map: conventional positions, survey epochs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from railfix.gnss.observations import Observations
 from railfix.pipeline.channel_book import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.range_stage import raw_ranges
-from railfix.pipeline.received import Received, broadcast_source
+from railfix.pipeline.received import Received, broadcast_source, with_base_station
 from railfix.positioning.carrier import CycleSlipState, corrected_phase_m, find_slips
 from railfix.positioning.gross_errors import GROSS_M, disagreeing, gross_in_space
 from railfix.positioning.igg3_fit import robust_fit
@@ -28,12 +28,11 @@ from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_sat
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
-#: Ellipsoidal heights of receivers on land and in aircraft [m]: a position beyond them is wrong.
+#: Range of ellipsoidal heights of receivers on land and in aircraft [m]; positions beyond it are wrong.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
-#: Heights for which the tropospheric model has values [m].
+#: Height range of the tropospheric model [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
-#: Root mean square of raw residuals, the atmosphere's delays among them, from which on gross errors are searched for
-#: [m].
+#: Root mean square of raw residuals, including atmospheric delays, from which on gross errors are searched for [m].
 _QUIET_M: Final = 10.0
 
 
@@ -44,13 +43,13 @@ class NoPosition(IntEnum):
     NONE = 0
     #: No pseudorange was observed.
     NO_CODE = 1
-    #: The navigation files have no valid and healthy record of enough of the satellites.
+    #: Too few satellites have a valid and healthy record in the navigation files.
     NO_RECORD = 2
-    #: Fewer usable satellites than unknowns: three coordinates and one clock per constellation.
+    #: There are fewer usable satellites than unknowns: three coordinates and one clock per constellation.
     TOO_FEW_SATELLITES = 3
     #: The ranges do not determine a position, or the iteration did not converge.
     NO_CONVERGENCE = 4
-    #: The ranges contradict each other by more than 100 m, and no exclusion restores consistency.
+    #: The ranges are inconsistent by more than 100 m, and no exclusion restores consistency.
     INCONSISTENT = 5
     #: The position is below -500 m or above 10 km.
     IMPLAUSIBLE_HEIGHT = 6
@@ -78,8 +77,8 @@ class Located:
 
     time: Datetimes  #: Shape (T,).
     ecef_m: Floats  #: NaN without a position, shape (T, 3).
-    #: Standard deviations north, east and up: from the sigmas of the ranges, atmosphere and orbits included, and larger
-    #: where the residuals are; shape (T, 3).
+    #: Standard deviations north, east and up, from the range sigmas including atmosphere and orbits, scaled up by large
+    #: residuals; shape (T, 3).
     sigma_m: Floats
     n_used: Integers  #: Shape (T,).
     no_position: Codes  #: `NoPosition` of each epoch, shape (T,).
@@ -90,19 +89,23 @@ class RangesWithoutMap:
     """Corrected ranges of one antenna at an approximate position, T epochs by K channels."""
 
     corrected: CorrectedRanges
-    ranges: Ranges  #: Those to be fitted, with the sigmas of satellites and atmosphere; weight 0 for the others.
-    near_ecef_m: Floats  #: The approximate position; NaN where the codes give none; shape (T, 3).
-    no_position: Codes  #: `NoPosition` by the number of codes, records and satellites; shape (T,).
+    #: Ranges to be fitted, with sigmas including satellite and atmospheric errors; weight 0 for the others.
+    ranges: Ranges
+    near_ecef_m: Floats  #: Approximate position; NaN if the codes give none; shape (T, 3).
+    no_position: Codes  #: `NoPosition` from the numbers of codes, records and satellites; shape (T,).
 
 
-#: Reasons by which a code is none of a satellite's that is used.
+#: Rejection reasons of codes from satellites that are not used.
 _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OTHER_SIGNAL_TAKEN)
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
-    """Return corrected ranges of one antenna without a track: the codes give the approximate position."""
+    """Return corrected ranges of one antenna without a track: the codes give the approximate position.
+
+    The models correct them, and a base station that has been received; SBAS does not.
+    """
     channels = book.of(obs, received.navigation)
-    source = replace(broadcast_source(received, config), second="none")
+    source = with_base_station(replace(broadcast_source(received, config), second="none"), received, config)
     satellites = find_satellites(obs, channels, source, max_age_s=config.max_ephemeris_age_s)
     raw = raw_ranges(obs, channels, satellites)
     observed, implausible = (satellites.reason & _OF_CODES) == 0, int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE)
@@ -111,7 +114,7 @@ def ranges_without_map(obs: Observations, received: Received, config: Config, bo
     corrected = corrected_ranges(obs, channels, satellites, seen_from, source, gross=gross, noise=config.noise)
     sigma = np.hypot(corrected.sigma_m, corrected.nominal_elevation_sigma_m)
     position, code = corrected.satellites.position_ecef_m, corrected.used_code_m
-    # those below the mask help to find which ones are wrong
+    # satellites below the mask help to identify the wrong ranges
     wrong = disagreeing(weighted_ranges(position, code, sigma, channels.clock), seen_from)
     code = np.where(wrong | ~(corrected.elevation_deg >= config.elevation.mask_deg), np.nan, code)
     ranges = weighted_ranges(position, code, sigma, channels.clock)
@@ -134,7 +137,7 @@ def _solvable(ranges: Ranges) -> Masks:
 
 
 def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, Masks]:
-    """Return positions from raw ranges, NaN without, (T, 3); gross errors, (T, M); contradictory epochs, (T,)."""
+    """Return positions from raw ranges (T, 3), NaN without one; gross errors (T, M); inconsistent epochs (T,)."""
     start = _below(raw)
     point = point_position(raw, start, limits=config.single_point)
     place, gross, rms = point.ecef_m.copy(), np.zeros(raw.weight.shape, dtype=np.bool_), _rms_m(raw, point)
@@ -149,26 +152,26 @@ def _approximate_position(raw: Ranges, config: Config) -> tuple[Floats, Masks, M
 
 
 def _rms_m(ranges: Ranges, point: SinglePoint) -> Floats:
-    """Return the root mean square of the residuals by degrees of freedom, shape (T,) [m]; 0 without any."""
+    """Return the root mean square of the residuals over the degrees of freedom, shape (T,) [m]; 0 without any."""
     freedom = ranges.space_redundancy
     square = np.where(ranges.weight > 0, point.residual_m, 0.0) ** 2
     return np.asarray(np.where(freedom >= 1, np.sqrt(square.sum(axis=1) / np.maximum(freedom, 1)), 0.0))
 
 
 def _plausible_height(ecef_m: Floats) -> Masks:
-    """Return the positions at heights where receivers are; false for NaN; shape (T,)."""
+    """Return the mask of positions at plausible receiver heights; false for NaN; shape (T,)."""
     height = geodetic_from_ecef(ecef_m)[2]
     return np.asarray((height >= _HEIGHTS_M[0]) & (height <= _HEIGHTS_M[1]))
 
 
 def _at_surface(ecef_m: Floats) -> Floats:
-    """Return positions moved up or down to heights where the model of the troposphere is valid, shape (T, 3) [m]."""
+    """Return positions moved vertically into the height range of the tropospheric model, shape (T, 3) [m]."""
     latitude, longitude, height = geodetic_from_ecef(ecef_m)
     return ecef_from_geodetic(latitude, longitude, np.clip(height, *_MODELLED_HEIGHTS_M))
 
 
 def locate(obs: Observations, received: Received, config: Config, book: ChannelBook) -> Located:
-    """Compute the conventional position of every epoch, ranges that disagree left out; see `ranges_without_map`."""
+    """Compute the conventional position of every epoch without inconsistent ranges; see `ranges_without_map`."""
     return locate_ranges(obs.time, ranges_without_map(obs, received, config, book), config)
 
 
@@ -178,7 +181,7 @@ def locate_ranges(time: Datetimes, seen: RangesWithoutMap, config: Config) -> Lo
     start = np.where(np.isnan(seen.near_ecef_m), _below(ranges), seen.near_ecef_m)
     fit = robust_fit(ranges, start, limits=config.robust_fit)
     rest = without(ranges, (ranges.weight > 0) & ~fit.kept)
-    checked = rest.space_redundancy > 0  # one range too many at least, or nothing shows which ones are wrong
+    checked = rest.space_redundancy > 0  # at least one redundant range is needed to identify wrong ranges
     ranges = without(ranges, (ranges.weight > 0) & ~fit.kept & checked[:, None])
     point = point_position(ranges, start, limits=config.single_point)
     freedom = ranges.space_redundancy
@@ -203,24 +206,24 @@ def locate_ranges(time: Datetimes, seen: RangesWithoutMap, config: Config) -> Lo
 
 
 def _below(ranges: Ranges) -> Floats:
-    """The point of the Earth's surface below the mean of the satellites, shape (T, 3) [m]: a start for the fit."""
+    """Return the point on the Earth's surface below the mean of the satellites, shape (T, 3) [m], to start the fit."""
     weight = (ranges.weight > 0).astype(np.float64)
     mean = np.einsum("tk,tki->ti", weight, ranges.sat_ecef_m) + np.array([1.0, 0.0, 0.0])
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True) * _EARTH_RADIUS_M)
 
 
-#: Steps longer than this many intervals have no changes: Beyond this, Dopplers at both ends are not accurate enough.
+#: Largest step, in intervals, with range changes; over longer steps the Dopplers at both ends are not accurate enough.
 _LONGEST_STEP: Final = 2.5
-#: Standard deviation of a change by Dopplers from the curvature of the motion [m/s^2].
+#: Standard deviation of a Doppler-derived change due to acceleration [m/s^2].
 _CURVED_MPS2: Final = 0.05
 
 
 def survey_run(
     parts: Iterable[Observations], received: Received, config: Config, limits: SurveyLimits, *, name: str
 ) -> SurveyRun:
-    """Return the run of a log, read part by part, with its ranges and their changes.
+    """Return the survey run of a log, read in parts, with its ranges and range changes.
 
-    Between two parts there is no change. ValueError: fewer than three epochs have a position.
+    There is no range change between two parts. ValueError if fewer than three epochs have a position.
     """
     book, slips = ChannelBook(config), None
     runs: list[SurveyRun] = []
@@ -244,10 +247,10 @@ def _survey_part(
     book: ChannelBook,
     slip_state: CycleSlipState | None,
 ) -> tuple[SurveyRun, RunSignals, CycleSlipState | None]:
-    """Return the run of some observations, thinned to the interval of the survey, and the state of the slips.
+    """Return the survey run of observations, decimated to the survey interval, and the slip state.
 
-    The change of a range is that of the carrier phase where it continues without a slip at every epoch between,
-    otherwise the mean of the Dopplers at both ends.
+    A range change is the carrier-phase change if the phase continues without a slip at every epoch between, otherwise
+    it is computed from the mean of the Dopplers at both ends.
     """
     seen = ranges_without_map(obs, received, config, book)
     located, channels = locate_ranges(obs.time, seen, config), seen.corrected.channels

@@ -156,4 +156,5 @@ class BaseStationSource:
         differenced = np.isfinite(base.code_m)
         nominal, beyond = (np.where(differenced, base.sigma_m, each) for each in (given.nominal_m, given.sigma_m))
         beyond = np.where(differenced, beyond, np.hypot(beyond, self.floor_sigma_m))
-        return SourceDelays(given.delays, beyond, nominal, given.nominal_elevation_sigma_m, base, "included")
+        by_elevation = np.where(differenced, 0.0, given.nominal_elevation_sigma_m)
+        return SourceDelays(given.delays, beyond, nominal, by_elevation, base, "included")

@@ -1,11 +1,11 @@
 """Pseudorange difference of two antennas against their spacing (P1 2.3(3), figure 5, table 6: 5 m).
 
 The range of a satellite from the rear antenna is longer by ``L (cos el cos(az - heading) cos gradient + sin el sin
-gradient)``. A difference that does not fit has multipath in one of the two, which one is unknown.
+gradient)``. An inconsistent difference indicates multipath at one of the two antennas; which one is unknown.
 
-Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median have separate clocks: the screen is not run, as in P1
-6. Otherwise the clock difference is the median over the satellites of a constellation; with range rates given, the
-satellites' motion between the two instants is removed (1 ms is up to 0.8 m).
+Receivers whose ranges differ by `SEPARATE_CLOCKS_M` in the median have separate clocks, and the screen is not run, as
+in P1 6. Otherwise the clock difference is the median over the satellites of a constellation; with range rates given,
+the satellites' motion between the two instants is removed (1 ms is up to 0.8 m).
 
 Gradient, sway and map leave the elevation uncertain by 3 deg and the azimuth relative to the car body by 3.5 deg (P1).
 Multipath below the difference that these explain is not detected.
@@ -35,29 +35,31 @@ from railfix.screens.base import ObservationPicture, ScreenColumn, Screened, Ver
 from railfix.screens.medians import clock_medians
 from railfix.screens.pairs import PairedEpochs, PairScreen, on_pairs, pair_channels
 
-#: Treatments of the receiver clocks, as named in the output.
+#: Treatment of the receiver clocks, in the words of the output.
 CLOCKS: Final = {
     "common": "the receivers' clocks are common by hardware",
     "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
 }
-#: Median difference over all satellites [m] that no multipath makes: the receivers' clocks are separate.
+#: Median difference over all satellites [m] that multipath cannot cause: the receivers' clocks are separate.
 SEPARATE_CLOCKS_M: Final = 100.0
 
 
 class AntennaPairLimits(Settings):
-    """Limits of the screen by two antennas."""
+    """Limits of the antenna-pair screen."""
 
-    #: Largest difference from the expected one; P1 table 6: 5.
+    #: Largest deviation from the expected difference; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Error of the satellite's direction from the car body; P1 2.3(3): 3 and 3.5.
+    #: Error of the satellite's direction relative to the car body; P1 2.3(3): 3 and 3.5.
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
-    clocks: Literal["common", "median"] = "median"  #: One clock by hardware, or the median of each constellation.
-    least_satellites: int = Field(default=4, ge=3)  #: "median": satellites of a constellation that both antennas need.
+    #: Receiver clocks: common by hardware, or eliminated by the median of each constellation.
+    clocks: Literal["common", "median"] = "median"
+    #: For "median": minimum number of common satellites in a constellation.
+    least_satellites: int = Field(default=4, ge=3)
     #: Largest difference of the time tags of a pair of epochs.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
-    #: Treatment of a satellite whose difference does not fit: its sigma grows on both antennas, as which of them is
-    #: wrong is unknown, or it is rejected on both, as in P1.
+    #: Treatment of a satellite with an inconsistent difference: its sigma is increased on both antennas, because the
+    #: faulty one is unknown, or it is rejected on both, as in P1.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
@@ -66,9 +68,9 @@ class AntennaPairScreened(Screened):
     """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m]."""
 
     expected_m: Floats  #: Pseudorange of the rear antenna less that of the front one, from the spacing; shape (P, C).
-    #: Clock of the rear receiver less that of the front one, as eliminated; 0 where common; shape (P, C).
+    #: Eliminated clock difference, rear receiver less front receiver; 0 if common; shape (P, C).
     clock_m: Floats
-    clocks: str  #: How the clocks were treated, in words.
+    clocks: str  #: Treatment of the clocks, in words.
     zone: Callable[[], Floats]  #: Returns `ambiguity_m`.
 
     @cached_property
@@ -86,7 +88,7 @@ class Spacing(NamedTuple):
 
 
 class TagDifference(NamedTuple):
-    """Instants of the two receivers."""
+    """Time-tag difference of the two receivers."""
 
     later: ArrayLike  #: Time tags of the rear receiver less those of the front one, shape (P,).
     range_rate_mps: ArrayLike  #: ``-lambda D``, NaN where unknown: then left out; shape (P, C).
@@ -98,8 +100,8 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacin
     Parameters
     ----------
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
-        On their trajectories at the same instant. A common error along a straight line has no effect: only their
-        difference counts.
+        Antenna positions on their trajectories at the same instant. Only their difference is used, so that a common
+        error along a straight line has no effect.
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)
@@ -119,14 +121,14 @@ def expected_difference_m(
     gradient_permille: ArrayLike,
     spacing_m: ArrayLike,
 ) -> Floats:
-    """Return the pseudorange of the rear antenna less that of the front one, with equal clocks, shape (P, C) [m].
+    """Return the rear antenna's pseudorange less the front antenna's, with equal clocks, shape (P, C) [m].
 
     Parameters
     ----------
     elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
     heading_deg, gradient_permille, spacing_m : array_like, shape (P,) or scalar
-        From the rear to the front antenna. For a train that faces falling chainage the heading is that of the line
-        turned by 180 deg, and the gradient changes sign.
+        Line from the rear to the front antenna. For a train that faces falling chainage the line's heading is turned by
+        180 deg, and the gradient changes sign.
     """
     elevation, azimuth = np.radians(elevation_deg), np.radians(azimuth_deg)
     heading, spacing = (np.asarray(value, dtype=np.float64)[..., None] for value in (heading_deg, spacing_m))
@@ -145,8 +147,8 @@ def ambiguity_m(
 ) -> Floats:
     """Return the largest change of the expected difference that the errors of the angles explain [m].
 
-    The direction within the errors that differs most: 1.1 m at most at 18.2 m spacing (P1 2.3(3)), for a low satellite
-    abeam.
+    It is computed for the worst direction within the errors: at most 1.1 m at 18.2 m spacing (P1 2.3(3)), for a low
+    satellite abeam.
 
     Parameters
     ----------
@@ -156,7 +158,7 @@ def ambiguity_m(
     elevation_error_deg, azimuth_error_deg : float [deg]
     """
     angles = np.broadcast_arrays(np.radians(elevation_deg), np.radians(relative_azimuth_deg))
-    shape = angles[0].shape  # rows of one element each where no table is given; a table may have no channel
+    shape = angles[0].shape  # scalars become rows of one element; a table may have no channel
     rows = (math.prod(shape[:-1]), shape[-1]) if len(shape) > 1 else (-1, 1)
     elevation, azimuth = (np.ascontiguousarray(a.reshape(rows)) for a in angles)
     errors = np.radians(elevation_error_deg), np.radians(azimuth_error_deg)
@@ -166,13 +168,13 @@ def ambiguity_m(
 
 def largest_changes(elevation: Floats, azimuth: Floats, elevation_error: float, azimuth_error: float) -> Floats:
     """Largest change of ``cos(elevation) cos(azimuth)`` within the errors of both, shape (T, M); all in radians."""
-    # the product of two cosines is extremal where each of them is
+    # the product of two cosines is extremal where each cosine is
     (up, *ups), (aside, *asides) = _cosines(elevation, elevation_error), _cosines(azimuth, azimuth_error)
     return np.asarray(np.max([np.abs(a * b - up * aside) for a, b in product(ups, asides)], axis=0))
 
 
 def _cosines(angle: Floats, error: float) -> tuple[Floats, Floats, Floats]:
-    """Return cosines of angles, and the least and the largest within an error of them; NaN for NaN."""
+    """Return the cosines of angles, and the smallest and largest cosine within the angle error; NaN for NaN."""
     cosine, least = np.cos(angle), math.cos(error)
     middle, half = cosine * least, np.abs(np.sin(angle)) * math.sin(error)
     low = np.where(cosine <= -least, -1.0, middle - half)
@@ -200,9 +202,9 @@ def antenna_pair_screen(
     elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
     satellite : ndarray of str, shape (C,)
     spacing : Spacing
-        Of `spacing_direction`.
+        Returned by `spacing_direction`.
     tags : TagDifference, optional
-        Without it the instants count as one.
+        Without it the receivers are treated as simultaneous.
 
     Returns
     -------
@@ -217,7 +219,7 @@ def antenna_pair_screen(
     later = np.zeros(len(front)) if tags is None else seconds(tags.later)
     raw = rear - front - expected - rate * later[:, None]
     if limits.clocks == "median":
-        # the instants that the clocks move are allowed for
+        # shifts of the instants by the clocks are included
         timed = raw + rate * clock_medians(raw, satellite) / SPEED_OF_LIGHT
         clock = clock_medians(timed, satellite, least=limits.least_satellites)
         raw = raw + rate * clock / SPEED_OF_LIGHT
@@ -243,7 +245,7 @@ def antenna_pair_screen(
 
 
 class AntennaPairScreen(PairScreen[AntennaPairLimits]):
-    """Pseudorange difference of two antennas against their spacing; a misfit is rejected on both."""
+    """Pseudorange difference of two antennas against their spacing; an inconsistent satellite is rejected on both."""
 
     name = "antenna_pair"
     limits = AntennaPairLimits()

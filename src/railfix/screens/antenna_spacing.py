@@ -20,13 +20,13 @@ class AntennaSpacingLimits(Settings):
 
     #: Largest difference from the spacing; P1 table 6: 5.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Filter positions that differ by more than the limit where both were predicted: also by this many of their
-    #: standard deviations. Limits of their speeds.
+    #: Filter positions must also differ by this many of their standard deviations where both were predicted; limits of
+    #: their speeds.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
     #: Largest difference of the two speeds by the filter. Antennas of one vehicle have equal speeds, up to a few cm/s
     #: where the track curves or its cant changes; a smaller difference of single epochs moves no position by a metre.
     filter_speed_mps: float = Field(default=1.5, gt=0.0)
-    #: Time for which neither position is trusted: a wrong speed results in a wrong position, which codes correct within
+    #: Time for which neither position is used: a wrong speed results in a wrong position, which codes correct within
     #: some 20 s.
     filter_held_s: float = Field(default=20.0, ge=0.0, allow_inf_nan=False)
 
@@ -44,19 +44,19 @@ def antenna_spacing_screen(
     Parameters
     ----------
     chainage_front_m, chainage_rear_m : array_like, shape (P,) [m]
-        Of the same instants, counted along one line; NaN without a position: not tested.
+        Chainages at the same instants along one line; NaN without a position, which is not tested.
     spacing_m : array_like, shape (P,) or scalar [m]
-        Front less rear along the track as the chainages count it, not negative: the antennas' distance
-        where each chainage is the one abeam its antenna, 0 where both are that of one reference point.
+        Expected front less rear chainage, not negative: the antenna distance if each chainage refers to its antenna, 0
+        if both refer to one reference point.
     facing : array_like of int, shape (P,) or scalar
-        1 where the vehicle's front looks to rising chainage, -1 to falling, 0 where that is unknown:
-        then the order of the two is not tested.
+        1 if the vehicle's front points to rising chainage, -1 to falling, 0 if unknown; the order of the two is then
+        not tested.
 
     Returns
     -------
     Screened
-        Shapes (P,). The metric is ``facing (front - rear) - spacing`` [m], positive where they are too
-        far apart; ``|front - rear| - spacing`` where facing is 0. Both positions are rejected.
+        Shapes (P,). The metric is ``facing (front - rear) - spacing`` [m], positive if the positions are too far apart;
+        ``|front - rear| - spacing`` where facing is 0. Both positions are rejected.
     """
     limits = limits or AntennaSpacingLimits()
     apart = np.asarray(chainage_front_m, dtype=np.float64) - np.asarray(chainage_rear_m, dtype=np.float64)
@@ -70,7 +70,7 @@ def antenna_spacing_screen(
 
 
 class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
-    """Spacing of the two positions against that of the antennas."""
+    """Distance of the two positions against the antenna spacing."""
 
     name = "antenna_spacing"
     limits = AntennaSpacingLimits()
@@ -78,7 +78,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     columns = (
         ScreenColumn(
             name="metric_antenna_spacing_m",
-            meaning="screen `antenna_spacing`: distance of the two positions less that of the antennas",
+            meaning="screen `antenna_spacing`: distance of the two positions less the antenna spacing",
             verdict="antenna_spacing",
             table="positions",
         ),
@@ -87,7 +87,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge(
         self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict of the pairs of positions; not ordered where the spacing is unknown."""
+        """Return metric and verdict of the position pairs; their order is not tested if the spacing is unknown."""
         along = np.where(np.isnan(pair.along_m), 0.0, pair.along_m)
         return antenna_spacing_screen(
             front_chainage_m, rear_chainage_m, np.abs(along), facing=np.sign(along).astype(int), limits=limits
@@ -96,7 +96,7 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict of pairs by the filter: positions or speeds beyond limit and noise."""
+        """Return metric and verdict of filtered pairs: positions or speeds beyond limit and noise."""
         found = self.judge(front.chainage_m, rear.chainage_m, pair, limits)
         apart = np.abs(found.metric) > limits.filter_sigmas * np.hypot(front.sigma_m, rear.sigma_m)
         difference = np.abs(front.speed_mps - rear.speed_mps)

@@ -39,18 +39,18 @@ class Screened(NotebookTable):
 class Verdict:
     """A screen's result on the channels of one antenna."""
 
-    name: str  #: Key in `AntennaResult.screens`: the screen's own name, or one a verdict where it has several.
-    reason: Reason  #: Given to the rejected observations.
+    name: str  #: Key in `AntennaResult.screens`: the screen's name, or one name per verdict if it has several.
+    reason: Reason  #: Reason given to the rejected observations.
     screened: Screened  #: Shapes (T, K).
-    #: Size of the measured error: suspected ranges are weighted down by it. None: rejected; shape (T, K).
+    #: Size of the measured error, by which the weight of suspected ranges is lowered; None for rejection; shape (T, K).
     error_m: Floats | None = None
 
 
 def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats:
     """Return the standard deviation of ranges of which some are suspected, shape (T, M) [m].
 
-    The error of a suspected range (`reject`), as the screen measured it (`error_m`), two sigmas at least, is added to
-    `sigma_m` as another standard deviation.
+    The error of a suspected range (`reject`), as measured by the screen (`error_m`) and at least two sigmas, is added
+    to `sigma_m` as another standard deviation.
     """
     if not reject.any():
         return sigma_m
@@ -62,7 +62,7 @@ def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenSetup:
-    """Facts of a run that some screens need."""
+    """Properties of a run that some screens need."""
 
     antennas: int = 1  #: Number of antennas.
     spacing_known: bool = False  #: Whether a vehicle file places both antennas on one vehicle.
@@ -71,9 +71,9 @@ class ScreenSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenColumn:
-    """A column of the result tables that a screen fills."""
+    """Column of the result tables filled by a screen."""
 
-    name: str  #: With its unit: ``metric_doppler_m``.
+    name: str  #: Name with its unit: ``metric_doppler_m``.
     meaning: str
     verdict: str  #: Key in `AntennaResult.screens`.
     field: str = "metric"  #: Array of that verdict: "metric", or another one of a subclass of `Screened`.
@@ -94,7 +94,7 @@ class ScreenPicture:
 
 
 class ObservationPicture(NamedTuple):
-    """Picture of a column of the observations against its limit."""
+    """Picture of an observation column against its limit."""
 
     name: str
     title: str
@@ -119,20 +119,20 @@ class RunTables(Protocol):
 
 
 class Screen(ABC, Generic[Limits]):
-    """One screen; derive from the subclass for its kind of verdict."""
+    """Base class of a screen; derive from the subclass for its kind of verdict."""
 
-    name: ClassVar[str]  #: In `Config.screens`, and of its group of settings.
-    limits: Limits  #: Default limits; their type has the fields of the group of settings.
-    needs: ClassVar[str]  #: Data without which it cannot be run, for the note.
+    name: ClassVar[str]  #: Name in `Config.screens` and of its settings group.
+    limits: Limits  #: Default limits, whose type defines the settings group.
+    needs: ClassVar[str]  #: Required data, for the note on a missing screen.
     columns: ClassVar[tuple[ScreenColumn, ...]] = ()  #: Columns of the result tables.
     observation_pictures: ClassVar[tuple[ObservationPicture, ...]] = ()
 
     def unable(self, limits: Limits, setup: ScreenSetup) -> bool:
-        """Return whether the screen cannot be run at all in this run."""
+        """Return whether the screen cannot be run in this run at all."""
         return False
 
     def notes(self, limits: Limits, setup: ScreenSetup) -> tuple[str, ...]:
-        """Return sentences on a screen that was requested and cannot be run, or not fully."""
+        """Return sentences on a requested screen that cannot be run, or only in part."""
         return (f"screen {self.name} was not run: it needs {self.needs}",) if self.unable(limits, setup) else ()
 
     def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:
@@ -155,5 +155,5 @@ class ObservationScreen(Screen[Limits]):
         Parameters
         ----------
         state : object
-            Returned with the previous chunk; None at the start. Screens without memory return None.
+            State returned with the previous chunk; None at the start. Screens without memory return None.
         """

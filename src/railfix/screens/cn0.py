@@ -1,7 +1,7 @@
 """C/N0 against its open-sky mean at the elevation, and an absolute floor (P1 2.3(1)).
 
-P1 measures the mean over elevation for the antenna and receiver on a day of open sky (`railfix.ranges.cn0_curve`), and
-rejects observations 10 dB-Hz below it; and, for all satellites, observations below 30 dB-Hz (table 6).
+P1 measures the mean over elevation for antenna and receiver on a day with open sky (`railfix.ranges.cn0_curve`), and
+rejects observations 10 dB-Hz below this mean, and all observations below 30 dB-Hz (table 6).
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from railfix.screens.base import (
 
 
 class Cn0Limits(Settings):
-    """Limits of the screen of signal strength."""
+    """Limits of the signal-strength screen."""
 
-    #: Largest deficit against the mean at the elevation; P1 table 6: 10. None switches the curve off.
+    #: Largest deficit against the mean at the elevation; P1 table 6: 10. With None the curve is not used.
     deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
-    #: Weakest signal used; None, the default, switches the floor off. P1 table 6: 30, for its receivers. C/N0 is
-    #: measured differently by each receiver: 30 rejects over half of the signals of an M8T in a city, where 20 to 25
-    #: fits.
+    #: Minimum C/N0; with None, the default, there is no floor. P1 table 6 uses 30 for its receivers. Receivers measure
+    #: C/N0 differently: 30 rejects over half of an M8T's signals in a city, where 20 to 25 is suitable.
     floor_dbhz: float | None = Field(default=None, gt=0.0, lt=100.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Screened(Screened):
-    """Verdict on signal strength: the metric is C/N0, the limit the higher of floor and curve [dB-Hz]."""
+    """Verdict on signal strength: the metric is C/N0, the limit is the higher of floor and curve [dB-Hz]."""
 
-    floor: Screened  #: The metric is C/N0 [dB-Hz].
-    curve: Screened  #: The metric is the mean at the elevation less C/N0 [dB]; NaN without a curve.
+    floor: Screened  #: Verdict of the floor; the metric is C/N0 [dB-Hz].
+    #: Verdict of the curve; the metric is the mean at the elevation less C/N0 [dB]; NaN without a curve.
+    curve: Screened
 
 
 def cn0_screen(
@@ -56,21 +56,21 @@ def cn0_screen(
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
 ) -> Cn0Screened:
-    """Reject signals that are weaker than an open sky gives (P1 2.3(1); table 6: mean - 10 dB-Hz, 30 dB-Hz).
+    """Reject signals weaker than under open sky (P1 2.3(1); table 6: mean - 10 dB-Hz, 30 dB-Hz).
 
     Parameters
     ----------
     cn0_dbhz : array_like, shape (T, M) [dB-Hz]
-        NaN where the log has none: not tested.
+        C/N0; NaN where absent, which is not tested.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
     curve : Cn0Curve, optional
-        Without one only the floor is applied.
+        Mean C/N0 over elevation; without it only the floor is applied.
 
     Returns
     -------
     Cn0Screened
-        At the limit exactly a signal is used.
+        A signal exactly at the limit is used.
     """
     limits = limits or Cn0Limits()
     cn0 = np.asarray(cn0_dbhz, dtype=np.float64)

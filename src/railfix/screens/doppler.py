@@ -5,10 +5,11 @@ multipath error is not detected. A step of the receiver clock moves all pseudora
 constellation removes it, and the interval is corrected by it beforehand (4 ms times 800 m/s are 3.2 m).
 
 P1 ran at 0.1 s. Over longer intervals the limit grows with the noise that two codes do not share, ``sqrt(1 - exp(-dt /
-correlation_s))``, the change of acceleration, ``jerk dt^3 / 12``, and the noise of the Doppler, ``sigma dt``. Its mode
-is "fixed" (P1's), "receiver", `factor` times the scale of the receiver's own changes (median over the satellites,
-averaged over the epochs), or "sigma", `factor` times the sigma of each code, which is widest for weak satellites (urban
-recordings at 1 Hz: a quarter of the bad codes found at the same loss); no mode is below P1's.
+correlation_s))``, the change of acceleration, ``jerk dt^3 / 12``, and the noise of the Doppler, ``sigma dt``. The mode
+of the limit is "fixed" (P1's limit), "receiver" (`factor` times the scale of the receiver's own changes, the median
+over the satellites averaged over the epochs), or "sigma" (`factor` times the sigma of each code, widest for weak
+satellites; in urban recordings at 1 Hz it finds a quarter of the bad codes at the same loss). No mode is below P1's
+limit.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ from railfix.screens.medians import clock_medians
 
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7  #: Median of the absolute value of a unit normal variable.
 _FINEST_M: Final = 1e-3  #: Smallest change used for the receiver's scale [m].
-_LEAST_CHANGES: Final = 5  #: Changes an epoch needs for its scale.
+_LEAST_CHANGES: Final = 5  #: Minimum number of changes for the scale of an epoch.
 
 
 class DopplerLimits(Settings):
     """Limits of the Doppler screen."""
 
-    #: Limit scaled by the receiver's noise, P1's, or by the stated sigmas; see the module.
+    #: Limit scaled by the receiver's noise, fixed as in P1, or scaled by the code sigmas; see the module.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
     #: Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
-    #: P1's interval is 0.1 s; twice that, so that one lost epoch changes nothing.
+    #: Twice P1's interval of 0.1 s, so that one lost epoch has no effect.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
     #: Time over which the receiver smooths its codes. 1 s gives 2.9 m at 1 s.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
@@ -54,23 +55,23 @@ class DopplerLimits(Settings):
     doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
     #: Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
     prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Over a longer interval the screen is not run.
+    #: Longest interval over which the screen is run.
     longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
-    #: How long a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back, which is
-    #: exactly P1's test.
+    #: Time for which a satellite stays rejected after a jump; 0 rejects only the epochs of the jumps out and back,
+    #: which is exactly P1's test.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
     least_satellites: int = Field(default=3, ge=3)  #: Number of satellites of one clock required to eliminate its step.
-    #: Treatment of a suspected satellite: its sigma grows by the size of the jump
-    #: (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. Where few satellites are left, the geometry
-    #: without one turns a few metres into a hundred; a weight does not.
+    #: Treatment of a suspected satellite: its sigma is increased by the size of the jump
+    #: (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. With few satellites, a rejection can weaken
+    #: the geometry so much that an error of a few metres becomes a hundred; a lower weight does not.
     verdict: Literal["weigh", "reject"] = "weigh"
 
 
 def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = None) -> Floats:
-    """Limit of mode "fixed" at an interval [m]: 1.50 up to 0.2 s, 2.88 at 1 s, 3.94 at 2 s.
+    """Return the limit of mode "fixed" at an interval [m]: 1.50 up to 0.2 s, 2.88 at 1 s, 3.94 at 2 s.
 
-    ``step sqrt((1 - exp(-dt / correlation)) / (1 - exp(-short / correlation))) + jerk dt^3 / 12``,
-    with dt not below `short_interval_s` in the first term and the second one only above it.
+    ``step sqrt((1 - exp(-dt / correlation)) / (1 - exp(-short / correlation))) + jerk dt^3 / 12``, with dt at least
+    `short_interval_s` in the first term; the second term applies only above it.
     """
     limits = limits or DopplerLimits()
     interval = np.asarray(interval_s, dtype=np.float64)
@@ -78,7 +79,7 @@ def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = Non
 
 
 def _growth(interval: Floats, limits: DopplerLimits) -> Floats:
-    """Return the noise of a change against that at the short interval."""
+    """Return the noise of a change relative to the short interval."""
     long = np.expm1(-np.maximum(interval, limits.short_interval_s) / limits.correlation_s)
     return np.asarray(np.sqrt(long / np.expm1(-limits.short_interval_s / limits.correlation_s)))
 
@@ -92,24 +93,24 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
     interval = interval_s[:, None]
     fresh = -np.expm1(-interval / limits.correlation_s)
     noise = (sigma_m[1:] ** 2 + sigma_m[:-1] ** 2) * fresh + (limits.doppler_sigma_mps * interval) ** 2
-    # a NaN stays NaN: without its sigma a satellite is not tested
+    # NaN is preserved: a satellite without a sigma is not tested
     return np.asarray(np.maximum(limits.step_m, limits.factor * np.sqrt(noise)) + _jerk_m(interval, limits))
 
 
 def receiver_limit_m(
     interval_s: Floats, metric_m: Floats, sum_log: float, weight: float, *, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Limit of mode "receiver", shape (T,) [m], and the sum of the logarithms of the scales and their number so far.
+    """Return the limit of mode "receiver", shape (T,) [m], and sum and number of the log scales so far.
 
-    The scale is that of changes at the short interval: the changes of an epoch are divided by the growth of the noise.
-    For a dozen satellites it is a tenth to a seventh too small (their own median is subtracted; logarithms are
-    averaged, so that an epoch full of multipath does not dominate).
+    The scale refers to the short interval: the changes of an epoch are divided by the growth of the noise. For a dozen
+    satellites it is a tenth to a seventh too small (their own median is subtracted; logarithms are averaged, so that an
+    epoch full of multipath does not dominate).
     """
     growth = _growth(interval_s, limits)
     shown = medians(np.abs(metric_m)) / _MEDIAN_NORMAL / growth
     counts = (np.isfinite(metric_m).sum(axis=1) >= _LEAST_CHANGES) & np.isfinite(shown)
     logs = np.where(counts, np.log(np.maximum(np.where(counts, shown, 1.0), _FINEST_M)), 0.0)
-    # running sums, continued from those of the state: chunk boundaries have no effect
+    # running sums continue from the state, so that chunk boundaries have no effect
     sums = np.concatenate([[sum_log], logs]).cumsum()[1:]
     weights = np.concatenate([[weight], counts]).cumsum()[1:]
     prior = limits.prior_epochs
@@ -125,26 +126,26 @@ _NS: Final = 1e9
 class DopplerScreened(Screened):
     """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m]; limits have shape (T, M)."""
 
-    #: Distance of a suspected satellite from its level before the jump, else 0, NaN as the metric; shape (T, M).
+    #: Code offset of a suspected satellite since before the jump, otherwise 0, NaN as the metric; shape (T, M).
     level_m: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerState:
-    """The last epoch seen, and the satellites under suspicion then; shapes (M,)."""
+    """Last epoch, and the satellites under suspicion at that epoch; shapes (M,)."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
-    #: Channels; the next chunk may have others.
+    #: Channels; the next chunk may have different ones.
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
     signal: Strings = field(default_factory=lambda: np.empty(0, dtype="<U2"))
     #: NaN where absent.
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_hz: Floats = field(default_factory=lambda: np.empty(0))
     code_sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    level_m: Floats = field(default_factory=lambda: np.empty(0))  #: See `DopplerScreened`.
+    level_m: Floats = field(default_factory=lambda: np.empty(0))  #: Code offset, as in `DopplerScreened`.
     #: Time of the jump, NaT where not suspected.
     since: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Sum of the logarithms of the receiver's scale, and how many epochs are in it (mode "receiver").
+    #: Sum of the receiver's log scales, and number of epochs in the sum (mode "receiver").
     scale_sum: float = 0.0
     scale_epochs: float = 0.0
 
@@ -176,11 +177,11 @@ def doppler_screen(
     The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` less its median over the
     channels of one receiver clock (GPS and QZSS share one).
 
-    A single difference does not show which of its two epochs is faulty. A satellite that jumps beyond the
-    limit is suspected and rejected, and its jumps are summed to a level. When the level is back within the
-    limit, the satellite is used again at once (its jump back is beyond the limit, and not rejected). When `hold_s` has
-    passed without that, the new offset is accepted. So a passing reflection costs its own epochs, and the end of a
-    reflection present from the first epoch on costs `hold_s` of good ones.
+    A single difference does not show which of its two epochs is faulty. A satellite that jumps beyond the limit is
+    suspected and rejected, and its jumps are summed to an offset. When the offset is back within the limit, the
+    satellite is used again at once (its jump back is beyond the limit, and not rejected). If this does not happen
+    within `hold_s`, the new offset is accepted. A passing reflection thus costs its own epochs, and the end of a
+    reflection present from the first epoch on costs `hold_s` of good epochs.
 
     Parameters
     ----------
@@ -188,20 +189,20 @@ def doppler_screen(
     code_m, doppler_hz : array_like, shape (T, M) [m], [Hz]
         NaN where absent. Implausible codes (0, 1e9) must be left out by the caller.
     break_before : array_like of bool, shape (T,), optional
-        Nothing is differenced across the step into these epochs.
+        Epochs before which no difference is formed.
     code_sigma_m : array_like, shape (T, M) [m], optional
-        Noise of the codes, requested by mode "sigma"; NaN there: not tested.
+        Noise of the codes, required by mode "sigma", in which a code with NaN is not tested.
     state : DopplerState, optional
-        Left by the previous chunk.
+        State after the previous chunk.
 
     Returns
     -------
     DopplerScreened
-        NaN metric, and no rejection, where there is no epoch before within `longest_interval_s`, where
-        the satellite lacks code or Doppler at either epoch, and where its clock has fewer than
-        `least_satellites` satellites. A suspicion ends there: the level is lost.
+        NaN metric, and no rejection, where there is no previous epoch within `longest_interval_s`, where the satellite
+        lacks code or Doppler at either epoch, and where its clock has fewer than `least_satellites` satellites. A
+        suspicion ends at such an epoch, because the offset is lost.
     DopplerState
-        To be passed on with the next chunk.
+        State for the next chunk.
 
     Raises
     ------
@@ -242,7 +243,7 @@ def doppler_screen(
 
 
 def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
-    """Return the state on the channels of this chunk; channels that left have no observation in it anyway."""
+    """Return the state on the channels of this chunk; other channels have no observation in it."""
     if state.satellite.tobytes() == satellite.tobytes() and state.signal.tobytes() == signal.tobytes():
         return state
     row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
@@ -254,7 +255,7 @@ def _align(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerS
 
 
 def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | None, limits: DopplerLimits) -> Floats:
-    """Return the interval into each epoch by the tags, shape (T,) [s]; NaN where nothing may be differenced."""
+    """Return the interval before each epoch by the time tags, shape (T,) [s]; NaN where no difference may be formed."""
     every = np.concatenate([np.array([last], dtype="datetime64[ns]"), time])
     interval = seconds(every[1:] - every[:-1])
     possible = (interval > 0.0) & (interval <= limits.longest_interval_s)
@@ -266,7 +267,7 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
     """Return the change of the codes against the Dopplers, the clock eliminated, shape (T, M) [m]."""
     raw = change - rate * interval[:, None]
-    # the receiver clock's step is not elapsed time
+    # a step of the receiver clock is not elapsed time
     passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT
     raw = change - rate * passed
     return np.asarray(raw - clock_medians(raw, satellite, least=least))
@@ -275,7 +276,7 @@ def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *
 def _limit_m(
     interval: Floats, metric: Floats, sigmas: Floats, before: DopplerState, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Limit of each change, shape (T, M) or (T, 1) [m], and the sums of the receiver's scale."""
+    """Return the limit of each change, shape (T, M) or (T, 1) [m], and the sums of the receiver's scale."""
     total, epochs = before.scale_sum, before.scale_epochs
     if limits.mode == "sigma":
         return expected_limit_m(interval, sigmas, limits=limits), total, epochs
@@ -295,12 +296,12 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     columns = (
         ScreenColumn(
             name="metric_doppler_m",
-            meaning="screen `doppler`: change of the pseudorange against its Doppler since the epoch before",
+            meaning="screen `doppler`: pseudorange change against its Doppler since the previous epoch",
             verdict="doppler",
         ),
         ScreenColumn(
             name="limit_doppler_m",
-            meaning="screen `doppler`: limit on the size of that",
+            meaning="screen `doppler`: limit of that change",
             verdict="doppler",
             field="limit",
         ),
@@ -315,7 +316,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     def judge(
         self, antenna: AntennaRanges, limits: DopplerLimits, setup: ScreenSetup, state: Any
     ) -> tuple[tuple[Verdict, ...], Any]:
-        """Return the verdict on a chunk, and the last epoch with the satellites under suspicion."""
+        """Return the verdict on a chunk, and the state with the satellites under suspicion."""
         screened, after = doppler_screen(
             antenna.time, np.where((antenna.reason & int(Reason.IMPLAUSIBLE_CODE)) == 0, antenna.code_m, np.nan),
             antenna.doppler_hz, channels=DopplerChannels(antenna.satellite, antenna.signal, antenna.frequency_hz),

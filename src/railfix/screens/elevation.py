@@ -23,14 +23,14 @@ from railfix.screens.base import (
 class ElevationLimits(Settings):
     """Limits of the elevation mask."""
 
-    #: Satellites below are rejected; P1 3.3 and table 6 use 20.
+    #: Elevation below which satellites are rejected; P1 3.3 and table 6 use 20.
     mask_deg: float = Field(default=20.0, ge=-90.0, lt=90.0)
 
 
 def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None = None) -> Screened:
     """Reject satellites below the mask, 20 degrees in P1 table 6.
 
-    The metric is the elevation [deg], NaN where unknown: not tested.
+    The metric is the elevation [deg]; NaN where unknown, which is not tested.
     """
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)

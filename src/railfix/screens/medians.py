@@ -20,7 +20,7 @@ def clock_medians(values: Floats, satellite: Strings, *, least: int = 0) -> Floa
 
 @lru_cache(maxsize=256)
 def _clocks(kind: str, satellites: bytes) -> tuple[Indices, Indices]:
-    """Return numbers of clock and satellite of M channels."""
+    """Return the clock and satellite indices of M channels."""
     names = np.frombuffer(satellites, dtype=kind).tolist()
     clock, number = (np.unique(of, return_inverse=True)[1] for of in ([CLOCK_GROUP[n[0]] for n in names], names))
     return clock.astype(np.intp), number.astype(np.intp)

@@ -19,10 +19,9 @@ from railfix.track.trajectory import Trajectory
 
 
 def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
-    """Return the epochs of two receivers that belong together, by rising time tags that differ by `tolerance_s` at
-    most.
+    """Return matching epochs of two receivers, whose ascending time tags differ by at most `tolerance_s`.
 
-    Each epoch is in one pair at most: two epochs are paired if each is the nearest to the other.
+    Each epoch is in at most one pair: two epochs are paired if each is the nearest to the other.
     """
     within_ns = round(tolerance_s * 1e9)
     to_rear = nearest_rows(time_rear, time_front, within_ns=within_ns)
@@ -35,8 +34,9 @@ def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: flo
 def pair_channels(
     satellite_front: Strings, signal_front: Strings, satellite_rear: Strings, signal_rear: Strings
 ) -> tuple[Indices, Indices]:
-    """Return the channels of the same satellite and signal at both receivers, in the order of the front one's."""
-    if satellite_front is satellite_rear and signal_front is signal_rear:  # epochs of both are rows of the same arrays
+    """Return the channels of the same satellite and signal at both receivers, in the order of the front receiver."""
+    # both receivers' epochs are rows of the same arrays
+    if satellite_front is satellite_rear and signal_front is signal_rear:
         every = np.arange(len(satellite_front))
         return every, every
     rear = {key: m for m, key in enumerate(zip(satellite_rear.tolist(), signal_rear.tolist(), strict=True))}
@@ -47,7 +47,7 @@ def pair_channels(
 
 
 def on_pairs(screened: Screened, shape: tuple[int, ...], epochs: Indices, channels: Indices) -> Screened:
-    """Return a verdict on pairs of epochs and channels laid on one antenna's own, of shape `shape`."""
+    """Map a verdict on pairs of epochs and channels to one antenna's epochs and channels, of shape `shape`."""
     metric, reject = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
     where = (epochs[:, None], channels) if len(shape) > 1 else epochs
     metric[where], reject[where] = screened.metric, screened.reject
@@ -67,9 +67,9 @@ def pair_antennas(
     *,
     tolerance_s: float,
 ) -> PairedEpochs:
-    """Return the epochs of two antennas matched by their time tags, with both positions on the line.
+    """Match the epochs of two antennas by their time tags, with both positions on the line.
 
-    `front_arc_m`: approximate arc lengths of the front antenna, shape (T,).
+    `front_arc_m` has approximate arc lengths of the front antenna, shape (T,).
     """
     at_front, at_rear = pair_epochs(front_time, rear_time, tolerance_s=tolerance_s)
     front_arc = front_arc_m[at_front]
@@ -83,20 +83,20 @@ def pair_antennas(
 
 @dataclass(frozen=True, kw_only=True)
 class PairedEpochs:
-    """Common epochs of two antennas of one vehicle, P of them."""
+    """P common epochs of two antennas of one vehicle."""
 
-    #: Epochs of each antenna that belong together, shape (P,).
+    #: Indices of matching epochs of each antenna, shape (P,).
     front_epoch: Indices
     rear_epoch: Indices
     #: Approximate positions of the antennas on their trajectories, shape (P, 3).
     front_ecef_m: Floats
     rear_ecef_m: Floats
-    #: Chainage of the front antenna less that of the rear one: negative if facing falling chainage; shape (P,).
+    #: Front less rear antenna chainage: negative if facing falling chainage; shape (P,).
     along_m: Floats
 
 
 class _OfTwoAntennas(Screen[Limits]):
-    """A screen that needs two antennas of one vehicle."""
+    """Screen that needs two antennas of one vehicle."""
 
     needs = "two antennas and a vehicle file, which gives their spacing"
 
@@ -106,7 +106,7 @@ class _OfTwoAntennas(Screen[Limits]):
 
 
 class PairScreen(_OfTwoAntennas[Limits]):
-    """A screen of the observations of two antennas of one vehicle."""
+    """Screen of the observations of two antennas of one vehicle."""
 
     @abstractmethod
     def judge(
@@ -116,7 +116,7 @@ class PairScreen(_OfTwoAntennas[Limits]):
 
 
 class FilteredMotion(NamedTuple):
-    """Positions [m] and speeds [m/s] of one antenna by the filter along the track, NaN where missing, shape (T,)."""
+    """Filtered positions [m] and speeds [m/s] of one antenna, NaN where missing, shape (T,)."""
 
     chainage_m: Floats
     sigma_m: Floats
@@ -124,14 +124,14 @@ class FilteredMotion(NamedTuple):
     speed_sigma_mps: Floats
 
     def take(self, epochs: Indices) -> FilteredMotion:
-        """Return those of some epochs."""
+        """Return the values of selected epochs."""
         return FilteredMotion(*(values[epochs] for values in self))
 
 
 class PositionScreen(_OfTwoAntennas[Limits]):
-    """A screen of the positions of two antennas of one vehicle."""
+    """Screen of the positions of two antennas of one vehicle."""
 
-    status: ClassVar[Status]  #: Given to the epochs of both antennas whose positions are rejected.
+    status: ClassVar[Status]  #: Status of both antennas' epochs whose positions are rejected.
 
     @abstractmethod
     def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:
@@ -141,4 +141,4 @@ class PositionScreen(_OfTwoAntennas[Limits]):
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: Limits
     ) -> Screened:
-        """Return the verdict for the P pairs of positions and speeds by the filter along the track."""
+        """Return the verdict for the P pairs of filtered positions and speeds."""

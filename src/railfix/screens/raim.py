@@ -1,4 +1,4 @@
-"""RAIM among the screens: its settings and its picture. The pipeline runs it on the solved positions."""
+"""RAIM as a screen: its settings and its picture. The pipeline runs it on the solved positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Registry of the screens: those of railfix, and those that packages name as entry points of ``railfix.screens``."""
+"""Registry of the screens of railfix, and of screens that packages register as entry points of ``railfix.screens``."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from railfix.core.errors import SettingsError
 from railfix.screens.base import ObservationScreen, Screen
 from railfix.screens.pairs import PairScreen, PositionScreen
 
-#: Group of entry points.
+#: Entry-point group.
 GROUP: Final = "railfix.screens"
 _NAMES: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing")
 
 
 def in_order(screens: Iterable[Screen[Any]]) -> tuple[Screen[Any], ...]:
-    """Return screens in the order in which they are run: of one antenna, of two, RAIM, of positions."""
+    """Return screens in their order of execution: of one antenna, of two antennas, RAIM, of positions."""
     return tuple(sorted(screens, key=_rank))
 
 
@@ -27,7 +27,7 @@ def _rank(screen: Screen[Any]) -> int:
 
 
 def _find_installed() -> list[Screen[Any]]:
-    """Load the screens of installed packages; SettingsError: one is no screen, or its name is taken."""
+    """Load the screens of installed packages; SettingsError if one is not a screen, or its name is taken."""
     found: list[Screen[Any]] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         package = entry.dist.name if entry.dist else "?"
@@ -45,7 +45,7 @@ def _find_installed() -> list[Screen[Any]]:
     return found
 
 
-#: All screens, in the order in which they are run.
+#: All screens in their order of execution.
 SCREENS: Final[tuple[Screen[Any], ...]] = in_order(
     (*(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES), *_find_installed())
 )

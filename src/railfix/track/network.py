@@ -7,7 +7,7 @@ with the stem, but not with the other leg.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, cast
@@ -33,7 +33,7 @@ CLEARANCE_M: Final = 3.0
 ANTENNA_UP_M: Final = 2.5
 ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Way over which the direction of an end is taken [m].
-_NEAR_WAY_M: Final = 5_000.0  #: Ways searched before the whole network is [m].
+_NEAR_WAY_M: Final = 5_000.0  #: Length of routes that are searched before the whole network is [m].
 _SAMPLE_M: Final = 50.0  #: Spacing of the samples of the spatial index [m].
 #: Number of nearest samples examined for each position at first; more where these do not extend far enough.
 _SAMPLES: Final = 32
@@ -300,18 +300,30 @@ class Network(NotebookTable):
             raise SettingsError(f"there is no track {name!r} in the network; {hint}")
         return self.names.index(name)
 
-    def ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
-        """Lengths and paths from a node, first near it, else in the whole network."""
+    def extend_routes(
+        self, routes: Mapping[int, tuple[float, list[int]]], stop: int
+    ) -> dict[int, tuple[float, list[int]]]:
+        """Return the shortest routes to each entry of a track, searched near it first, else in the whole network.
+
+        A route has its length and its nodes of `graph`: the one at which it begins, and those at which tracks are
+        entered. `routes` are those so far, by the node that is left.
+        """
         import networkx as nx
 
-        for cutoff in (_NEAR_WAY_M, None):
-            length, path = cast(
-                "tuple[dict[int, float], dict[int, list[int]]]",
-                nx.single_source_dijkstra(self.graph, node, cutoff=cutoff),
-            )
-            if 4 * stop in length or 4 * stop + 2 in length:
-                break
-        return length, path
+        reached: dict[int, tuple[float, list[int]]] = {}
+        entries = 4 * stop, 4 * stop + 2
+        for node, (so_far, route) in routes.items():
+            for cutoff in (_NEAR_WAY_M, None):
+                length, path = cast(
+                    "tuple[dict[int, float], dict[int, list[int]]]",
+                    nx.single_source_dijkstra(self.graph, node, cutoff=cutoff),
+                )
+                if any(entry in length for entry in entries):
+                    break
+            for entry in entries:
+                if entry in length and so_far + length[entry] < reached.get(entry, (np.inf, []))[0]:
+                    reached[entry] = so_far + length[entry], route + [n for n in path[entry] if n % 2 == 0]
+        return reached
 
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
         """Return the shortest route that passes the given tracks in order; MismatchError where none exists."""
@@ -326,22 +338,11 @@ class Network(NotebookTable):
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
         """Return the tracks of the shortest route that passes the given tracks in order; None without one."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
-        best: dict[int, tuple[float, list[int]]] = {4 * wanted[0] + e: (0.0, [wanted[0]]) for e in (1, 3)}
+        routes = {4 * wanted[0] + end: (0.0, [4 * wanted[0] + end]) for end in (1, 3)}
         for stop in wanted[1:]:
-            reached: dict[int, tuple[float, list[int]]] = {}
-            for node, (cost, route) in best.items():
-                if node not in self.graph:
-                    continue
-                length, path = self.ways_from(node, stop)
-                for end in (0, 2):
-                    entry, leave = 4 * stop + end, 4 * stop + 3 - end
-                    if entry in length and cost + length[entry] < reached.get(leave, (np.inf, []))[0]:
-                        passed = [n // 4 for n in path[entry] if n % 2 == 0]
-                        reached[leave] = (cost + float(length[entry]), route + passed)
-            if not reached:
-                return None
-            best = reached
-        return min(best.values(), key=lambda item: item[0])[1]
+            # a track that is entered at one end is left at the other
+            routes = {entry ^ 3: route for entry, route in self.extend_routes(routes, stop).items()}
+        return [node // 4 for node in min(routes.values())[1]] if routes else None
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:

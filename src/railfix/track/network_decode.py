@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, cheapest_path, read_only
-from railfix.track.network import UNMAPPED_PRIOR, Candidates, Network
+from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Network
 
 #: Negative logarithm of the likelihood of a position on a track that the map does not have and that runs beside none,
 #: compared with one at distance 0.
@@ -37,9 +37,11 @@ _LEAVE_COST: Final = 12.0
 _ENTER_COST: Final = 5.0
 _LEAVE_BESIDE_COST: Final = 10.0
 _ENTER_BESIDE_COST: Final = 7.0
-#: Distance beyond a track end at which the map ends, above which the same applies to a position [m].
+#: The same of passing an open end, at which the map ends. A position lies beyond one from so many of its standard
+#: deviations on, and from a distance within these limits [m].
 _OPEN_COST: Final = 2.0
-_BEYOND_M: Final = 10.0
+_BEYOND_SIGMAS: Final = 5.0
+_BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
 #: Length by which a connection may exceed the straight distance of two positions [m], and fraction of it: a bend.
 _SLACK_M: Final = 30.0
@@ -102,8 +104,21 @@ class Transitions:
         self._enters = to_end[1:] <= self._reach[:, None]
         ends = np.array([[(t, e) not in network.passages for e in (0, 1)] for t in range(len(network.tracks))])
         at_end = ends[self._track] & (np.stack([self._place, self._rest], axis=-1) <= _ROUNDED_M)
-        #: Whether a position lies beyond an open end, shape (n, m).
-        self._opens = at_end.any(axis=2) & (np.abs(residuals.beyond_m) > _BEYOND_M)
+        beyond = np.abs(residuals.beyond_m) / np.clip(_BEYOND_SIGMAS * residuals.sigma_m, *_BEYOND_M)[:, None]
+        opens = at_end.any(axis=2) & (beyond > 1.0)
+        same = (self._track[:-1, :, None] == self._track[1:, None, :]) & (self._track[:-1, :, None] >= 0)
+        next_opens, last_open = (same & opens[1:, None, :]).any(axis=2), (same & opens[:-1, :, None]).any(axis=1)
+        #: Whether an open end is passed in leaving a track, or in coming to one: the position after, or before, lies
+        #: beyond it, or farther still; shapes (n - 1, m).
+        self._left = next_opens | (opens[:-1] & ~same.any(axis=2))
+        self._entered = last_open | (opens[1:] & ~same.any(axis=1))
+        # errors do not change by metres in one step: a position beyond the end, next to one that is not, is no error
+        stays = np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2))
+        #: Likelihood of staying on a track where the position before, or after, is the only one beyond its open end.
+        self._stays = (
+            np.where(opens[:-1] & ~next_opens, stays[:-1], 1.0),
+            np.where(opens[1:] & ~last_open, stays[1:], 1.0),
+        )
 
     @property
     def changes(self) -> Masks:
@@ -117,21 +132,26 @@ class Transitions:
         m, free = len(before), self._clear[k + 1] * _shares_of_shifts()
         same = (before[:, None] == after) & (before[:, None] >= 0)
         share = np.full((m + len(SHIFTS_M) + 1, m + len(SHIFTS_M) + 1), np.exp(-_LEAVE_COST))
-        share[:m, -1] = np.where(self._opens[k], np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
-        share[-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
+        left, entered = self._left[k], self._entered[k]
+        share[:m, -1] = np.where(left, np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
+        share[-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
         # a train that has passed an open end, or comes to one, is on a track that the map lacks; as it begins on one
         # with `UNMAPPED_PRIOR`, leaving has that factor, too, and a run and its return are equally probable
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
-        share[:m, m:-1][self._opens[k]] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
-        share[m:-1, :m] = np.where(self._opens[k + 1], np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
+        share[:m, m:-1][left] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
+        share[m:-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
+        # of one track that the map lacks: a part that runs beside a track, and a part that runs beside none
+        share[-1, m:-1], share[m:-1, -1] = UNMAPPED_PRIOR * free, UNMAPPED_PRIOR * np.exp(-_ENTER_COST)
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
             way = self._way(k, i, j)
             if way <= self._reach[k]:
                 share[i, j] = 1.0 / (1.0 + ((way - self._step[k]) / _PASSING_M) ** 2)
-        return np.asarray(share / share.sum(axis=1, keepdims=True))
+        share /= share.sum(axis=1, keepdims=True)
+        share[:m, :m] *= np.where(same, self._stays[0][k][:, None] * self._stays[1][k], 1.0)
+        return share
 
     def _way(self, k: int, i: int, j: int) -> float:
         """Path length between two positions over ends of tracks [m], infinite beyond the limit."""

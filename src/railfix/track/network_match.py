@@ -338,11 +338,11 @@ def _residuals(
 def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) -> dict[str, Any]:
     """Return where tracks that the map lacks can run: `clear`, `moved_m` and `turned` of `Residuals`."""
     cosine = np.einsum("nmi,ni->nm", across, across[:, 0])
-    present = np.isfinite(offset_m)
-    offset = np.where(present, offset_m, 0.0)
+    offset = np.where(np.isfinite(offset_m), offset_m, 0.0)
     right_m = offset[:, :1] - offset * cosine  # of the nearest track
-    apart = np.where(present, np.abs(SHIFTS_M[:, None, None] - right_m), np.inf).min(axis=2)
-    clear = (apart.T > CLEARANCE_M - _ROUNDED_M) & present[:, :1] & (np.abs(beyond_m[:, :1]) <= CLEARANCE_M)
+    there = np.isfinite(offset_m) & (np.abs(beyond_m) <= CLEARANCE_M)  # not beyond its end
+    apart = np.where(there, np.abs(SHIFTS_M[:, None, None] - right_m), np.inf).min(axis=2)
+    clear = (apart.T > CLEARANCE_M - _ROUNDED_M) & there[:, :1]
     before = np.concatenate([track[:1, :1], track[:-1, :1]])  # the nearest track of the previous position
     same = (track == before) & (before >= 0)
     rows, column = np.arange(len(track)), same.argmax(axis=1)

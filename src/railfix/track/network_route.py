@@ -126,19 +126,18 @@ def _fill_legs(
     if first == last:
         return np.array([first]), np.array([from_m]), np.array([to_m])
     length = network.length_m
-    best, nodes = np.inf, list[int]()
-    for end, before in ((0, from_m), (1, length[first] - from_m)):
-        ways, paths = network.ways_from(4 * first + 2 * end + 1, last)
-        for entry, after in ((0, to_m), (1, length[last] - to_m)):
-            node = 4 * last + 2 * entry
-            if node in ways and before + ways[node] + after < best:
-                best, nodes = before + ways[node] + after, paths[node]
-    if not nodes:
+    begun = {4 * first + 1: (from_m, [4 * first + 1]), 4 * first + 3: (length[first] - from_m, [4 * first + 3])}
+    ended = [
+        (so_far + (to_m if entry == 4 * last else length[last] - to_m), nodes)
+        for entry, (so_far, nodes) in network.extend_routes(begun, last).items()
+    ]
+    if not ended:
         return None
-    # nodes alternate: left, entered, left, ..., entered
-    place = [0.0 if node % 4 < 2 else float(length[node // 4]) for node in nodes]
-    numbers = [first, *(node // 4 for node in nodes[1::2])]
-    return np.array(numbers), np.array([from_m, *place[1::2]]), np.array([*place[0::2], to_m])
+    begin, *entered = min(ended)[1]
+    left = [begin, *(node ^ 3 for node in entered[:-1])]
+    enter, leave = ([0.0 if node % 4 < 2 else float(length[node // 4]) for node in nodes] for nodes in (entered, left))
+    numbers = [first, *(node // 4 for node in entered)]
+    return np.array(numbers), np.array([from_m, *enter]), np.array([*leave, to_m])
 
 
 def find_route(network: Network, matched: Matched, path: str = "the log") -> tuple[list[int], list[int]]:

@@ -1,7 +1,7 @@
-"""One filter along the track: codes, Dopplers, carrier phases and sensors, hypotheses over branches.
+"""Filter along the track over codes, Dopplers, carrier phases and sensors, with hypotheses over branches.
 
-Plain functions over arrays: `track` takes epochs and the state left by earlier ones and returns places along the
-trajectory and the new state.
+The interface is plain functions on arrays: `track` takes epochs and the state after the previous epochs, and returns
+positions along the trajectory and the new state.
 """
 
 import lazy_loader

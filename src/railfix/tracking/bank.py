@@ -1,4 +1,4 @@
-"""Sources of faults that the level of the filtered position has a sub-filter for, and its budget of risk.
+"""Fault sources with a sub-filter in the protection level of the filtered position, and the risk budget.
 
 `railfix.kernels.tracking.subfilters` has the sub-filters, `railfix.kernels.tracking.level` the level.
 """
@@ -18,14 +18,14 @@ from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits
 
-#: Sensors by the kind of their rows.
+#: Sensor names by the kind of their rows.
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
-#: How long a fault common to a constellation lasts until users are alerted [s] (ARAIM milestone 3 report: an hour).
+#: Time from a constellation fault to the alert of users [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: Sources whose probabilities add up to less than this share of the risk need no sub-filter, if there are so many.
+#: Sources whose probabilities sum to less than this fraction of the risk need no sub-filter.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
-#: Risk of the bound on the speed over that of the level.
+#: Risk of the speed bound as a fraction of the risk of the position level.
 SPEED_SHARE: Final = 0.01
 
 
@@ -42,8 +42,8 @@ class SourceKind(IntEnum):
     ALL_IN_VIEW = 7
 
 
-#: Further sources: all Dopplers, all phases, the codes of satellites ahead or behind, the map; and none, for all
-#: satellites in view.
+#: Further sources: all Dopplers, all phases, the codes of satellites ahead, of satellites behind, the map; and no
+#: source, for all satellites in view.
 OTHERS: Final = {
     "doppler": SourceKind.MOTION,
     "phase": SourceKind.MOTION,
@@ -52,7 +52,7 @@ OTHERS: Final = {
     "map": SourceKind.MAP,
     "all in view": SourceKind.ALL_IN_VIEW,
 }
-#: Kind of each source that is no satellite.
+#: Kind of each source other than a satellite.
 KINDS: Final = {
     **dict.fromkeys(ix.CLOCKS, SourceKind.CONSTELLATION),
     **dict.fromkeys(SENSORS.values(), SourceKind.SENSOR),
@@ -63,25 +63,27 @@ KINDS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Risk of an independent error and probabilities of faults, with the factors that follow from them."""
+    """Risk of an independent error and fault probabilities, with the factors computed from these."""
 
     risk: float
-    k: float  #: Sigmas that noise without a fault exceeds with the risk, on either side.
-    #: Probability that a source of each `SourceKind` is faulty or still remembered; 0 needs no sub-filter.
+    k: float  #: Two-sided normal quantile of the risk: the sigmas that fault-free noise exceeds with this probability.
+    #: Probability that a source of each `SourceKind` is faulty or an earlier fault is still in the filter; 0 needs no
+    #: sub-filter.
     prior: tuple[float, ...]
-    #: Sigmas that noise exceeds on one side with the risk over that probability: the least that a sub-filter requires.
+    #: One-sided normal quantile of the risk over that probability: the minimum factor of a sub-filter's sigma.
     k_fault: tuple[float, ...]
-    #: The same two for the speed's bound, which has `SPEED_SHARE` of the risk on top, in equal parts for all sources.
+    #: Two-sided and one-sided quantile for the speed bound, which has the additional fraction `SPEED_SHARE` of the
+    #: risk, in equal parts for all sources.
     k_speed: float
     k_speed_fault: tuple[float, ...]
 
 
 @lru_cache(maxsize=8)
 def budget(limits: TrackingLimits) -> Budget:
-    """Return the risk of an independent error, and the probabilities of faults of the sources.
+    """Return the risk of an independent error and the fault probabilities of the sources.
 
-    The filter remembers a source for as long as its errors stay in the state, `FORGOTTEN` correlation times after a
-    fault that lasts for one independent error, or `CONSTELLATION_FAULT_S` for one of a constellation.
+    A source affects the filter as long as its errors stay in the state: for `FORGOTTEN` correlation times after the
+    fault. A fault lasts for one independent error, a constellation fault for `CONSTELLATION_FAULT_S`.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S

@@ -1,4 +1,4 @@
-"""Epochs prepared for the recursion: what needs no place is computed for all epochs of a chunk at once."""
+"""Prepare epochs for the recursion: position-independent quantities are computed for all epochs of a chunk at once."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from railfix.tracking.state import TrackState
 
 #: Shortest interval between epochs [s].
 _SHORTEST_S: Final = 1e-3
-#: Two epochs further apart than this have nothing to do with each other [s].
+#: Epochs further apart than this are treated as independent [s].
 _APART_S: Final = 3600.0
-#: Phases or Dopplers of an epoch that give speed and clock drift with redundancy.
+#: Minimum number of phases or Dopplers that determine speed and clock drift with redundancy.
 _MOTION: Final = 4
-#: Place of each clock in `ix.CLOCKS`.
+#: Index of each clock in `ix.CLOCKS`.
 _OFFSETS: Final = {letter: k for k, letter in enumerate(ix.CLOCKS)}
 #: Satellites unseen for this many correlation times of codes are dropped from the state.
 FORGOTTEN: Final = 3.0
@@ -33,19 +33,19 @@ FORGOTTEN: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """T epochs of K channels and S errors of satellites, as the recursion takes them."""
+    """Inputs of the recursion: T epochs of K channels and S satellite errors."""
 
     time: Datetimes  #: Shape (T,).
     satellite: Strings  #: Of each channel; shape (K,).
     epoch: Records  #: `railfix.kernels.tracking.layout.EPOCH`; shape (T,).
     channel: Records  #: `railfix.kernels.tracking.layout.CHANNEL`; shape (T, K).
-    off_map: Masks  #: The train is away from the line; shape (T,).
+    off_map: Masks  #: True where the train is away from the line; shape (T,).
     fresh: Masks  #: Satellites whose error begins at an epoch; shape (T, S).
-    within_memory: Masks  #: Satellites whose error lasts from before an epoch; shape (T, S).
+    within_memory: Masks  #: Satellites whose error continues from before an epoch; shape (T, S).
 
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
-    """Return the chunk, and give the state an error for each satellite measured in it."""
+    """Return the chunk, and add an error unknown to the state for each satellite measured in it."""
     state.origin = epochs.time[0] if np.isnat(state.origin) else state.origin
     phase, before = _previous(epochs.channel, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
@@ -62,7 +62,8 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     if np.isnat(state.time):
         gap[:1] = 0.0
     apart = gap > _APART_S
-    # Two epochs at one instant are a millisecond apart: Dopplers and forces count by the interval.
+    # Two epochs at one instant are treated as a millisecond apart, because Dopplers and forces are weighted by the
+    # interval.
     interval = np.maximum(gap, _SHORTEST_S)
     interval[apart] = 1.0
     if np.isnat(state.time):
@@ -103,7 +104,9 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
 
 
 def _compute_variance(cn0_dbhz: Floats, code_sigma_m: Floats, limits: TrackingLimits) -> Floats:
-    """Return the variances of the white errors of codes, phases and Dopplers, the last two by C/N0; shape (3, T, K)."""
+    """Return the white-error variances of codes, phases and Dopplers, the last two as functions of C/N0; shape (3, T,
+    K).
+    """
     cn0 = np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
     return np.array(
@@ -117,13 +120,13 @@ def _compute_variance(cn0_dbhz: Floats, code_sigma_m: Floats, limits: TrackingLi
 
 @lru_cache(maxsize=64)
 def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
-    """Compute `railfix.motion.singer.singer_steps` of one interval, shapes (3, 3)."""
+    """Compute `railfix.motion.singer.singer_steps` for one interval, shapes (3, 3)."""
     step, noise = singer_steps(np.array([dt]), sigma_mps2, tau_s)
     return step[0], noise[0]
 
 
 def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> None:
-    """Write the velocities without the line; numba is imported here, for what runs no filter does without."""
+    """Write the velocities without the line; numba is imported here, so that runs without a filter do not load it."""
     from railfix.kernels.tracking.velocity import write_velocities
 
     latitude, longitude, _ = geodetic_from_ecef(np.where(np.isfinite(near_ecef_m), near_ecef_m, 1e6))
@@ -132,7 +135,7 @@ def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> 
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
-    """Make the state ready to be handed on: without satellites long unseen, with the phases of the last epoch."""
+    """Prepare the state for the next chunk: drop satellites unseen for long, store the phases of the last epoch."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
     state.previous = Previous(channel=epochs.channel, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
     kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * constants.CODE_CORRELATION_S
@@ -141,7 +144,7 @@ def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
 
 
 def _previous(channels: Strings, previous: Previous | None) -> tuple[Floats, Floats]:
-    """Return the phase and satellites of the epoch before the first, in the order of the channels."""
+    """Return phases and satellite positions of the epoch before the first, in the order of the channels."""
     if previous is not None and np.array_equal(channels, previous.channel):
         return previous.phase_m, previous.sat_ecef_m
     size = len(channels)
@@ -153,7 +156,7 @@ def _previous(channels: Strings, previous: Previous | None) -> tuple[Floats, Flo
 
 
 def _with_satellites(state: TrackState, satellite: Strings, measured: Masks) -> Indices:
-    """Give the state a place for the error of each satellite measured; return the place of each channel's."""
+    """Add an error unknown to the state for each satellite measured; return the index of each channel's error."""
     place = {name: k for k, name in enumerate(state.satellite.tolist())}
     names = satellite.tolist()
     new = [name for name in dict.fromkeys(satellite[measured].tolist()) if name not in place]

@@ -1,4 +1,4 @@
-"""The filter along the track: epochs in, places along the trajectory and the state for the next epochs out.
+"""Filter along the track: from epochs to positions along the trajectory and the state for the next epochs.
 
 `railfix.kernels.tracking.layout` has the arrays, `railfix.kernels.tracking.recursion` the recursion over them.
 """
@@ -25,21 +25,21 @@ from railfix.tracking.state import TrackState
 
 @dataclass(kw_only=True)
 class Step:
-    """One epoch of the filter with H hypotheses, as it was left."""
+    """Result of one filter epoch with H hypotheses."""
 
-    dt: float  #: Since the epoch before [s].
+    dt: float  #: Interval since the previous epoch [s].
     satellite: Strings  #: Shape (N - ix.SATELLITES,).
-    trace: Trace | None = None  #: Measurements and restarts; None without a hypothesis.
-    #: After the epoch; shapes (H, N), (H, N, N).
+    trace: Trace | None = None  #: Measurements and restarts of the epoch; None without a hypothesis.
+    #: Means and covariances after the epoch; shapes (H, N), (H, N, N).
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
-    #: Hypothesis of the epoch before; -1 where one began; shape (H,).
+    #: Index of each hypothesis at the previous epoch; -1 for a new one; shape (H,).
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     splits: list[SplitHypothesis | None] | None = None
 
 
 class Recursion:
-    """A chunk as the kernel takes it; `start_state`: before it, with the errors of its satellites."""
+    """Kernel inputs of a chunk; `start_state` is the state before it, with the errors of its satellites."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class Recursion:
         *,
         levels: bool,
     ) -> None:
-        from railfix.kernels.tracking.recursion import advance  # numba: what runs no filter does without
+        from railfix.kernels.tracking.recursion import advance  # imports numba, which runs without a filter do not need
 
         self.kernel = advance
         self.chunk, self.line, self.limits, self.levels = chunk, line, limits, levels
@@ -66,7 +66,9 @@ class Recursion:
         )  # fmt: skip
 
     def seek(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> Sought | None:
-        """Seek places for an epoch that hypotheses are predicted to; None where there is none, which ends the epoch."""
+        """Search positions for an epoch to which hypotheses are predicted; None if there is none, which ends the
+        epoch.
+        """
         if not state.hypotheses:
             state.code_bias = np.where(self.chunk.fresh[epoch], 0.0, state.code_bias)
         found = seek(state, self.chunk, epoch, self.line, self.limits, reasons)
@@ -79,9 +81,11 @@ class Recursion:
         return None
 
     def run(self, state: TrackState, first: int, found: Sought | None, trace: list[Step] | None) -> tuple[int, int]:
-        """Do epochs from `first` on and change the state; return the next, and why places have to be sought there or 0.
+        """Process epochs from `first` on and update the state; return the next epoch, and the reasons for a position
+        search there or 0.
 
-        That epoch alone where places have been `found` in it, and where the smoother needs something of each.
+        Only that epoch is processed if positions have been `found` for it, or if the smoother requires a record per
+        epoch.
         """
         count, width = state.mean.shape
         last = len(self.chunk.time) if trace is None and found is None else first + 1
@@ -105,12 +109,12 @@ class Recursion:
         return done, reasons
 
     def make_step(self, state: TrackState, epoch: int) -> Step:
-        """Return an epoch without a hypothesis for the smoother."""
+        """Return the smoother's record of an epoch, without hypotheses."""
         return Step(dt=float(self.chunk.epoch["interval_s"][epoch]), satellite=state.satellite)
 
 
 def _new_trace(hypotheses: int, rows: int, unknowns: int) -> layout.Trace:
-    """Return an empty record of an epoch for the smoother."""
+    """Return an empty smoother record of an epoch."""
     return layout.Trace(
         prior=np.zeros((hypotheses, unknowns, unknowns)), row=np.zeros((hypotheses, rows, unknowns)),
         value=np.zeros((hypotheses, rows)), variance=np.full((hypotheses, rows), np.inf),
@@ -128,7 +132,7 @@ def track(
     levels: bool = False,
     trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
-    """Return places along the trajectory, each from its own and earlier epochs (model: R. A. Singer, 1970).
+    """Estimate positions along the trajectory, each from its own and earlier epochs (model: R. A. Singer, 1970).
 
     The equations are in docs/filter-equations.md, the compiled recursion in `railfix.kernels.tracking.recursion`. With
     ``NUMBA_DISABLE_JIT=1`` in the environment the same code runs as plain Python, for a debugger.
@@ -136,22 +140,23 @@ def track(
     Parameters
     ----------
     epochs : GnssEpochs
-        T epochs in rising time; those without any measurement are predicted.
+        T epochs in rising time; epochs without any measurement are predicted.
     line : Line
     state : TrackState, optional
-        Left by the epochs before; None at the start.
+        State after the previous epochs; None at the start.
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
     levels : bool
-        Whether a bank of sub-filters gives a level at every epoch (`railfix.tracking.levels`: at a lower rate).
+        Whether a bank of sub-filters computes a protection level at every epoch (`railfix.tracking.levels`: at a lower
+        rate).
     trace : list of Step, optional
-        Gets what the smoother needs of each epoch (`railfix.tracking.smoother`).
+        Receives the record of each epoch that the smoother requires (`railfix.tracking.smoother`).
 
     Returns
     -------
     Tracked
     TrackState
-        Epochs one by one with the state handed on give the same numbers as all at once.
+        Processing epochs one by one with the returned state gives the same numbers as all at once.
     """
     limits, sensors = limits or TrackingLimits(), sensors or SensorEpochs()
     state = TrackState() if state is None else copy_with(state)

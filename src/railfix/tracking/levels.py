@@ -1,12 +1,14 @@
-"""Level of the filtered position at every epoch, from a filter with sub-filters over epochs a second apart.
+"""Protection level of the filtered position at every epoch, from a filter with sub-filters over epochs one second
+apart.
 
-The bank of `railfix.tracking.bank` costs as many filters as there are satellites, and codes of neighbouring epochs tell
-the same. So a second filter with its bank takes one epoch a second. With its place s, its speed v, their levels L and
-V, tau after its last epoch, and the acceleration below a, an error of the place p of the filter itself is at most::
+The bank of `railfix.tracking.bank` costs as many filters as there are satellites, and codes of neighbouring epochs have
+nearly the same errors. A second filter with the bank therefore processes one epoch per second. Let s and v be its
+position and speed, L and V their levels, tau the time since its last epoch, and a the largest acceleration. The error
+of the position p of the main filter is at most::
 
     |p - s - v tau| + L + V tau + a tau^2 / 2
 
-with the risk of L and that of V, which is a hundredth of it.
+with the sum of the risks of L and V; the risk of V is a hundredth of the risk of L.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, TrackStatus, is_bounded
 from railfix.tracking.state import TrackState
 
-#: Sensors whose values between two epochs are added, and the one of which the mean is taken.
+#: Sensors whose values between two epochs are summed, and the sensor whose values are averaged.
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
 _MEAN: Final = np.array([False, False, True])
-#: The standard deviation explains a sub-filter up to so many of it away: where a place has no level, where it has one.
-#: One without the faulty satellite lies further away.
+#: Separation in standard deviations up to which a sub-filter is consistent with noise: for a position without a level,
+#: and with one. A sub-filter without the faulty satellite is further away.
 _EXPLAINED: Final = (3.0, 4.0)
-#: Larger levels are none [m]: they are those of a sub-filter that is left without measurements.
+#: Larger levels count as missing [m]: they come from a sub-filter without measurements.
 LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
@@ -43,28 +45,30 @@ _KEPT: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class AccumulatedIncrement:
-    """Measurements accumulated since the last epoch that was taken."""
+    """Measurements accumulated since the last epoch selected."""
 
-    #: First epoch of the log: epochs are taken where a period from there is rounded to another number.
+    #: First epoch of the log; an epoch is selected where the number of periods since then, rounded, changes.
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    number: int = -1  #: Number of periods from `start` to the last epoch taken; -1 before the first.
-    epochs: int = 0  #: Epochs since then.
-    #: Channels whose carrier phase went on at all of them; None where there was no epoch.
+    number: int = -1  #: Number of periods from `start` to the last epoch selected; -1 before the first.
+    epochs: int = 0  #: Number of epochs since then.
+    #: Channels whose carrier phase continued at all these epochs; None without such an epoch.
     unbroken: frozenset[str] | None = None
     #: Sums over these epochs of distances by wheel and radar [m] and force [m/s2], and of variances; shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
     variance: Floats = field(default_factory=lambda: np.zeros(3))
-    balises: BaliseEpochs | None = None  #: Balises read since then, as one epoch.
+    balises: BaliseEpochs | None = None  #: Balises read since then, as a single epoch.
 
 
 def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Return which epochs are taken, these with what was measured since the one before, and what is left after them.
+    """Return the mask of selected epochs, the selected epochs with accumulated measurements, and the remainder after
+    them.
 
-    None for these where none is. A carrier phase goes on where it did so at all epochs between. Distances between
-    epochs are added, the force is their mean; balises at the next epoch taken; places by features and ranges to ground
-    units at the epochs that are taken. `since` is what the epochs before left.
+    The selected epochs are None if there is none. A carrier phase continues if it did so at all epochs between.
+    Distances between epochs are summed and forces averaged; balises belong to the next selected epoch; positions from
+    features and ranges to ground units are used at selected epochs only. `since` is the remainder of the previous
+    chunk.
     """
     if not len(epochs):
         return np.empty(0, dtype=np.intp), None, SensorEpochs(), since
@@ -73,7 +77,7 @@ def decimate_epochs(
     before = np.maximum.accumulate(np.concatenate([[since.number], number]))
     taken = (before[1:] > before[:-1]).nonzero()[0]
     value, variance = _columns(sensors, len(epochs))
-    # Row 0 is what the epochs before left, row t + 1 epoch t; a row that is taken ends an interval.
+    # Row 0 is the remainder of the previous chunk, row t + 1 epoch t; a selected row ends an interval.
     goes_on = np.ones((len(epochs) + 1, len(epochs.channel)), dtype=np.bool_)
     if since.unbroken is not None:
         goes_on[0] = [name in since.unbroken for name in epochs.channel.tolist()]
@@ -110,7 +114,7 @@ def decimate_epochs(
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
-    """Return the values and variances of the sensors that are summed, shape (T, 3); NaN without one."""
+    """Return the values and variances of the summed sensors, shape (T, 3); NaN without a sensor."""
     value, variance = np.full((epochs, 3), np.nan), np.full((epochs, 3), np.nan)
     for column, (name, sigma) in enumerate(_SUMMED):
         if getattr(sensors, name) is not None:
@@ -121,7 +125,7 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
 def _balises(
     sensors: SensorEpochs, since: AccumulatedIncrement, interval: Indices, taken: int
 ) -> tuple[BaliseEpochs | None, BaliseEpochs | None]:
-    """Return the balises at the epochs that are taken, and those read after them, with what was left before."""
+    """Return the balises at the selected epochs, and the balises read after them, including the earlier remainder."""
     if sensors.balises is None and since.balises is None:
         return None, None
     rows = join_epochs([since.balises or BaliseEpochs.none(1), sensors.balises or BaliseEpochs.none(len(interval))])
@@ -134,10 +138,10 @@ class LevelState:
     """State of the filter with sub-filters after a chunk."""
 
     track: TrackState | None = None
-    every: bool = True  #: It has used every epoch so far, so that it equals the filter itself.
+    every: bool = True  #: True while it has used every epoch, so that it equals the main filter.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Its last epoch.
-    #: Its place, speed, levels with parts, amount and status at that epoch; shape (10,).
+    #: Its position, speed, levels with parts, confidence amount and status at that epoch; shape (10,).
     values: Floats = field(default_factory=lambda: np.full(len(_KEPT), np.nan))
 
 
@@ -149,9 +153,9 @@ def track_with_levels(
     limits: TrackingLimits,
     sensors: SensorEpochs,
 ) -> tuple[Tracked, TrackState, LevelState]:
-    """Return the places of the filter with their levels, its state, and that of the filter with sub-filters.
+    """Return the filter's positions with their levels, its state, and the state of the filter with sub-filters.
 
-    Where the filter with sub-filters takes every epoch its places are those of the filter, which then does not run.
+    If the filter with sub-filters processes every epoch, its positions are returned and the main filter does not run.
     """
     taken, some, sensed, since = decimate_epochs(epochs, sensors, state.since, limits.level_period_s)
     place, after = None, state.track
@@ -175,10 +179,10 @@ def carried_levels(
     state: LevelState,
     limits: TrackingLimits,
 ) -> tuple[Tracked, LevelState]:
-    """Return places with the levels of the epochs that the filter with sub-filters took, carried to all epochs.
+    """Return positions with the levels of the sub-filtered epochs propagated to all epochs.
 
-    `tracked` has the places of the filter, `taken` the epochs that the one with sub-filters took, `place` its places
-    there, None without any, and `state` its last epoch before these.
+    `tracked` has the main filter's positions, `taken` the mask of the epochs of the filter with sub-filters, `place`
+    its positions at these epochs (None without any), and `state` its last epoch before the chunk.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
@@ -189,7 +193,7 @@ def carried_levels(
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
     tau = seconds(tracked.time - times[number])  # NaN before the first
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
-    # What the place may have gone wrong by since then: V tau + a tau^2 / 2.
+    # Growth of the position error since then: V tau + a tau^2 / 2.
     growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
     known = np.isfinite(tracked.arc_m)
 
@@ -204,8 +208,8 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # In doubt the sub-filter furthest off may be the one that is right; else one that the standard deviation does not
-    # explain.
+    # In doubt the most distant sub-filter may be the correct one; otherwise a sub-filter that is not consistent with
+    # noise.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)
@@ -221,12 +225,12 @@ def carried_levels(
 
 
 def _useful(level_m: Floats) -> Floats:
-    """Return levels, those beyond `LARGEST_LEVEL_M` infinite: a sub-filter without data diverges."""
+    """Return levels, infinite beyond `LARGEST_LEVEL_M`, because a sub-filter without data diverges."""
     return np.where(level_m > LARGEST_LEVEL_M, np.inf, level_m)
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
-    """Return the statuses of places: one without a level is neither tracking nor coasting."""
+    """Return the statuses of positions; a position without a level is neither tracking nor coasting."""
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)

@@ -1,4 +1,4 @@
-"""The trajectory as the filter sees it: points, smooth tangents and axes at arc lengths, beyond its ends too."""
+"""Trajectory of the filter: points, smooth tangents and axes at arc lengths, including beyond its ends."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.ranges.atmosphere import geomagnetic_latitude
 from railfix.track.trajectory import Trajectory
 
-#: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude: 2/9 of that of
-#: the vertical delay that DO-229D J.2.3 assumes without SBAS, 9 m up to 20 deg, 4.5 m up to 55 deg, 6 m beyond [m].
-#: At middle latitudes it is that of `slow_code_m`.
+#: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude: 2/9 of the
+#: vertical-delay sigma that DO-229D J.2.3 assumes without SBAS, 9 m up to 20 deg, 4.5 m up to 55 deg, 6 m beyond [m].
+#: At middle latitudes it equals `slow_code_m`.
 TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 
 class Line:
-    """A trajectory with smooth axes at its points; places beyond its ends are on it too."""
+    """Trajectory with smooth axes at its points; it continues beyond its ends."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
         self.arc_m: Floats = trajectory.arc_m  #: Shape (V,).
         self.ecef_m: Floats = trajectory.ecef_m  #: Shape (V, 3).
-        self.segment: Floats = trajectory.tangent  #: Unit vector of each segment; shape (V - 1, 3).
+        self.segment: Floats = trajectory.tangent  #: Unit vectors of the segments; shape (V - 1, 3).
         self.joins_m = trajectory.joins_m
-        #: Standard deviations of the map [m].
+        #: Standard deviations of the map, across and up [m].
         self.sigma_plan_m, self.sigma_height_m = trajectory.sigma_plan_m, trajectory.sigma_height_m
 
     @cached_property
     def axes(self) -> Floats:
-        """Axes at the points, rows: tangent (mean of the two segments), to the right, up; shape (V, 3, 3)."""
+        """Axes at the points, in rows: tangent (mean of the two segments), right, up; shape (V, 3, 3)."""
         segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -50,8 +50,8 @@ class Line:
     def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
         """Return points [m] and axes at arc lengths [m], shapes (H, 3), (H, 3, 3) and (H,).
 
-        Beyond the ends of a closed line they are where it goes on, of others straight on. Rows of the axes are tangent,
-        right and up, interpolated between vertices.
+        A closed line is continued round its loop, an open line straight beyond its ends. The rows of the axes are
+        tangent, right and up, interpolated between vertices.
         """
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         index = self.arc_m[1:-1].searchsorted(arc_m, side="right")
@@ -63,11 +63,13 @@ class Line:
 
     @cached_property
     def closed(self) -> bool:
-        """Whether the line goes on at one of its ends."""
+        """Whether the line continues at one of its ends."""
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift of places beyond an end of a closed line to where it goes on [m]; 0 for others."""
+        """Return the shift of positions beyond an end of a closed line to their equivalent on the line [m]; 0 for
+        others.
+        """
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
         for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):
@@ -76,7 +78,7 @@ class Line:
         return back
 
     def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
-        """Return arc lengths of places nearest to others, beyond the end of a closed line if need be [m]."""
+        """Return the arc lengths, modulo laps of a closed line, nearest to other arc lengths [m]."""
         if not self.closed:
             return arc_m
         back = self.round_m(to_m)
@@ -93,7 +95,7 @@ class Line:
 
     @cached_property
     def records(self) -> tuple[Records, Records]:
-        """Vertices, and the line as a whole, as the recursion takes them; shapes (V,), (1,)."""
+        """Vertex and line records of the recursion; shapes (V,), (1,)."""
         vertex, line = np.zeros(len(self.arc_m), dtype=VERTEX), np.zeros(1, dtype=LINE)
         for name in ("arc_m", "ecef_m", "axes"):
             vertex[name] = getattr(self, name)
@@ -109,7 +111,7 @@ class Line:
         return vertex, line
 
     def gradient_at(self, arc_m: Floats) -> Floats:
-        """Return the climb over horizontal length, linear between the middles of segments, shape (H,)."""
+        """Return the gradient, climb over horizontal length, linear between the middles of segments, shape (H,)."""
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         return np.interp(arc_m, self._middle_m, self.gradient)
 

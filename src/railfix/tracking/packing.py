@@ -1,4 +1,4 @@
-"""State, settings and sensors of the filter as the recursion takes them, and the state back."""
+"""Conversion of state, settings and sensors to the recursion's arrays, and of the state back."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import HYPOTHESIS, MONITORS, Bank, Monitors, TrackState
 
-#: Least `MAP_BRANCH_M` in standard deviations of the map across.
+#: Minimum `MAP_BRANCH_M` in standard deviations of the map across.
 _BRANCH_SIGMAS = 3.0
 
 
 @lru_cache(maxsize=8)
 def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
-    """Return the numbers among the settings, and the budget of the level; shape (1,)."""
+    """Return the numeric settings and the risk budget of the level; shape (1,)."""
     budget = bank.budget(limits)
     values = {name: value for name, value in dict(limits).items() if isinstance(value, (int, float))}
     values["map_branch_m"] = max(constants.MAP_BRANCH_M, _BRANCH_SIGMAS * sigma_plan_m)
@@ -36,7 +36,7 @@ def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
 
 
 def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
-    """Return wheel, radar, force, place, balises and ranges by column, `layout.SENSOR`; shape (T, C)."""
+    """Return wheel, radar, force, position, balises and ranges by column, `layout.SENSOR`; shape (T, C)."""
     ranges = sensors.ranges
     columns = ix.RANGE_COLUMN + (0 if ranges is None else ranges.range_m.shape[1])
     packed = np.zeros((len(time), columns), dtype=layout.SENSOR)
@@ -62,12 +62,12 @@ def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
 
 
 def list_sources(state: TrackState) -> list[str]:
-    """Return the sources of sub-filters in the order of the recursion."""
+    """Return the sub-filter sources in the order of the recursion."""
     return [*state.satellite.tolist(), *ix.CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
 
 
 def pack_state(state: TrackState, limits: TrackingLimits, *, levels: bool) -> layout.State:
-    """Return a copy of the state."""
+    """Return a copy of the state as the recursion's arrays."""
     names = list_sources(state) if levels else []
     count, width = state.mean.shape
     x, P = np.zeros((count + len(names), width)), np.zeros((count + len(names), width, width))

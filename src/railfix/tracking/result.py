@@ -1,4 +1,4 @@
-"""What the filter returns: places, speeds and what measured them, epoch by epoch."""
+"""Results of the filter per epoch: positions, speeds and the measurements behind them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from railfix.kernels.tracking.index import TrackStatus as TrackStatus
 from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind
 
-#: Statuses whose level bounds the error: beside the map, on one of several branches or on a track in doubt, no
-#: sub-filter does.
+#: Statuses whose level bounds the error. Beside the map, on one of several branches or on a doubtful track, no
+#: sub-filter bounds it.
 BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
 _IS_BOUNDED: Final = np.array([status in BOUNDED for status in TrackStatus])
 
@@ -26,19 +26,19 @@ def is_bounded(status: Codes) -> Masks:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Tracked(NotebookTable):
-    """Places of T epochs; NaN where there is none."""
+    """Positions of T epochs; NaN where unknown."""
 
     time: Datetimes  #: Shape (T,).
     status: Codes  #: `TrackStatus`; shape (T,).
-    #: Of the most probable hypothesis; the standard deviation has the straight distance to the others in it, and in
-    #: doubt the separation; shape (T,).
+    #: Arc length and standard deviation of the most probable hypothesis; the standard deviation includes the straight
+    #: distance to the other hypotheses, and in doubt the separation; shape (T,).
     arc_m: Floats
     sigma_m: Floats
     #: Shape (T,).
     speed_mps: Floats
     speed_sigma_mps: Floats
     acceleration_mps2: Floats
-    probability: Floats  #: Of the hypothesis given; shape (T,).
+    probability: Floats  #: Probability of the reported hypothesis; shape (T,).
     hypotheses: Integers  #: Number of hypotheses; shape (T,).
     #: Mean weights of codes, and of Dopplers and phases; shape (T,).
     code_weight: Floats
@@ -47,26 +47,26 @@ class Tracked(NotebookTable):
     wheel_scale: Floats
     force_offset_mps2: Floats
     radar_scale: Floats
-    map_scale: Floats  #: Factor on the error of the map's lengths, 1 where codes do not contradict them; shape (T,).
-    #: Of the error along the line; of the straight distance, all branches and a map aside included; and without faults
-    #: and branches. NaN where levels are off; shape (T,).
+    map_scale: Floats  #: Factor on the length error of the map, 1 where codes do not contradict it; shape (T,).
+    #: Levels of the error along the line; of the straight distance, including all branches and a laterally displaced
+    #: map; and without faults and branches. NaN where levels are off; shape (T,).
     level_m: Floats
     ground_level_m: Floats
     level_noise_m: Floats
-    #: Bound of the error of the speed, which carries the level on to the next epochs; shape (T,).
+    #: Bound of the speed error, which propagates the level to the next epochs; shape (T,).
     level_speed_mps: Floats
     #: Largest separation of a sub-filter. NaN where levels are off; shape (T,).
     separation_m: Floats
-    #: Probability of faults that the level does not bound: one common to the only constellation; shape (T,).
+    #: Probability of faults that the level does not bound: a fault common to the only constellation; shape (T,).
     unchecked_prior: Floats
-    #: Over- and under-reading amount: the level, and never less than the bound of the scale times the distance since
-    #: codes were used (SUBSET-026 3.6.8); shape (T,).
+    #: Over- and under-reading amount: the level, but at least the scale bound times the distance since codes were used
+    #: (SUBSET-026 3.6.8); shape (T,).
     amount_m: Floats
     used: Integers  #: Measurements of each kind with a weight of more than a half; shape (T, len(Kind)).
-    innovation: Floats  #: Before the update, of codes, phases and Dopplers; shape (T, 3, K).
-    #: The same of the sensors, in the order of `Kind`; of several ranges the last; shape (T, len(Kind) - 3).
+    innovation: Floats  #: Innovations of codes, phases and Dopplers; shape (T, 3, K).
+    #: Innovations of the sensors, in the order of `Kind`; of several ranges the last; shape (T, len(Kind) - 3).
     sensed: Floats
-    weight: Floats  #: 0 for codes that are left out; shape (T, 3, K).
+    weight: Floats  #: Weights, 0 for codes that are left out; shape (T, 3, K).
     faulty: Masks  #: Codes that are left out (`railfix.kernels.tracking.adaptation`); shape (T, K).
 
     def __len__(self) -> int:
@@ -74,12 +74,12 @@ class Tracked(NotebookTable):
 
     @classmethod
     def empty(cls, time: Datetimes, channels: int) -> Tracked:
-        """Nothing known at T epochs of K channels."""
+        """Return unknown positions for T epochs of K channels."""
         return cls.from_records(time, new_results(len(time), channels))
 
     @classmethod
     def from_records(cls, time: Datetimes, results: Results) -> Tracked:
-        """Return the columns of the recursion's records."""
+        """Convert the recursion's records to columns."""
         columns = {name: np.ascontiguousarray(results.epoch[name]) for name in EPOCH_RESULT.names or ()}
         columns |= {
             name: np.ascontiguousarray(np.moveaxis(results.channel[name], -1, 1)) for name in ("innovation", "weight")
@@ -87,11 +87,11 @@ class Tracked(NotebookTable):
         return cls(time=time, **columns, faulty=np.ascontiguousarray(results.channel["faulty"]))
 
 
-#: Types of the columns, and the shapes of those that have more than one number an epoch.
+#: Types of the columns, and the shapes of columns with more than one number per epoch.
 _TYPES: Final = {"Codes": np.int8, "Integers": np.int64, "Floats": np.float64}
 _SHAPES: Final = {"used": (len(Kind),), "sensed": (len(Kind) - 3,)}
 _OF_CHANNELS: Final = ("innovation", "weight", "faulty")
-#: One epoch of `Tracked` as the recursion writes it, and one channel of it.
+#: Record types of one epoch and of one channel of `Tracked` in the recursion.
 EPOCH_RESULT: Final = record_of({
     f.name: (_TYPES[str(f.type)], _SHAPES.get(f.name, ()))
     for f in fields(Tracked)
@@ -101,7 +101,7 @@ CHANNEL_RESULT: Final = record_of({"innovation": (float, (3,)), "weight": (float
 
 
 def new_results(epochs: int, channels: int) -> Results:
-    """Return records of epochs at which nothing is known."""
+    """Return records of epochs without positions."""
     results = Results(np.zeros(epochs, dtype=EPOCH_RESULT), np.zeros((epochs, channels), dtype=CHANNEL_RESULT))
     for name, (kind, *_) in (EPOCH_RESULT.fields or {}).items():
         if kind.base == np.float64:

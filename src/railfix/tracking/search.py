@@ -1,4 +1,4 @@
-"""Places sought at the start, after gaps and when lost, before an epoch's update."""
+"""Position search at the start, after gaps and after a loss of track, before an epoch's update."""
 
 from __future__ import annotations
 
@@ -17,32 +17,33 @@ from railfix.tracking.limits import Tails, TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 
-#: The line is searched at points this far apart at most; a Gaussian of `START_SIGMA_M` covers what lies between, and
-#: codes count with the error that a place between two points makes [m].
+#: Largest spacing of the points at which the line is searched; a Gaussian of `START_SIGMA_M` covers the positions
+#: between, and the code variance includes the error of a position between two points [m].
 _SPACING_M: Final = 15.0
-#: Codes beyond place and clocks that places are sought with: with one alone a wrong place fits as well.
+#: Required redundancy of codes beyond position and clocks for a search: with a redundancy of one a wrong position fits
+#: as well.
 REDUNDANT: Final = 2
-#: Places whose logarithm of likelihood is this far below the best are not begun with.
+#: Positions whose log likelihood is this far below the best get no hypothesis.
 _WORSE: Final = 25.0
-#: Standard deviation of an unknown speed: no train is faster than twice this [m/s].
+#: Prior standard deviation of the speed: no train is faster than twice this [m/s].
 _ANY_SPEED_MPS: Final = 50.0
 _ANY_DRIFT_MPS: Final = 1e3
-#: Priors of the sensors: a wheel worn or entered wrongly by 2 %, an accelerometer's offset and mounting, a radar's
-#: angle.
+#: Sensor priors: a wheel diameter wrong by 2 %, an accelerometer's offset and mounting, a radar's angle.
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
-#: Places beside in `BEND_M`, how many, standard deviation of their speed [m/s], and share of probability that they get.
+#: Neighbouring positions: multiples of `BEND_M`, largest number, standard deviation of their speed [m/s], and fraction
+#: of the probability that they get.
 _BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])
 _BESIDE: Final = len(_BESIDE_STEPS)
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
-#: What a new hypothesis takes over from a lost track: its error has gone into everything else.
+#: Unknowns that a new hypothesis takes from a lost track; all others contain its error.
 _KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
 
 
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floats:
-    """Return the arc lengths that the codes of an epoch are consistent with, shape (C,) [m].
+    """Return the arc lengths that are consistent with the codes of an epoch, shape (C,) [m].
 
     Local maxima of the likelihood with Student's t errors, the best first; none with fewer than `REDUNDANT` codes
     beyond the unknowns.
@@ -53,7 +54,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floa
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1 + REDUNDANT:
         return np.empty(0)
-    # between the vertices too: a map with few of them would be searched with gaps
+    # points between the vertices too, so that a sparse map is searched without gaps
     arc = np.linspace(line.arc_m[0], line.arc_m[-1], 1 + int(np.ceil((line.arc_m[-1] - line.arc_m[0]) / _SPACING_M)))
     points, _ = line.at(arc)
     likelihood = np.zeros(len(arc))
@@ -90,10 +91,10 @@ def begin(
     sigma_m: float = constants.START_SIGMA_M,
     known: tuple[Floats, Floats] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return the mean and covariance of new hypotheses at places [m], shapes (H, N), (H, N, N) and (H,).
+    """Return mean and covariance of new hypotheses at positions [m], shapes (H, N), (H, N, N) and (H,).
 
-    `satellites` is the number of their errors in the state, `known` are mean and covariance of a lost track, (N,) and
-    (N, N): what it knew of the sensors is kept, clocks and satellites restart.
+    `satellites` is the number of satellite errors in the state; `known` are mean and covariance of a lost track, (N,)
+    and (N, N): its sensor unknowns are kept, clocks and satellites restart.
     """
     width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
@@ -122,50 +123,50 @@ def begin(
     return mean, covariance
 
 
-#: Probability of other places where the velocity contradicts the one that was sure: the map may be wrong just here.
+#: Probability of other positions where the velocity contradicts a single certain position: the map may be wrong there.
 _ELSEWHERE: Final = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitHypothesis:
-    """One of the narrower hypotheses that a wide one was split into."""
+    """One of the narrow hypotheses into which a wide hypothesis was split."""
 
-    parent: int  #: The wide one.
-    #: Mean and covariance of the wide one; shapes (N,), (N, N).
+    parent: int  #: Index of the wide hypothesis.
+    #: Mean and covariance of the wide hypothesis; shapes (N,), (N, N).
     mean: Floats
     covariance: Floats
-    place_m: float  #: Place of the narrower one, with the standard deviation `START_SIGMA_M`.
+    place_m: float  #: Arc length of the narrow hypothesis, with the standard deviation `START_SIGMA_M`.
 
 
 class Sought(NamedTuple):
-    """Result of the search before an epoch."""
+    """Result of the position search before an epoch."""
 
-    lost: bool  #: The track was lost.
-    parent: Indices  #: Hypothesis of the epoch before that each one goes on from; -1 where it began; shape (H,).
-    splits: list[SplitHypothesis | None] | None  #: Hypotheses that began at this epoch within wider ones.
+    lost: bool  #: True if the track was lost.
+    parent: Indices  #: Index of each hypothesis at the previous epoch; -1 for a new one; shape (H,).
+    splits: list[SplitHypothesis | None] | None  #: Hypotheses that were split from wide ones at this epoch.
 
 
-#: Means, covariances and records of some hypotheses; shapes (H, N), (H, N, N), (H,).
+#: Means, covariances and records of H hypotheses; shapes (H, N), (H, N, N), (H,).
 _Part: TypeAlias = tuple[Floats, Floats, Records]
 
 
 def _new_records(log_probability: Floats, origin_m: Floats, log_code: Floats | float = 0.0) -> Records:
-    """Return the records of hypotheses that begin, `HYPOTHESIS`; arguments of shape (H,)."""
+    """Return the `HYPOTHESIS` records of new hypotheses; arguments of shape (H,)."""
     records = np.zeros(len(origin_m), dtype=HYPOTHESIS)
     records["log_probability"], records["origin_m"], records["log_code"] = log_probability, origin_m, log_code
     return records
 
 
 def _join(state: TrackState, parts: list[_Part]) -> None:
-    """Make some hypotheses those of the state, with probabilities that add up to 1."""
+    """Set the hypotheses of the state, with probabilities that sum to 1."""
     state.mean, state.covariance, state.hypothesis = (np.concatenate(items) for items in zip(*parts, strict=True))
     state.hypothesis["log_probability"] -= np.logaddexp.reduce(state.hypothesis["log_probability"])
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits, reasons: int) -> Sought:
-    """Seek places before an epoch, and change the state, which is predicted to it.
+    """Search positions before an epoch, and update the state, which is predicted to the epoch.
 
-    `reasons` are bits of `index.LOST_TRACK` and those after it; 0 without a hypothesis.
+    `reasons` are bits from `index.LOST_TRACK` on; 0 without a hypothesis.
     """
     if not state.hypotheses:
         arc = places(chunk, epoch, line, limits)
@@ -198,17 +199,17 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
 
 
 def _start_branches(state: TrackState) -> None:
-    """Start the count of time and distance on the branches."""
+    """Reset time and distance on the branches."""
     state.hypothesis["log_least"], state.hypothesis["log_recent"] = state.hypothesis["log_probability"], 0.0
     state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
 
 
 def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
-    """Reset what contradicted the earlier places, and hold the level back where the track was lost."""
+    """Reset the monitors of the earlier positions, and withhold the level after a loss of track."""
     _start_branches(state)
     hold = state.monitors.level_hold_s
     if lost and state.monitors.weak_code_s >= constants.LOST_CODE_S:
-        # Codes have contradicted the place that motion carried: the next place is theirs alone.
+        # Codes have contradicted the position propagated by motion: the next position comes from codes alone.
         hold = max(hold, constants.STEP_HOLD_S)
     if weak:
         hold = max(hold, constants.LEVEL_START_S)
@@ -221,9 +222,10 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
 def _split_wide(
     state: TrackState, arc_m: Floats, wide: Masks, line: Line
 ) -> tuple[list[_Part], list[SplitHypothesis | None]]:
-    """Return narrower hypotheses at places within wide ones, and what each hypothesis was split from.
+    """Return narrow hypotheses at positions within wide ones, and the origin of each hypothesis.
 
-    Each is the wide one as if its place were known with `START_SIGMA_M`; their probabilities are by its density there.
+    Each is the wide hypothesis conditioned on a position with `START_SIGMA_M`; the probabilities follow from its
+    density at that position.
     """
     parts: list[_Part] = []
     splits: list[SplitHypothesis | None] = [None] * state.hypotheses
@@ -250,29 +252,30 @@ def _split_wide(
 
 
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
-    """Return hypotheses at places away from those of a lost track; `weak`: its weights were low for long."""
+    """Return hypotheses at positions away from a lost track; `weak` means that its weights were low for long."""
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.across >= constants.ACROSS_TAKEN else _ELSEWHERE
-    # One that is less probable than a new place has drifted from where codes would begin it.
+    # A hypothesis less probable than a new one at its position has drifted from the position implied by codes.
     alive = log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]
     there = line.nearest_m(arc[:, None], going)
     arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
-    # The old place goes on too, free to be pulled to where the codes are; where the velocity alone contradicts it,
-    # the hypotheses go on as they are.
+    # The old position is continued too, with an inflated variance so that codes can correct it; where the velocity
+    # alone contradicts it, the hypotheses continue unchanged.
     arc = np.concatenate([going, arc]) if weak else arc
     fresh = begin(arc, len(state.satellite), line, limits, known=(state.mean[best], state.covariance[best]))
     return (*fresh, _new_records(np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc))
 
 
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
-    """Add hypotheses a little before and after those that are apart, the most probable first; return how many.
+    """Add hypotheses slightly ahead of and behind separate hypotheses, the most probable first; return their number.
 
-    Where a line turns back within some tens of metres, Dopplers fit one leg run forward and the other run backward
-    alike, and a step of the estimate over the bend is none of the equations linearised before it. Contradicted by its
-    motion, the place beyond the bend must be tried, with any speed. Motion that contradicts the best hypothesis
-    contradicts another lap of it alike: without places of its own beside it the other lap would lose by them.
+    Where a line turns back within some tens of metres, Dopplers fit travel forward on one leg and backward on the other
+    equally well, and equations linearised before the bend do not reach beyond it. If motion contradicts the position,
+    positions beyond the bend must therefore be tried, with any speed. Motion that contradicts the best hypothesis also
+    contradicts another lap of it, so each lap gets its own neighbouring positions; otherwise the other lap would lose
+    probability to them.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE

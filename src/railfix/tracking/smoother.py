@@ -1,13 +1,14 @@
-"""Places from both directions: the filter's answer, and then everything measured after it.
+"""Smoothed positions: the filter's estimates combined with all later measurements.
 
 The adjoint form of the smoother (G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
-doi:10.1080/00207177308932424): what all later measurements say of an epoch's unknowns is a vector l and a matrix L,
+doi:10.1080/00207177308932424): the information of all later measurements on an epoch's unknowns is a vector l and a
+matrix L, and the smoothed mean and covariance are
 
     mean + P l,   P - P L P
 
-which go backward through updates and predictions without an inverse of any covariance. The weights of the
-measurements are those that the filter gave them; the hypotheses are those that led to the last one. Where a hypothesis
-began, nothing of what comes later reaches the epochs before.
+l and L are propagated backward through updates and predictions without inverting a covariance. The measurement weights
+are the filter's; the hypotheses are those that led to the last one. Information from after the start of a hypothesis
+does not reach the epochs before it.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from railfix.tracking.state import TrackState
 
 
 def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Carry the information of later epochs on hypothesis h of an epoch backward through its measurements."""
+    """Propagate the information of later epochs on hypothesis h backward through an epoch's measurements."""
     from railfix.kernels.tracking.backward import before_measurements
 
     made = step.trace
@@ -37,7 +38,7 @@ def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floa
         )
     part = None if step.splits is None else step.splits[h]
     if part is not None:
-        # The density of the narrower one over the wide one, as if its place had been measured.
+        # Ratio of the narrow to the wide density, as if the position had been measured.
         place = ix.ARC
         wide = part.covariance[place, place]
         back = np.eye(len(vector))
@@ -50,7 +51,7 @@ def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floa
 
 
 def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
-    """Return the transition of all unknowns over an interval from a state, shape (N, N); `mean` has shape (N,)."""
+    """Return the transition matrix of all unknowns over an interval, shape (N, N); `mean` has shape (N,)."""
     from railfix.kernels.tracking.backward import transition_matrix
 
     epoch = np.zeros(1, dtype=EPOCH)
@@ -62,8 +63,8 @@ def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 class BackwardInformation:
     """Information of all later epochs on the unknowns after an epoch."""
 
-    place_m: float  #: Of the hypothesis that they go on from; NaN for none.
-    #: Of the unknowns; shapes (N,), (N, N).
+    place_m: float  #: Arc length of the hypothesis that the later epochs continue; NaN for none.
+    #: Information vector and matrix of the unknowns; shapes (N,), (N, N).
     vector: Floats
     matrix: Floats
     satellite: Strings  #: Shape (N - ix.SATELLITES,).
@@ -71,7 +72,7 @@ class BackwardInformation:
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothed:
-    """Places of T epochs from both directions; NaN where the filter has none."""
+    """Smoothed positions of T epochs; NaN where the filter has none."""
 
     #: Shape (T,).
     arc_m: Floats
@@ -82,12 +83,12 @@ class Smoothed:
 def smooth_steps(
     steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
 ) -> tuple[Smoothed, BackwardInformation]:
-    """Return places from both directions of a chunk (adjoint smoother: G. J. Bierman, 1973).
+    """Return the smoothed positions of a chunk (adjoint smoother: G. J. Bierman, 1973).
 
     Parameters
     ----------
     steps : list of Step
-        From `railfix.tracking.track`, one an epoch.
+        From `railfix.tracking.track`, one per epoch.
     before : TrackState
         Before the chunk.
     later : BackwardInformation or None
@@ -145,7 +146,7 @@ def smooth_steps(
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return the vector and matrix for other satellites; those no longer in the state have no information."""
+    """Return the vector and matrix for another set of satellites; satellites no longer in the state are dropped."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
     of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])

@@ -1,4 +1,4 @@
-"""State of the filter: hypotheses side by side, each a Gaussian over the same unknowns."""
+"""State of the filter: hypotheses, each a Gaussian over the same unknowns."""
 
 from __future__ import annotations
 
@@ -12,71 +12,71 @@ from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Records, record_of
 from railfix.tracking.epochs import Previous
 
-#: Bounds of the speed where nothing is known of it [m/s].
+#: Bounds of an unknown speed [m/s].
 ANY_SPEED: Final = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Monitors:
-    """Scalars of the state: what it has adapted to, and what contradicts it."""
+    """Scalars of the state: adapted parameters and contradiction monitors."""
 
-    #: How long the mean weights of motion and of codes have been low [s].
+    #: Times for which the mean weights of motion and of codes have been low [s].
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
-    #: Logarithms of the variances of Dopplers and of phases against those of the limits.
+    #: Log ratios of the Doppler and phase variances to those of the limits.
     log_doppler_scale: float = 0.0
     log_phase_scale: float = 0.0
-    #: Mean of the shifts that codes imply over the last epochs, in standard deviations, and its variance.
+    #: Mean of the normalised position shifts that codes imply over the last epochs, and its variance.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0
-    #: Logarithm of the variance of lengths along the map against that of the limits, at least 0.
+    #: Log ratio of the variance of map lengths to its limit, at least 0.
     map_log_variance: float = 0.0
-    #: Sum of the contradictions of the velocity (`railfix.kernels.tracking.monitors`).
+    #: Cumulative sum of the velocity contradictions (`railfix.kernels.tracking.monitors`).
     across: float = 0.0
-    #: One less the mean weight of Dopplers and phases lately; 0 where a sensor measures the speed.
+    #: One less the recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
     motion_misfit: float = 0.0
-    step_s: float = 0.0  #: How long all codes have implied another place [s].
-    #: For how long the level is held back still, and that along the line, as other places were more probable than the
-    #: risk [s].
+    step_s: float = 0.0  #: Time for which all codes have implied another position [s].
+    #: Remaining times for which the level is withheld, and for which the level along the line is withheld because other
+    #: positions were more probable than the risk [s].
     level_hold_s: float = 0.0
     ambiguity_hold_s: float = 0.0
     #: Time and distance since the hypotheses began [s, m].
     branch_s: float = 0.0
     branch_m: float = 0.0
     distance_since_code_m: float = 0.0  #: Distance since codes were used [m].
-    direction: float = 0.0  #: Sign of the last speed with a direction.
-    #: Speeds that are possible after those measured so far (`railfix.kernels.tracking.model.narrow_speed_range`); no
-    #: bounds while there are several hypotheses [m/s].
+    direction: float = 0.0  #: Sign of the last speed whose direction was known.
+    #: Range of possible speeds after the measured ones (`railfix.kernels.tracking.model.narrow_speed_range`); unbounded
+    #: with several hypotheses [m/s].
     least_speed_mps: float = ANY_SPEED[0]
     most_speed_mps: float = ANY_SPEED[1]
-    #: Times since `TrackState.origin` of the last epoch with measurements that the filter used, NaN before one, and of
-    #: the last one whose codes counted (`TrackingLimits.code_period_s`), -inf where the next ones do [s].
+    #: Times since `TrackState.origin` [s]: of the last epoch with used measurements, NaN before the first; and of the
+    #: last epoch with used codes (`TrackingLimits.code_period_s`), -inf if the next codes are used in any case.
     measured_s: float = np.nan
     coded_s: float = -np.inf
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bank:
-    """Sub-filters of the most probable hypothesis, each without one source: B Gaussians over the same unknowns."""
+    """Sub-filters of the most probable hypothesis, each excluding one source: B Gaussians over the same unknowns."""
 
-    #: A satellite ("G05"), a constellation by the letter of its clock ("G"), a sensor ("wheel"), or one of
-    #: `railfix.tracking.bank.OTHERS` ("doppler").
+    #: Source names: a satellite ("G05"), a constellation by the letter of its clock ("G"), a sensor ("wheel"), or one
+    #: of `railfix.tracking.bank.OTHERS` ("doppler").
     without: tuple[str, ...]
     mean: Floats  #: Shape (B, N).
     covariance: Floats  #: Shape (B, N, N).
-    contradicted_s: Floats  #: How long the measurements of each have contradicted it [s]; shape (B,).
+    contradicted_s: Floats  #: Time for which its measurements have contradicted each sub-filter [s]; shape (B,).
 
 
-#: Scalars of the state as the recursion takes them: the fields of `Monitors`, and the number of hypotheses.
+#: Record type of the state's scalars: the fields of `Monitors`, and the number of hypotheses.
 MONITORS: Final = record_of(dict.fromkeys(Monitors.__dataclass_fields__, float) | {"hypotheses": np.intp})
-#: What each hypothesis has beside its Gaussian.
+#: Record type of a hypothesis, without its Gaussian.
 HYPOTHESIS: Final = record_of({
     "log_probability": float,  # logarithm of its probability
-    "log_code": float,  # part of that which the codes gave (`railfix.kernels.tracking.hypotheses`)
-    "log_least": float,  # least `log_probability` lately: it rises with time (`constants.LEAST_RISE`)
-    # Evidence of the codes lately against laps within the error of the map (`constants.RECENT_S`); no probability.
+    "log_code": float,  # part of it due to codes (`railfix.kernels.tracking.hypotheses`)
+    "log_least": float,  # recent minimum of `log_probability`: it rises with time (`constants.LEAST_RISE`)
+    # Recent code evidence against laps within the map error (`constants.RECENT_S`); not a probability.
     "log_recent": float,
-    "origin_m": float,  # arc length at which it began [m]
+    "origin_m": float,  # arc length at its start [m]
 })  # fmt: skip
 
 
@@ -84,17 +84,17 @@ HYPOTHESIS: Final = record_of({
 class TrackState:
     """State after an epoch: H hypotheses of N unknowns. Its arrays are never written to."""
 
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the last epoch.
-    origin: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Of the first epoch.
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
+    origin: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the first epoch.
     mean: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES)))  #: Units as in `index.py`; shape (H, N).
     covariance: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES, ix.SATELLITES)))  #: Shape (H, N, N).
     hypothesis: Records = field(default_factory=lambda: np.empty(0, dtype=HYPOTHESIS))  #: `HYPOTHESIS`; shape (H,).
     #: Satellites whose errors are in the state; shape (N - ix.SATELLITES,).
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
-    #: When each was last measured; shape (N - ix.SATELLITES,).
+    #: Time at which each was last measured; shape (N - ix.SATELLITES,).
     seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Mean innovation of each satellite's codes over their standard deviation
-    #: (`railfix.kernels.tracking.adaptation`); shape (N - ix.SATELLITES,).
+    #: Mean normalised innovation of each satellite's codes (`railfix.kernels.tracking.adaptation`); shape (N -
+    #: ix.SATELLITES,).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
     #: Clocks that have had an observation; shape (len(ix.CLOCKS),).
     offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))
@@ -108,7 +108,7 @@ class TrackState:
         return len(self.hypothesis)
 
     def reset(self) -> None:
-        """Restart: no hypothesis, no sub-filter, no clock known, nothing adapted; the level stays held back."""
+        """Reset hypotheses, sub-filters, clocks and adapted parameters; the level stays withheld."""
         width = ix.SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.hypothesis = self.hypothesis[:0]
@@ -122,7 +122,7 @@ class TrackState:
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:
-        """Keep the errors of some satellites, indices into `satellite`, and begin those of new ones."""
+        """Keep the errors of some satellites (indices into `satellite`), and append the errors of new satellites."""
         index = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + kept]).astype(np.intp)
         self.mean, self.covariance = _rearrange(self.mean, self.covariance, index, len(new))
         if self.bank is not None:
@@ -135,7 +135,7 @@ class TrackState:
 
 
 def _rearrange(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
-    """Return Gaussians over some of their unknowns and a number of new errors of satellites."""
+    """Return Gaussians over a subset of their unknowns and a number of new satellite errors."""
     old = len(index)
     means, covariances = np.zeros((len(mean), old + new)), np.zeros((len(mean), old + new, old + new))
     means[:, :old], covariances[:, :old, :old] = mean[:, index], covariance[:, index[:, None], index]

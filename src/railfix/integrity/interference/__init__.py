@@ -1,4 +1,4 @@
-"""Jamming and spoofing suspected from observations, positions and the receiver's own indicators."""
+"""Suspicion of jamming and spoofing from observations, positions and the receiver's own indicators."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Causes of suspected interference, limits of their tests, and signs in C/N0 and the gain of the front end."""
+"""Causes of suspected interference, limits of their tests, and signs in C/N0 and front-end gain."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from railfix.core.timescale import GPS_EPOCH, seconds
 
 
 class Suspicion(IntEnum):
-    """Likely cause of signs that all satellites of an epoch share; `suspicion` decides it."""
+    """Likely cause of signs common to all satellites of an epoch, as decided by `suspicion`."""
 
     NONE = 0
     JAMMING_SUSPECTED = 1
     SPOOFING_SUSPECTED = 2
     #: All satellites are consistent with one error of the time tags.
     TIME_TAGS = 3
-    #: The 3-D positions have left the map, without any other sign.
+    #: The 3-D positions have left the map, and there is no other sign.
     LEFT_MAP = 4
-    #: All positions of the last minute failed a check; the cause is unknown.
+    #: All positions of the last minute failed a check for an unknown cause.
     CONTRADICTED = 5
 
 
@@ -38,7 +38,7 @@ class Sign(IntFlag):
     RECEIVER_JAMMING = 1 << 0
     #: C/N0 of all satellites has fallen by nearly the same amount.
     CN0_FALL = 1 << 1
-    #: The gain of the receiver's front end has fallen.
+    #: The front-end gain of the receiver has fallen.
     GAIN_FALL = 1 << 2
     #: The receiver reports spoofing: UBX SEC-SIG (affirmed), SBF RFStatus.
     RECEIVER_SPOOFING = 1 << 3
@@ -54,7 +54,7 @@ class Sign(IntFlag):
     CONSTELLATIONS_PART = 1 << 8
     #: Consistent 3-D positions have left the map sideways.
     LEFT_MAP = 1 << 9
-    #: The distance by satellites deviates from that of the wheel.
+    #: The satellite distance deviates from the wheel distance.
     WHEEL_PARTS = 1 << 10
     #: One error of the time tags explains the ranges.
     TIME_TAGS = 1 << 11
@@ -77,77 +77,78 @@ class InterferenceLimits(Settings):
     """
 
     use: Literal["on", "off"] = "on"
-    least_satellites: int = Field(default=6, ge=5)  #: Satellites that a statement on "all" takes.
+    least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test over all satellites.
     fall_db: float = Field(default=5.0, gt=0)  #: Median fall of C/N0 below its recent peak.
     #: Largest standard deviation of the falls: a jammer raises the noise of all channels alike, walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
-    peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: How fast a peak is forgotten [dB/min].
+    peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay of a peak [dB/min].
     known_after_s: float = Field(default=10.0, ge=0)  #: A satellite is compared once it has been tracked for this time.
-    #: Fall of the front end's gain as a fraction of its recent peak; 14 % within a start without interference.
+    #: Fall of the front-end gain as a fraction of its recent peak; up to 14 % during a start without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
     #: Largest standard deviation of equal C/N0; in open sky 1.2 dB and more.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Step of the codes against the Dopplers, whole milliseconds left out. Clocks of phones step by 30 m.
+    #: Step of the codes against the Dopplers, without whole milliseconds. Phone clocks step by 30 m.
     clock_jump_m: float = Field(default=60.0, gt=0)
-    #: Least jumps and least distance from the line. A yard is some 100 m wide.
+    #: Minimum jumps and minimum distance from the line. A yard is some 100 m wide.
     drift_jump_mps: float = Field(default=10.0, gt=0)
     speed_jump_mps: float = Field(default=5.0, gt=0)
     position_jump_m: float = Field(default=30.0, gt=0)
     off_map_m: float = Field(default=100.0, gt=0)
-    #: Least error of the time tags, and the same in standard deviations: right tags are within 0.05 s of it in towns,
-    #: and a phone's with seven satellites within 0.13 s.
+    #: Minimum error of the time tags, in seconds and in standard deviations. Estimated errors of correct tags reach
+    #: 0.05 s in towns, and 0.13 s with a phone and seven satellites.
     tag_error_s: float = Field(default=0.1, gt=0)
     tag_sigmas: float = Field(default=6.0, gt=0)
     #: Time for which all positions fail a check before positions are considered unreliable.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: Limit in standard deviations; and of the difference of two constellations.
+    #: Limits in standard deviations, in general and for the difference of two constellations.
     jump_sigmas: float = Field(default=10.0, gt=0)
     part_sigmas: float = Field(default=15.0, gt=0)
     #: Limits of a train's motion; position jumps exceed these.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Epochs farther apart are not compared.
-    #: Less sure velocities and positions are not compared.
+    #: Velocities and positions with larger standard deviations are not compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)
     largest_sigma_m: float = Field(default=30.0, gt=0)
-    #: How long a fall, equal C/N0 or distance from the map lasts before it counts; and parted constellations.
+    #: Holding times: of a fall, of equal C/N0 and of a distance from the map; and of separated constellations.
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)
-    #: Time over which satellites and wheel are compared, and the shortest one.
+    #: Time over which satellites and wheel are compared, and its minimum.
     wheel_window_s: float = Field(default=120.0, gt=0)
     wheel_least_s: float = Field(default=60.0, gt=0)
-    #: Least difference, and the same in standard deviations [m].
+    #: Minimum difference [m], and minimum difference in standard deviations.
     wheel_m: float = Field(default=20.0, gt=0)
     wheel_sigmas: float = Field(default=6.0, gt=0)
-    #: Whether the level of the filter covers a pull that the wheel has not shown yet: two to four times as large.
+    #: Whether the filter's protection level covers a pull that the wheel has not shown yet; the level is then two to
+    #: four times as large.
     wheel_level: Literal["on", "off"] = "off"
-    #: Standard deviations of the difference in it: 2.1 for a probability of 1e-7 that a pull has begun within the
-    #: window, and a risk of 1e-9.
+    #: Standard deviations of the difference in that level: 2.1 for a probability of 1e-7 that a pull has begun within
+    #: the window, and a risk of 1e-9.
     wheel_level_sigmas: float = Field(default=2.1, ge=0)
-    #: Standard deviation of the wheel's circumference, before positions determine it; and of its change after (creep).
+    #: Relative standard deviation of the wheel's circumference before positions determine it, and of its later change
+    #: (creep).
     wheel_scale: float = Field(default=0.01, gt=0)
     wheel_change: float = Field(default=0.001, gt=0)
-    #: A wheel that changes its speed faster has slipped: the comparison restarts. Adhesion gives 1 to 1.5.
+    #: Acceleration above which the wheel has slipped and the comparison restarts. Adhesion allows 1 to 1.5.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: Time for which a suspicion remains after its last sign: a jump takes one epoch, its cause lasts.
+    #: Time for which a suspicion remains after its last sign: a jump takes one epoch, but its cause persists.
     jamming_release_s: float = Field(default=10.0, ge=0)
     spoofing_release_s: float = Field(default=300.0, ge=0)
 
 
 def cause_text(causes: Bits) -> Strings:
-    """Return the names of the causes of each epoch joined by ``+``, blank without any, same shape."""
+    """Return the causes of each epoch joined by ``+``, blank without a cause, same shape."""
     words, which = np.unique(causes, return_inverse=True)
     texts = ["+".join(str(cause.name).lower() for cause in CAUSES if cause & word) for word in words.tolist()]
     return np.array(texts, dtype=np.str_)[which.reshape(causes.shape)] if texts else np.zeros(causes.shape, "<U1")
 
 
 def suspicion(causes: Bits) -> Codes:
-    """Return the `Suspicion` of epochs by their causes, same shape: all decisions between causes are made here.
+    """Return the `Suspicion` of epochs from their signs, same shape; the only function that decides between causes.
 
-    The cause that explains most signs comes first. One error of the time tags, fitted to all ranges, moves positions
-    and clocks as a spoofer would. Jumps, equal C/N0 and different constellations are not caused by leaving the map. A
-    train that leaves its map shows no other sign than that, and neither does jamming. Satellites that are wrong
-    separately are excluded before.
+    The cause that explains most signs comes first. A common time-tag error, fitted to all ranges, moves positions and
+    clocks as a spoofer would. Leaving the map does not cause jumps, equal C/N0 or different constellations; a train off
+    its map, and jamming, show no further sign. Satellites with separate errors are excluded beforehand.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -166,21 +167,22 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 class HeldState:
     """State of C conditions after a chunk."""
 
-    time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Last epoch; NaT before the first.
+    time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Time of the last epoch; NaT before the first.
     #: Time for which each condition has been true, shape (C,).
     run_ns: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    #: When it last counted; NaT for never; shape (C,).
+    #: Time at which each condition was last active; NaT for never; shape (C,).
     last: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
 
 
 def hold_signs(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
-    """Return which conditions have been true for their time, which within their time of release, and the state.
+    """Return which conditions have been true for their holding time, which are within their release time, and the
+    state.
 
     An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
-    sufficient. Signs and results have the shape (T, C), the times of holding and release (C,) [s]; a condition whose
-    time of holding is 0 counts at once.
+    sufficient. Signs and results have the shape (T, C), the holding and release times (C,) [s]; a condition with a
+    holding time of 0 counts at once.
     """
     conditions = signs.shape[1]
     run, last = state.run_ns, state.last
@@ -197,19 +199,19 @@ def hold_signs(
 
 
 _MINUTE_S: Final = 60.0
-_GAIN_DECAY_PER_MIN: Final = 0.005  #: The gain's peak is forgotten by this fraction of it per minute.
-_LARGEST_DBHZ: Final = 100.0  #: A peak that has been forgotten by this much is below every C/N0.
+_GAIN_DECAY_PER_MIN: Final = 0.005  #: Relative decay of the gain's peak per minute.
+_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is below every C/N0.
 _LONGEST_SILENCE_S: Final = 60.0  #: Satellites that were absent for longer are not compared with earlier values [s].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerState:
-    """State after a chunk, by channel ("G01" + "1C")."""
+    """State of C/N0 and gain after a chunk, by channel ("G01" + "1C")."""
 
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
     #: Peak of C/N0 plus the decay since the GPS epoch; -inf before the first; shape (K,).
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Begin of the present tracking of each channel, and its last observation, since the GPS epoch; NaN before; shape
+    #: Start of the current tracking of each channel, and its last observation, since the GPS epoch; NaN before; shape
     #: (K,).
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
@@ -218,7 +220,7 @@ class PowerState:
 
 @dataclass(frozen=True, kw_only=True)
 class PowerSigns:
-    """Statistics of T epochs; NaN where too few satellites are compared."""
+    """C/N0 and gain statistics of T epochs; NaN where too few satellites are compared."""
 
     #: Median and standard deviation of the falls of C/N0 below the recent peak of each satellite, shape (T,).
     fall_db: Floats
@@ -235,7 +237,7 @@ def power_signs(
 
     The recent peak of a satellite falls by `peak_decay_db_per_min`: a slow change of the sky does not raise a sign, a
     constant jammer is detected for minutes. `channel` names satellite and signal, one signal of each satellite at an
-    epoch. The gain is in the receiver's unit, + for more gain; NaN where unknown.
+    epoch. The gain is in the receiver's unit, rising with gain; NaN where unknown.
     """
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ

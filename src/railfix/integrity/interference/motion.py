@@ -1,4 +1,4 @@
-"""Signs of interference in clock, velocity and position: steps that no train and no oscillator makes."""
+"""Signs of interference in clock, velocity and position: steps beyond the limits of trains and oscillators."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_tim
 
 #: Steps of receiver clocks by whole milliseconds are not signs of interference [m].
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
-#: Redundant ranges or Dopplers from which their noise is estimated: fewer can agree by chance.
+#: Minimum redundancy for a noise estimate of ranges or Dopplers: with less they can agree by chance.
 _LEAST_FREEDOM: Final = 3
-_LEAST_MPS: Final = 0.05  #: Least noise of Dopplers [m/s].
+_LEAST_MPS: Final = 0.05  #: Minimum noise of Dopplers [m/s].
 _SIZE: Final = 4  #: Unknowns that two constellations determine separately: position and clock.
 
 
@@ -30,11 +30,11 @@ class Fix(NamedTuple):
     time: Datetimes
     ecef_m: Floats  # (T, 3)
     sigma_m: Floats
-    velocity_mps: Floats  # (T, 4), with the drift of the clock
+    velocity_mps: Floats  # (T, 4), with the clock drift
     velocity_sigma_mps: Floats
 
     def take(self, rows: Indices | slice) -> Fix:
-        """Return the fits of some epochs."""
+        """Return the fits of a selection of epochs."""
         time, ecef, sigma, velocity, velocity_sigma = self
         return Fix(time[rows], ecef[rows], sigma[rows], velocity[rows], velocity_sigma[rows])
 
@@ -53,56 +53,57 @@ class MotionSignState:
     #: Last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Shape (K,).
-    #: Last ones of each channel, shape (K,).
+    #: Last codes and Dopplers of each channel, shape (K,).
     code_m: Floats = field(default_factory=lambda: np.zeros(0))
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
-    #: When they were observed, shape (K,).
+    #: Time of these observations, shape (K,).
     since: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
-    #: Last ones that were good enough to compare with, one epoch each.
+    #: Last position and velocity accurate enough for a comparison, one epoch each.
     position: Fix = field(default_factory=_no_fix)
     velocity: Fix = field(default_factory=_no_fix)
-    on_map: bool = False  #: A position has been on the map.
+    on_map: bool = False  #: True once a position has been on the map.
     tags: TagErrors = NO_TAGS  #: Fits of the last epochs.
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSigns:
-    """Statistics of T epochs; NaN where there is nothing to compare."""
+    """Motion statistics of T epochs; NaN where a comparison is not possible."""
 
     clock_jump_m: Floats  #: Median change of the codes against the Dopplers, less whole milliseconds; shape (T,).
-    #: Changes beyond the limits of train and oscillator, and in standard deviations; shape (T,).
+    #: Changes beyond the limits of train and oscillator, in physical units and in standard deviations; shape (T,).
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
     speed_jump_sigmas: Floats
     position_jump_m: Floats
     position_jump_sigmas: Floats
-    #: Largest difference of two constellations' own positions and clocks, in standard deviations; shape (T,).
+    #: Largest difference between the separate positions and clocks of two constellations, in standard deviations; shape
+    #: (T,).
     part_sigmas: Floats
     #: Distance of the 3-D position from the line, once a position has been on it; shape (T,).
     off_line_m: Floats
     off_line_sigmas: Floats
-    #: Median error of the time tags over the last epochs, + where they are late; also in standard deviations; (T,).
+    #: Median error of the time tags over the last epochs, positive for late tags; also in standard deviations; (T,).
     tag_error_s: Floats
     tag_error_sigmas: Floats
 
 
 class MotionFit(NamedTuple):
-    """Fits of the ranges of T epochs, of any antenna, without other data."""
+    """Fits of the ranges of T epochs of one antenna, without other data."""
 
     fixes: Fix
-    part_sigmas: Floats  #: Of `MotionSigns`.
-    #: Error of the time tags, + where they are late, and its standard deviation; NaN without redundancy; shape (T,).
+    part_sigmas: Floats  #: Field of `MotionSigns`.
+    #: Error of the time tags, positive for late tags, and its standard deviation; NaN without redundancy; shape (T,).
     tag_error_s: Floats
     tag_sigma_s: Floats
 
     def take(self, rows: slice) -> MotionFit:
-        """Return those of some epochs."""
+        """Return the fits of a selection of epochs."""
         return MotionFit(self.fixes.take(rows), self.part_sigmas[rows], self.tag_error_s[rows], self.tag_sigma_s[rows])
 
 
 def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
-    """Return positions and velocities, and how far constellations are apart."""
+    """Return positions and velocities, and the differences between constellations."""
     linear = misfit_at(inputs)
     parts = _parts(inputs, linear, limits.least_satellites - 1)
     return MotionFit(fit_motion_fixes(inputs, linear), parts, *fit_time_tags(inputs))
@@ -111,7 +112,7 @@ def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
 def motion_signs(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits, fitted: MotionFit | None = None
 ) -> tuple[MotionSigns, MotionSignState]:
-    """Return the statistics of clock, velocity and position of T epochs, and the state to pass on."""
+    """Return the statistics of clock, velocity and position of T epochs, and the state for the next chunk."""
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
     fixes, part_sigmas, tag_error, tag_sigma = fitted or fit_motion(inputs, limits)
@@ -162,12 +163,12 @@ def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]
 
 
 def _length(covariance: Floats) -> Floats:
-    """Return the square root of the first three variances together, shape (T,)."""
+    """Return the square root of the sum of the first three variances, shape (T,)."""
     return np.asarray(np.sqrt(covariance[:, :3, :3].trace(axis1=1, axis2=2)))
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
-    """Return the last good fix before each epoch, and the last one of all."""
+    """Return the last accurate fix before each epoch, and the last accurate fix of all."""
     if len(good) == 1:
         return start, fixes if good[0] else start
     time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))
@@ -191,7 +192,9 @@ def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floa
 
 
 def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return the distance from the position extrapolated by the last velocity, less a train's reach; also in sigmas."""
+    """Return the distance to the position extrapolated by the last velocity, less a train's largest deviation; also in
+    sigmas.
+    """
     dt = seconds(now.time - before.time)
     velocity = np.where((moving.time == before.time)[:, None], moving.velocity_mps[:, :3], np.nan)
     slow = np.isnan(velocity[:, 0])

@@ -1,4 +1,4 @@
-"""Ranges of epochs that the signs of interference are searched for in, and least-squares fits of them."""
+"""Ranges for the interference tests, and least-squares fits of these ranges."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.positioning.search_index import SearchIndex
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-_RIDGE: Final = 1e-9  #: Weight of the unknowns themselves, for those that too few satellites determine.
+_RIDGE: Final = 1e-9  #: Prior weight of the unknowns, for unknowns that too few satellites determine.
 
 
 class MotionInputs(NamedTuple):
@@ -21,29 +21,29 @@ class MotionInputs(NamedTuple):
     break_before: Masks  #: Shape (T,).
     channel: Strings  #: Shape (K,).
     group: Indices  #: Receiver clock of each channel, shape (K,).
-    near_ecef_m: Floats  #: Position, right to some kilometres; NaN without one; shape (T, 3).
+    near_ecef_m: Floats  #: Position accurate to some kilometres; NaN if unknown; shape (T, 3).
     #: Shape (T, K, 3).
     sat_ecef_m: Floats
     sat_velocity_mps: Floats
-    code_m: Floats  #: As observed, shape (T, K).
+    code_m: Floats  #: Observed pseudoranges, shape (T, K).
     rate_mps: Floats  #: ``-lambda D``, shape (T, K).
     #: Shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
-    used: Masks  #: Channels without a reason against them, shape (T, K).
-    named: Masks  #: Channels that are wrong separately, and would be used otherwise; shape (T, K).
+    used: Masks  #: Channels without a rejection reason, shape (T, K).
+    named: Masks  #: Channels with separate errors, which would be used otherwise; shape (T, K).
     noise_scale: Floats  #: Shape (T,).
-    #: Known offsets between the receiver clocks, and their sigmas; shape (T, G).
+    #: Known offsets between the receiver clocks and their sigmas; shape (T, G).
     clock_offset_m: Floats
     clock_sigma_m: Floats
     off_line_m: Floats  #: Distance of the 3-D position from the line across it; NaN beyond an end; shape (T,).
-    #: Codes are grossly wrong or named so, or the position failed a check; shape (T,).
+    #: True where codes are grossly wrong or flagged as wrong, or the position failed a check; shape (T,).
     doubted: Masks
-    antenna: Indices  #: Number of the antenna among `lines`, shape (T,).
+    antenna: Indices  #: Index of the antenna's line in `lines`, shape (T,).
     lines: tuple[SearchIndex, ...]  #: Line of each antenna.
 
     def take(self, rows: slice | Indices) -> MotionInputs:
-        """Return those of some epochs."""
+        """Return the inputs of a selection of epochs."""
         own = {
             n: values if n in ("channel", "group", "lines") else values[rows] for n, values in self._asdict().items()
         }
@@ -75,7 +75,7 @@ def misfit_at(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
 
 
 def fit_epochs(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[Floats, Floats, Floats]:
-    """Return solutions, covariances and noise scales of weighted least squares; NaN below `least` redundant."""
+    """Return solutions, covariances and noise scales of weighted least squares; NaN with a redundancy below `least`."""
     has = (weight > 0) & np.isfinite(value) & np.isfinite(design).all(axis=2)
     rows = np.where(has[..., None], design, 0.0)
     y, w = np.where(has, value, 0.0), np.where(has, weight, 0.0)

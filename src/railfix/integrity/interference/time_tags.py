@@ -1,7 +1,8 @@
 """A common error of the time tags as a hypothesis: position, receiver clocks and the error fitted together.
 
-Satellites were where they are not at the tags, so that the column of the error is the range rate of the satellites with
-its sign changed. Bad codes and a train off its map are the alternative hypotheses: the error must explain clearly more.
+With wrong tags the satellite positions are computed for the wrong time, so that the design column of the error is the
+negative range rate. Bad codes and a train off its map are the alternative hypotheses: the error must explain clearly
+more.
 """
 
 from __future__ import annotations
@@ -14,21 +15,22 @@ from railfix.core.arrays import Datetimes, Floats, Masks, masked_median
 from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 
-_RATE_MPS: Final = 500.0  #: Range rate of a satellite, by its order: unit of the column of the error [m/s].
-#: The error is a median over at most and at least these numbers of epochs, none older than the window.
+#: Order of magnitude of a satellite's range rate, the unit of the error's design column [m/s].
+_RATE_MPS: Final = 500.0
+#: Largest and smallest number of epochs for the median error; none is older than the window.
 _TAG_EPOCHS: Final = 10
 _TAG_LEAST: Final = 3
 _TAG_WINDOW: Final = np.timedelta64(60, "s")
-_STEPS: Final = 6  #: Steps of a fit at most; and up to which error [s] and position [m] a step is the last.
+_STEPS: Final = 6  #: Largest number of steps of a fit, and convergence limits of the error [s] and the position [m].
 _SETTLED_S: Final = 0.05
 _SETTLED_M: Final = 100.0
-_ROUNDS: Final = 2  #: Fits of each step, with the weights by the residuals before.
-_FITS_WELL: Final = 3.0  #: Residuals up to this multiple of the median have full weight.
+_ROUNDS: Final = 2  #: Reweighted fits per step.
+_FITS_WELL: Final = 3.0  #: Multiple of the median up to which residuals have full weight.
 _SHOWN: Final = 3.0  #: Errors from this many standard deviations on are tested against the other hypotheses.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's position across and above its line.
-_LEAST_FREEDOM: Final = 3  #: Redundant ranges that agree on an error at least.
-#: Residuals up to this many standard deviations agree; larger ones cost no more. An error of the time tags takes one
-#: bad code in by itself, so that it has to cost less by more than one of these squared.
+_LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree on an error.
+#: Residuals up to this many standard deviations agree; larger ones cost no more. A time-tag error can absorb one bad
+#: code, so that it must reduce the cost by more than one of these squared.
 _AGREES: Final = 5.0
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
@@ -36,7 +38,7 @@ _ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])
 
 
 class TagErrors(NamedTuple):
-    """Errors of the time tags at single epochs and their standard deviations, shape (N,) each."""
+    """Time-tag errors at single epochs and their standard deviations, shape (N,) each."""
 
     time: Datetimes
     error_s: Floats
@@ -47,21 +49,21 @@ NO_TAGS: Final = TagErrors(np.zeros(0, dtype="datetime64[ns]"), np.zeros(0), np.
 
 
 class _TagFit(NamedTuple):
-    """Positions with an error of the time tags, T epochs."""
+    """Positions fitted with a time-tag error, T epochs."""
 
-    error_s: Floats  # (T,), + where the tags are late
+    error_s: Floats  # (T,), positive for late tags
     sigma_s: Floats  # (T,)
     place_ecef_m: Floats  # (T, 3)
-    residual: Floats  # (T, K + 2) over their standard deviations, those of the line last
+    residual: Floats  # (T, K + 2), normalised; the two rows of the line last
 
 
 def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
-    """Return the common error of the time tags, + where they are late, and its standard deviation, shape (T,) [s].
+    """Return the common time-tag error, positive for late tags, and its standard deviation, shape (T,) [s].
 
-    Satellites that are named as wrong are fitted too, since an error of the tags makes them look wrong. Where the error
-    shows, or a position is in doubt, the line takes part; the standard deviation is infinite unless redundant rows
-    agree, and the residuals cost clearly less than those without an error and without the named satellites: of both
-    the squares of all codes and of the line, each of `_AGREES` at most.
+    Satellites flagged as wrong are fitted too, since a time-tag error makes satellites appear wrong. Where the error is
+    significant, or a position is in doubt, the line is used as a constraint. The standard deviation is infinite unless
+    redundant rows agree and the cost is clearly lower than without a time-tag error and without the flagged satellites.
+    The cost is the sum of squares of all codes and of the line, each clipped at `_AGREES`.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)
@@ -76,12 +78,12 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
 
 
 def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) -> Masks:
-    """Return whether an error of the time tags explains clearly more than bad codes do, by both residuals; (T,)."""
+    """Return whether a time-tag error explains clearly more than bad codes do, from both sets of residuals; (T,)."""
     every = inputs.used | inputs.named
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
-    # without a redundant range the remaining ones fit in any case, and the named ones do not
+    # without a redundant range the remaining ranges fit in any case, and the flagged ranges do not
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # noise of this fit, at most that of the receiver, which would include an error of the tags
+    # noise of this fit, at most the receiver's noise, which would include a time-tag error
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
@@ -91,7 +93,9 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
 def _fit(
     inputs: MotionInputs, counted: Masks, late_s: Floats, place_ecef_m: Floats, *, tags: bool, line: bool
 ) -> _TagFit:
-    """Return positions by the codes that are `counted` (T, K), with an error of the `tags`, and near the `line`."""
+    """Return positions from the `counted` codes (T, K), with a time-tag error if `tags`, and near the line if
+    `line`.
+    """
     rows, late, place = np.arange(len(late_s)), late_s.copy(), place_ecef_m.copy()
     sigma, residual = np.full(len(rows), np.nan), np.full((len(rows), counted.shape[1] + 2), np.nan)
     for _ in range(_STEPS):
@@ -124,8 +128,7 @@ def _with_line(channels: Masks, line: bool) -> Masks:
 def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks) -> tuple[Floats, Floats, Floats]:
     """Return solutions, standard deviations of the fourth unknown, and residuals over their standard deviations.
 
-    Rows that are `counted` are fitted, with less weight where they fit badly; for the others only residuals are
-    computed.
+    The `counted` rows are fitted, with lower weight for large residuals; for other rows only residuals are computed.
     """
     now = full = np.where(counted, weight, 0.0)
     for _ in range(_ROUNDS):
@@ -137,7 +140,7 @@ def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks)
 
 
 def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
-    """Return the ranges with the satellites where they were `late_s` before, shape (T,)."""
+    """Return the ranges with satellite positions `late_s`, shape (T,), earlier."""
     place, velocity, before = inputs.sat_ecef_m, inputs.sat_velocity_mps, -late_s[:, None, None]
     gravity = -GM_GPS / np.linalg.norm(place, axis=2, keepdims=True) ** 3 + EARTH_ROTATION_RATE**2 * _ACROSS_AXIS
     coriolis = 2.0 * EARTH_ROTATION_RATE * np.stack([velocity[..., 1], -velocity[..., 0], 0.0 * velocity[..., 0]], 2)
@@ -149,10 +152,10 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 
 
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
-    """Return the median error of the time tags over the last epochs, also in standard deviations, and those to keep.
+    """Return the median time-tag error over the last epochs, also in standard deviations, and the errors to keep.
 
-    The standard deviation is the median of the epochs, or that of their spread where it is larger. NaN for fewer
-    than `_TAG_LEAST` epochs.
+    The standard deviation is the median over the epochs, or their spread where it is larger. NaN for fewer than
+    `_TAG_LEAST` epochs.
     """
     tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
     lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))

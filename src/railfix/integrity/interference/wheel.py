@@ -1,7 +1,8 @@
-"""Distance by satellites against that of a wheel: detects a pull along the track that no other test detects.
+"""Satellite distance against wheel distance: detects a slow pull along the track that no other test detects.
 
-Over a window the two differ by the noise of two positions and by the wheel's scale error, which is estimated before the
-window. A pull from the beginning, or as slow as the uncertainty of the diameter, is not detected.
+Over a window the two distances differ by the noise of two positions and by the wheel's scale-factor error, which is
+estimated before the window. A pull from the start of the run, or within the uncertainty of the diameter, is not
+detected.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Least standard deviation of a position: satellite and atmospheric errors that change over minutes [m].
+#: Minimum standard deviation of a position: satellite and atmospheric errors that change over minutes [m].
 _LEAST_M: Final = 1.0
-#: Speed up to which a tachometer without output counts as standing, or may creep [m/s].
+#: Speed up to which a wheel may creep while its tachometer has no output [m/s].
 _SLOW_MPS: Final = 0.5
 #: Positions are used at this interval; tags may precede the whole second by this time.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
@@ -28,13 +29,13 @@ class WheelSamples(RowArrays):
     """Positions and distances once a second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: By satellites.
+    #: Position along the line by satellites.
     arc_m: Floats = field(default_factory=lambda: np.empty(0))
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
-    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Distance of the wheel since its beginning.
-    #: Largest distance that it may have rolled below its least speed.
+    distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start.
+    #: Largest distance that the wheel may have rolled below its minimum speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Distance over which the wheel has turned without slip or a gap.
+    #: Distance rolled without slip or gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
@@ -42,10 +43,10 @@ class WheelSamples(RowArrays):
 class WheelState:
     """State after a chunk."""
 
-    #: The first sample of the present part, and those of the last window.
+    #: First sample of the current part, and the samples of the last window.
     samples: WheelSamples = field(default_factory=WheelSamples)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
-    #: Distance of the wheel there; the speed is NaN where unknown.
+    #: Wheel distance at the last epoch; the speed is NaN where unknown.
     distance_m: float = 0.0
     doubt_m: float = 0.0
     speed_mps: float = float("nan")
@@ -63,13 +64,14 @@ class WheelState:
 class WheelSigns:
     """Comparison of T epochs."""
 
-    #: Distance by satellites over the window less that of the wheel; NaN where not compared; shape (T,).
+    #: Satellite distance over the window less wheel distance; NaN where not compared; shape (T,).
     difference_m: Floats
-    #: Bound of the position error, for a pull that began within the window, even if shorter than `wheel_least_s`: the
-    #: difference, and `wheel_level_sigmas` of the position at the beginning and of the wheel's distance since; shape
-    #: (T,).
+    #: Bound of the position error for a pull that began within the window, even if it is shorter than `wheel_least_s`:
+    #: the difference plus `wheel_level_sigmas` times the sigma of the start position and of the wheel distance since
+    #: then; shape (T,).
     bound_m: Floats
-    parted: Masks  #: The difference exceeds noise and diameter error, or did so within the time of release; shape (T,).
+    #: True where the difference exceeds noise and diameter error, or did so within the release time; shape (T,).
+    parted: Masks
 
 
 def wheel_signs(
@@ -82,11 +84,11 @@ def wheel_signs(
     *,
     signed: bool,
 ) -> tuple[WheelSigns, WheelState]:
-    """Compare distances by satellites and wheel, shapes (T,), and return the state to pass on.
+    """Compare satellite and wheel distances, shapes (T,), and return the state for the next chunk.
 
-    `arc_m` and `sigma_m` are positions along the line, of single epochs or of the filter, NaN without one; `wheel_m` is
-    the distance that the wheel has rolled since the previous epoch, NaN where it is not known, `signed` whether it has
-    the sign of the motion along the line.
+    `arc_m` and `sigma_m` are positions along the line, single-epoch or filtered, NaN if missing; `wheel_m` is the wheel
+    distance since the previous epoch, NaN if unknown; `signed` tells whether it has the sign of the motion along the
+    line.
     """
     if not len(time):
         return WheelSigns(difference_m=np.empty(0), bound_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
@@ -117,7 +119,7 @@ def wheel_signs(
 def _wheel_distances(
     time: Datetimes, wheel_m: Floats, state: WheelState, limits: InterferenceLimits
 ) -> tuple[WheelSamples, WheelState]:
-    """Return the wheel's distance at epochs, and the state; after slips and unknown distances a part begins."""
+    """Return the wheel distance at epochs, and the state; a new part begins after a slip or an unknown distance."""
     span = seconds(np.diff(np.concatenate([[time[0] if np.isnat(state.time) else state.time], time])))
     known = np.isfinite(wheel_m) & (span > 0.0)
     speed = np.where(known, wheel_m / np.where(span > 0.0, span, 1.0), np.nan)
@@ -140,16 +142,18 @@ def _wheel_distances(
 def _compare(
     samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool
 ) -> tuple[Floats, Floats, Masks]:
-    """Return differences over the window that ends at each sample from `first` on, bounds, and which are too large."""
+    """Return the differences over the window ending at each sample from `first` on, their bounds, and the mask of
+    excessive ones.
+    """
     time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
     now = np.arange(first, len(time))
     begun = np.searchsorted(time, time[now] - limits.wheel_window_s - 0.5)
-    start = np.searchsorted(samples.part, samples.part[now])  # parts rise
+    start = np.searchsorted(samples.part, samples.part[now])  # part numbers rise
     begun = np.maximum(begun, start)
     long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-        """Distance by satellites less that of the wheel, the wheel's, and the variance without the second position."""
+        """Satellite less wheel distance, wheel distance, and the variance without the second position."""
         arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
             arc, distance = np.abs(arc), np.abs(distance)

@@ -1,14 +1,14 @@
 """ARAIM: multiple-hypothesis solution separation with an integrity support message, along the track and in 3-D.
 
-The algorithm of the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0): for each fault mode k the position
-without its satellites, with `S_k = (G' W_k G)^-1 G' W_k`, W of the integrity sigmas,
+The algorithm of the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0): for each fault mode k, the position
+without its satellites is used, with `S_k = (G' W_k G)^-1 G' W_k`, W of the integrity sigmas,
 
 - `sigma_k^2 = [(G' W_k G)^-1]_qq`, bias `b_k = sum_i |S_k,qi| b_i`,
 - threshold `T_k = K_fa sqrt(sum_i (S_k,qi - S_0,qi)^2 sigma_acc,i^2)` with the accuracy sigmas,
 - level L: `2 Q((L - b_0) / sigma_0) + sum_k p_k Q((L - T_k - b_k) / sigma_k) = PHMI_q (1 - P_unmonitored / PHMI)`.
 
-A map is one more constraint (Wenz 2024): two observations, of the offsets across and up, with the sigmas of the map,
-that a wrong map makes faulty together; the position along the track is then the component of interest.
+A map is a further constraint (Wenz 2024): two observations of the offsets across and up, with the sigmas of the map,
+which are faulty together if the map is wrong. The component of interest is then the position along the track.
 """
 
 from __future__ import annotations
@@ -31,16 +31,18 @@ from railfix.core.settings_files import read_toml
 from railfix.core.staged_files import FilePath
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
-#: Halvings of the interval of a level: 1e4 m to less than a tenth of a micrometre.
+#: Number of bisections of the level's interval, from 1e4 m to less than a tenth of a micrometre.
 _HALVINGS: Final = 48
 _LONGEST_M: Final = 1e4
 _BLOCK_SIZE: Final = 4_000_000  #: Number of elements of the largest array of a block of epochs.
-#: Determinants below this fraction of the product of the diagonal are those of singular matrices.
+#: A matrix is singular if its determinant is below this fraction of the product of its diagonal.
 _SINGULAR: Final = 1e-12
 
 
 class AraimBudget(Settings):
-    """Allocation of integrity and continuity risk; defaults of ADD 3.0 for LPV-200, along the track of its vertical."""
+    """Allocation of integrity and continuity risk; defaults of ADD 3.0 for LPV-200, with its vertical budget along the
+    track.
+    """
 
     #: Probability of hazardously misleading information in an approach or a sample.
     phmi_along: float = Field(default=9.8e-8, gt=0, lt=1)
@@ -50,25 +52,25 @@ class AraimBudget(Settings):
     false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
-    #: Probability up to which fault modes may be left out; more satellites at a time become modes until it is kept.
+    #: Probability up to which fault modes may be omitted; modes of more satellites are added until it is met.
     unmonitored: float = Field(default=8e-8, gt=0, lt=1)
-    most_faults: int = Field(default=2, ge=1, le=3)  #: Faulty at a time, at most, in a mode.
-    map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Probability that the map is wrong; 0: no such mode.
+    most_faults: int = Field(default=2, ge=1, le=3)  #: Largest number of simultaneous faults in a mode.
+    map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Probability that the map is wrong; 0 for no such mode.
 
 
 @dataclass(frozen=True, kw_only=True)
 class AraimGeometry:
     """Observations of T epochs, N of them: ranges, and with a map its two constraints."""
 
-    #: Change of each observation with the P unknowns, position first, then a clock a constellation; shape (T, N, P).
-    #: Any value where not used.
+    #: Partial derivatives of each observation by the P unknowns: position, then one clock per constellation; shape (T,
+    #: N, P). Any value where not used.
     design: Floats
     #: Standard deviations for integrity and accuracy; NaN where not used; shape (T, N).
     sigma_int_m: Floats
     sigma_acc_m: Floats
     bias_m: Floats  #: Shape (T, N).
-    prior: Floats  #: Prior of a fault of the observation alone; 0: none; shape (N,).
-    together: Masks  #: Observations that one fault makes faulty together: of constellations, of the map; shape (C, N).
+    prior: Floats  #: Prior probability of a fault of the observation alone; shape (N,).
+    together: Masks  #: Observations that are faulty together, by constellation or by the map; shape (C, N).
     together_prior: Floats  #: Shape (C,).
 
     @property
@@ -81,12 +83,12 @@ class AraimGeometry:
 class AraimLevels:
     """Levels of T epochs, for Q components of the position."""
 
-    #: NaN without a position, infinite where unchecked faults are likelier than the risk; shape (T, Q).
+    #: Levels, NaN without a position, infinite where unchecked faults are likelier than the risk; shape (T, Q).
     level_m: Floats
     #: Variance of the position with all observations, shape (T, Q).
     sigma_int_m: Floats
     sigma_acc_m: Floats
-    modes: Integers  #: Fault modes, shape (T,).
+    modes: Integers  #: Number of fault modes, shape (T,).
     unmonitored: Floats  #: Probability of faults that are not modes, or leave no position; shape (T,).
 
 
@@ -94,8 +96,8 @@ class AraimLevels:
 class AraimResult(NotebookTable):
     """ARAIM of T epochs; NaN without a position."""
 
-    along: AraimLevels  #: Along the track, with the map as a constraint.
-    space: AraimLevels  #: East, north and up, without the map.
+    along: AraimLevels  #: Level along the track, with the map as a constraint.
+    space: AraimLevels  #: Levels east, north and up, without the map.
 
     @property
     def horizontal_m(self) -> Floats:
@@ -106,9 +108,9 @@ class AraimResult(NotebookTable):
 def araim_levels(
     geometry: AraimGeometry, phmi: Sequence[float], false_alarm: Sequence[float], budget: AraimBudget
 ) -> AraimLevels:
-    """Return the levels of the first Q unknowns; `phmi` and `false_alarm` are of each component."""
+    """Return the levels of the first Q unknowns; `phmi` and `false_alarm` apply to each component."""
     epochs, count = geometry.sigma_int_m.shape
-    events = np.concatenate([np.eye(count, dtype=bool), geometry.together])  # alone, then faulty together; (E, N)
+    events = np.concatenate([np.eye(count, dtype=bool), geometry.together])  # single faults, then common faults; (E, N)
     sets = [list(s) for size in range(1, budget.most_faults + 1) for s in combinations(range(len(events)), size)]
     masks = np.array([events[s].any(axis=0) for s in sets], dtype=bool).reshape(len(sets), count)
     size = np.array([len(s) for s in sets])
@@ -139,7 +141,7 @@ def _block(
     probability = np.where(size[None, :] <= order[:, None], probability, 0.0)
     out = np.concatenate([np.zeros((1, masks.shape[1]), dtype=bool), masks])
     kept = used[:, None, :] & ~out
-    # modes that remove nothing, or only what a smaller one removes, are those of their faults
+    # modes that remove no further observation are merged with the smaller mode
     weight = np.where(kept, 1.0 / np.where(used, geometry.sigma_int_m[rows], 1.0)[:, None] ** 2, 0.0)
     gain, sigma = _gains(design, weight, components)
     acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]
@@ -175,7 +177,7 @@ def _event_priors(geometry: AraimGeometry, used: Masks) -> Floats:
 
 
 def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
-    """Return how many events at a time are modes (T,), and a bound of the probability of more."""
+    """Return the number of simultaneous events in the modes (T,), and a bound of the probability of more events."""
     more = set_sums(prior, budget.most_faults + 1)[:, 2:]
     enough = more <= budget.unmonitored
     order = np.where(enough.any(axis=1), np.argmax(enough, axis=1) + 1, budget.most_faults)
@@ -200,7 +202,7 @@ def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Flo
 
 
 def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Floats:
-    """Return the levels (T, Q) at which the tails (T, F, Q) use up the risk, from above, by halving."""
+    """Return the levels (T, Q) at which the tails (T, F, Q) use the risk, from above, by bisection."""
     low, high = np.zeros(risk.shape), np.full(risk.shape, _LONGEST_M)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -217,24 +219,24 @@ Satellite = Annotated[str, Field(pattern=r"^[GJECR][0-9]{2}$")]
 
 
 class SatelliteSupport(Settings):
-    """Statement on a satellite."""
+    """Integrity support of a satellite."""
 
-    #: Standard deviation of the error of orbit and clock in the range: for integrity, and for accuracy and continuity.
+    #: Standard deviation of the orbit and clock error in the range: for integrity, and for accuracy and continuity.
     sigma_ura_m: float = Field(gt=0)
     sigma_ure_m: float = Field(gt=0)
     bias_m: float = Field(ge=0)  #: Largest nominal bias of the range (b_nom).
-    prior: float = Field(ge=0, lt=1)  #: Probability that the satellite is faulty at a time (P_sat).
+    prior: float = Field(ge=0, lt=1)  #: Probability that the satellite is faulty at a given time (P_sat).
 
 
 class ConstellationSupport(SatelliteSupport):
-    """Statement on the satellites of a constellation."""
+    """Integrity support of a constellation's satellites."""
 
-    #: Probability that a fault common to the constellation is there at a time (P_const).
+    #: Probability of a fault common to the constellation at a given time (P_const).
     constellation_prior: float = Field(ge=0, lt=1)
 
 
 class SupportArrays(NamedTuple):
-    """Statements by channel, shape (M,); `constellation_prior` by letter."""
+    """Integrity support by channel, shape (M,); `constellation_prior` by letter."""
 
     sigma_ura_m: Floats
     sigma_ure_m: Floats
@@ -247,12 +249,12 @@ class IntegritySupport(Settings):
     """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
 
     format: Literal["railfix integrity support 1"]
-    #: Period in which the message is valid [GPS time]; None: not stated. Epochs outside have no ARAIM level.
+    #: Validity period of the message [GPS time]; None if not stated. Epochs outside have no ARAIM level.
     valid_from: datetime | None = None
     valid_until: datetime | None = None
-    #: By letter; a constellation without a statement is not used in the levels.
+    #: Support by constellation letter; a constellation without support is not used in the levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
-    #: Satellites with separate statements.
+    #: Satellites with their own support.
     satellite: dict[Satellite, SatelliteSupport] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -272,9 +274,9 @@ class IntegritySupport(Settings):
         return ~((time < first) | (time > last))
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return a sentence where the message states no end, or is invalid at some epochs."""
+        """Return a note if the message states no end of validity, or is invalid at some epochs."""
         if self.valid_until is None:
-            return ("integrity support message: it states no valid_until; whether it has expired is not known",)
+            return ("integrity support message: without valid_until it is not known whether it has expired",)
         if self.holds(time).all():
             return ()
         first = "" if self.valid_from is None else f"from {self.valid_from} "
@@ -284,7 +286,7 @@ class IntegritySupport(Settings):
         )
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
-        """Return the statements on satellites; NaN for constellations without one."""
+        """Return the support of each channel; NaN for constellations without support."""
         of_each = [self.satellite.get(name) or self.constellation.get(name[0]) for name in satellites]
         ura, ure, bias, prior = (
             np.array([np.nan if each is None else getattr(each, name) for each in of_each], dtype=np.float64)

@@ -21,7 +21,8 @@ from railfix.integrity.raim import LinearModel
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
 
-_FURTHEST_M: Final = 5000.0  #: Largest distance searched [m]: the linear model of a range is off by 0.7 m there.
+#: Largest distance searched [m], at which the linear model of a range has an error of 0.7 m.
+_FURTHEST_M: Final = 5000.0
 _NEGLIGIBLE: Final = 0.01  #: Fraction of the risk of a sample below which no search is made.
 
 
@@ -32,17 +33,17 @@ class Forms(NamedTuple):
     equal in all horizontal directions: another position has another tangent.
     """
 
-    prior: Floats  # (T, K), 0 for what is no hypothesis
+    prior: Floats  # (T, K), 0 for unused entries
     form: Floats  # (T, K, 10): constant, slope [1/m], upper triangle of the matrix [1/m^2]
-    lowest_m: Floats  # (T, K) distance of the place at which each is lowest; NaN where singular
-    depth: Floats  # (T, K) by how much it is lower there
+    lowest_m: Floats  # (T, K) distance to the minimum of each form; NaN where singular
+    depth: Floats  # (T, K) depth of the minimum
     widest_m2: Floats  # (T, K) trace of the inverse of the matrix, which is above its largest eigenvalue
 
     def radius_m(self, risk: float) -> Floats:
         """Return the distance within which the possible positions of each hypothesis lie, shape (T, K); 0 without a
         prior.
 
-        Beyond them all have 1 % of the risk, the same for each.
+        Positions beyond this distance have 1 % of the risk in total, equally for each hypothesis.
         """
         possible = self.prior > 0
         each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(possible, axis=1, keepdims=True), 1)
@@ -119,10 +120,10 @@ def _around(
     first : ndarray of int, shape (T + 1,)
         First section of each epoch, then their number P.
     start_m, tangent : ndarray, shape (P, 3)
-        Along, across and up from the position.
+        Offsets along, across and up from the position.
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance of what lies beyond the level where the tangent does not lead to; others infinite.
+        Distance of sections beyond the level and off the tangent; infinite for other sections.
     """
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)

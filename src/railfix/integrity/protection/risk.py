@@ -29,16 +29,17 @@ from railfix.integrity.raim import LinearModel
 
 #: Probability that a satellite is faulty at a time: 1e-5 per hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
 #: Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the Galileo service definition after it); the
-#: others as Galileo, as no commitment of theirs is as old.
+#: other constellations are treated as Galileo, because their commitments are more recent.
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
-MOST_EXCLUDED: Final = 2  #: Exclusions after which a level is still given (P1 2.3(4) excludes up to two satellites).
-MOST_TOGETHER: Final = 4  #: Faulty satellites at a time that can be hypotheses of a level.
+MOST_EXCLUDED: Final = 2  #: Largest number of exclusions with a level (P1 2.3(4) excludes up to two satellites).
+MOST_TOGETHER: Final = 4  #: Largest number of simultaneously faulty satellites in a hypothesis.
 
 
 def k_factor(risk: float) -> float:
-    """Return sigmas that an error in one dimension exceeds, on either side, with this probability per sample.
+    """Return the two-sided normal quantile: the sigmas that a one-dimensional error exceeds with this probability per
+    sample.
 
     Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a horizontal position.
     """
@@ -48,11 +49,11 @@ def k_factor(risk: float) -> float:
 
 
 def one_sided_k(probability: Floats) -> Floats:
-    """Return sigmas that noise exceeds on one side with this probability; -inf from 1 on, inf at 0 and below."""
+    """Return the one-sided normal quantile of this probability; -inf from 1 on, inf at 0 and below."""
     return np.asarray(-scipy.special.ndtri(np.clip(probability, 0.0, 1.0)))
 
 
-Probability = Annotated[float, Field(ge=0, lt=1)]  #: A probability below 1.
+Probability = Annotated[float, Field(ge=0, lt=1)]  #: Probability below 1.
 
 
 class RiskBudget(Settings):
@@ -62,41 +63,42 @@ class RiskBudget(Settings):
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     #: Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s: multipath of a
     #: moving train changes within seconds, that of a standing one within tens of seconds, SBAS corrections within
-    #: minutes (DO-229D appendix J counts 10 samples per hour). More samples are the safe side; from 10 to 3600 the
+    #: minutes (DO-229D appendix J counts 10 samples per hour). A larger number is conservative; from 10 to 3600 the
     #: fault-free K grows by 0.9.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
-    #: Fractions of the risk of an epoch; together at most 1. They determine the three parts, from the largest of which
-    #: the level is lowered until all tails together use their sum; twice the fraction lowers a K of 6 by 0.1, one of 3
-    #: by 0.2: thirds.
+    #: Fractions of the risk of an epoch, with a sum of at most 1. They determine the three parts of the level, from the
+    #: largest of which the level is lowered until the sum of all tails equals the sum of the fractions. Doubling a
+    #: fraction lowers a K of 6 by only 0.1, and a K of 3 by 0.2, so the default is thirds.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Fraction of the risk for faults that are not hypotheses: where they are likelier, further ones become hypotheses,
+    #: Fraction of the risk for faults that are not hypotheses. If these are likelier, further faults become hypotheses,
     #: up to four satellites at a time and three shared faults (constellation, side, map).
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite, and the same again for two.
+    #: Fraction of the risk for epochs with one excluded satellite, and the same fraction for two.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability that a satellite is faulty, by constellation: its own signal.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
-    #: Additional probability of a local fault: multipath, interference. An assumption until measured on the
-    #: line (P1 7).
+    #: Additional probability of a local fault (multipath, interference): an assumption until measured on the line (P1
+    #: 7).
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
     #: Probability that the map is wrong by more than its stated error: the next track, heights without the geoid,
-    #: another reference frame. An assumption; 0: no such hypothesis.
+    #: another reference frame. This is an assumption; 0 for no such hypothesis.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)
     #: Probability that low satellites of one side of the track are faulty together: `SUPPORTED_SIDE_PRIOR`. No data
-    #: supports a smaller one, which every output of the levels then states; 0: no such hypothesis.
+    #: supports a smaller value, and every output of the levels says so if a smaller one is set; 0 for no such
+    #: hypothesis.
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
-    #: Elevation up to which satellites count as low: of a wall as high as it is away.
+    #: Elevation up to which satellites count as low: the top of a wall whose height equals its distance.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
     #: Satellites that are faulty together: the low ones left of the track, or right of it ("beside"); also all
-    #: satellites ahead, or behind, as in the filter ("all"). One epoch without them knows the position along the track
-    #: badly: the levels become up to three times as large.
+    #: satellites ahead, or behind, as in the filter ("all"). A single epoch without these satellites has a weak
+    #: geometry along the track, so that the levels become up to three times as large.
     late_sides: Literal["beside", "all"] = "beside"
-    #: Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are called
-    #: indicative in every output: no hourly risk is claimed. "measured" needs `local_prior` and `side_prior` to be
+    #: Whether the priors were measured on this line (``railfix error-model``). Levels with assumed priors are called
+    #: indicative in every output, and no hourly risk is claimed. "measured" needs `local_prior` and `side_prior` to be
     #: given.
     priors: Literal["assumed", "measured"] = "assumed"
     #: Probability of a fault that many satellites of a constellation share; an unnamed constellation has none, and the
@@ -131,7 +133,7 @@ class RiskBudget(Settings):
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
-        """Return the fault probability of each channel, shape (M,): of the satellite and of the antenna's surroundings.
+        """Return the fault probability of each channel, shape (M,), for the satellite and the antenna's surroundings.
 
         ValueError: a constellation has no prior.
         """
@@ -177,13 +179,13 @@ def set_sums(prior: Floats, most: int) -> Floats:
 
 #: Largest number of simultaneous shared faults in a hypothesis; the probability of more is subtracted from the risk.
 _MOST_SHARED: Final = 3
-FEW: Final = 2  #: Epochs of two antennas, live: their allocation is kept.
-REMEMBERED: Final = 512  #: Such allocations: satellites come and go behind obstacles.
-_MOST_SETS: Final = 46_376  #: Largest number of sets of a class that are left out one by one: four of 34 satellites.
+FEW: Final = 2  #: Epochs per chunk (two antennas, live) up to which the allocation is cached.
+REMEMBERED: Final = 512  #: Number of cached allocations, as satellites come and go behind obstacles.
+_MOST_SETS: Final = 46_376  #: Largest number of sets in a class that are left out individually: four of 34 satellites.
 
 
 class Shared(NamedTuple):
-    """Shared faults at a time."""
+    """Simultaneous shared faults."""
 
     events: tuple[int, ...]  # constellations, then sets that fail together
     wrong_map: bool
@@ -197,20 +199,20 @@ class Shared(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """Allocation of the risk, T epochs; equal to itself alone."""
+    """Allocation of the risk of T epochs; compared by identity."""
 
     prior: Floats  # (T, M), 0 where not used
     groups: tuple[str, ...]  # letters of the C constellations with a prior of their own
     shared: tuple[Shared, ...]  # B sets of shared faults, of which the first is empty
     members: Masks  # (T, B, M) satellites of these
     shared_prior: Floats  # (T, B) of these, 0 where absent
-    order: Indices  # (T, B) satellites at most that are left out with each; -1: not a hypothesis
+    order: Indices  # (T, B) largest number of satellites left out with each; -1 if not a hypothesis
     beyond: Floats  # probability of the classes that are no hypotheses
     fault_free: Floats  # risk of each part
     one: Floats
     two: Floats
     more: Floats  # 0 where three faults are no hypotheses
-    reserved: Floats  # of pairs of satellites where they fit into their share unchecked
+    reserved: Floats  # probability of satellite pairs where they fit into their allocation unchecked
     k_false_alarm: Floats
 
 
@@ -225,10 +227,10 @@ def allocate(
     """
     used = model.used
     sides = sides & used[:, None]
-    if len(used) <= FEW:  # live, where the same satellites are used epoch after epoch
+    if len(used) <= FEW:  # live operation uses the same satellites epoch after epoch
         given = (used.tobytes(), out.tobytes(), sides.tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
-    # Most epochs of a chunk have the satellites of others: each set is computed once.
+    # Most epochs of a chunk share their satellites with others: each set is computed once.
     bits = np.packbits(np.concatenate([used, sides.reshape(len(used), -1)], axis=1), axis=1)
     keys = np.concatenate([bits, np.ascontiguousarray(out)[:, None].view(np.uint8)], axis=1)
     _, first, which = np.unique(keys.view(f"V{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
@@ -238,7 +240,7 @@ def allocate(
 
 
 class _Same:
-    """A budget that is equal to itself alone: its contents are not hashed."""
+    """Budget that is compared by identity, so that its contents are not hashed."""
 
     def __init__(self, risk: RiskBudget) -> None:
         self.risk = risk
@@ -254,7 +256,7 @@ class _Same:
 def _of_few_epochs(
     risk: _Same, systems: tuple[str, ...], used: bytes, out: bytes, sides: bytes, count: int, wrong_map: bool
 ) -> Allocation:
-    """Return the allocation of few epochs, kept: nobody writes into it."""
+    """Return the cached allocation of few epochs, which must not be changed."""
     channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
     return _allocate(
         np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(), systems, risk.risk, excluded,
@@ -293,7 +295,7 @@ def _allocate(
     )
     beyond = classes.rest(order)
     left = risk.sample_risk(n, out, beyond)
-    # With hypotheses of three faults every part gives up a quarter to them.
+    # Hypotheses of three faults take a quarter of every part.
     more = (order + [s.kind for s in shared] >= 3).any(axis=1, where=order >= 0)
     left = np.where(more, 0.75, 1.0) * left
     parts = [s * left for s in (risk.fault_free_share, risk.one_fault_share, risk.two_fault_share)]
@@ -316,7 +318,9 @@ def _allocate(
 
 @lru_cache(maxsize=64)
 def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool) -> tuple[tuple[Shared, ...], Masks]:
-    """Return the B sets of up to three shared faults, smaller first, and which of them have one fault less (B, B)."""
+    """Return the B sets of up to three shared faults, smaller sets first, and the mask of sets with one fault less (B,
+    B).
+    """
     sets = []
     for size in range(_MOST_SHARED + 1):
         for some in combinations([*events, -1] if wrong_map else events, size):
@@ -337,7 +341,7 @@ class _Classes:
     within: Masks  # (B, B) sets of one fault less
     sums: Floats  # (T, MOST_TOGETHER + 2) over sets of satellites of 0, 1, 2, ...
     further: Floats  # (T,) probability of more shared faults than may be hypotheses
-    least: Sequence[int]  # length B, satellites left out with each whatever the probability; -1: no hypothesis
+    least: Sequence[int]  # length B, satellites always left out with each; -1 if not a hypothesis
 
     def _take(self, rows: Indices) -> _Classes:
         return replace(self, each=self.each[rows], sums=self.sums[rows], further=self.further[rows])
@@ -350,10 +354,10 @@ class _Classes:
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Return the largest number of satellites left out with each set of shared faults, shape (T, B).
+        """Choose the largest number of satellites left out with each set of shared faults, shape (T, B).
 
-        `share` may stay unchecked; `likely` are the priors of the shared faults, length B, `satellite` that of a
-        satellite.
+        The probability `share` may stay unchecked; `likely`, length B, are the priors of the shared faults, `satellite`
+        is the prior of a satellite.
         """
         sizes = np.arange(MOST_TOGETHER + 1)
         feasible = scipy.special.comb(used[:, None], sizes) <= _MOST_SETS

@@ -1,12 +1,13 @@
 """Protection level along the track with fault hypotheses: solution separation over sets of faults.
 
-While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no part.
-The level L is reached where the tails of all hypotheses use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
+While ``|x_J - x| <= T_J``, the position x is within T_J of the position x_J, which a fault of the subset J does not
+affect. The level L is reached where the tails of all hypotheses use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
-Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. It is found from above: from the largest of
-``K_ff sigma_0 + b_0`` without fault and, for one fault and for two and more, the largest ``T_J + K sigma_J + b_J``.
+The thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. The level is found from above: from the
+largest of ``K_ff sigma_0 + b_0`` without fault and, for one fault and for two and more, the largest ``T_J + K sigma_J +
+b_J``.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Al
 from railfix.integrity.raim import LinearModel
 
 _BLOCK_SIZE: Final = 200_000  #: Number of elements of a pair array of a block of epochs.
-_OF_MORE: Final = 3  #: Number of the tails of three faults and more among those of all kinds.
+_OF_MORE: Final = 3  #: Index of the tails of three and more faults among all kinds.
 _SAME: Final = 1e-9  #: Separation, over the sigma of the position, below which the two positions are the same.
 
 
 class Cause(IntEnum):
     """Hypothesis that uses most of the risk of an epoch at its level, or the reason for a missing level."""
 
-    #: The noise of the position without a fault.
+    #: Fault-free noise of the position.
     FAULT_FREE = 0
     #: A fault of one satellite, of a constellation, of a side of the track (or of both), or of the map.
     ONE_FAULT = 1
-    #: Two of these at a time.
+    #: Two simultaneous faults of these.
     TWO_FAULTS = 2
     #: Infinite: undetectable satellite faults are likelier than their part of the risk.
     UNCHECKED = 3
@@ -48,17 +49,17 @@ class Cause(IntEnum):
     BUDGET = 4
     #: No position.
     NO_POSITION = 5
-    #: Three of these at a time, or more.
+    #: Three or more simultaneous faults of these.
     THREE_FAULTS = 6
     #: Infinite: local faults cannot be bounded on this part of the line.
     UNBOUNDED = 7
-    #: As `UNCHECKED`, mostly faults of a constellation, alone or with satellites.
+    #: Infinite as `UNCHECKED`, mostly by faults of a constellation, alone or with satellites.
     UNCHECKED_CONSTELLATION = 8
-    #: As `UNCHECKED`, of a side of the track or of both.
+    #: Infinite as `UNCHECKED`, by faults of one or both sides of the track.
     UNCHECKED_SIDE = 9
-    #: As `UNCHECKED`, of the map.
+    #: Infinite as `UNCHECKED`, by faults of the map.
     UNCHECKED_MAP = 10
-    #: As `UNCHECKED`, of several of these three together.
+    #: Infinite as `UNCHECKED`, by several of these three together.
     UNCHECKED_TOGETHER = 11
 
 
@@ -66,26 +67,27 @@ class Cause(IntEnum):
 class ProtectionLevel(NotebookTable):
     """Levels along the track of T epochs; NaN without a position."""
 
-    #: Level at which all tails together stay within the risk; at most the largest of the three parts, whose allocations
-    #: of the risk need not be used up. Infinite for the reason in `cause`; shape (T,).
+    #: Level at which the sum of all tails is within the risk; at most the largest of the three parts, whose risk
+    #: allocations need not be fully used. Infinite for the reason in `cause`; shape (T,).
     level_m: Floats
     #: Parts of the level. 0 where the part's hypotheses fit into its allocation of the risk unchecked; shape (T,).
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
     sigma_m: Floats  #: Standard deviation of the position along the track, without a fault; shape (T,).
-    #: Sigmas of each part; -inf where it is not required; shape (T,).
+    #: Factors K of each part; -inf where not required; shape (T,).
     k_fault_free: Floats
     k_one_fault: Floats
     k_two_faults: Floats
-    k_false_alarm: Floats  #: Sigmas of the thresholds, shape (T,).
-    separation: Floats  #: The largest ``|x_J - x|/T_J``; 0 where nothing can be left out; shape (T,).
-    #: It is at most 1. Otherwise the level is invalid. False without a position; shape (T,).
+    k_false_alarm: Floats  #: Factor K of the thresholds, shape (T,).
+    separation: Floats  #: Largest ``|x_J - x|/T_J``; 0 where no satellite can be left out; shape (T,).
+    #: True where the separation is at most 1. Otherwise the level is invalid. False without a position; shape (T,).
     consistent: Masks
-    #: Channel that sets `one_fault_m`; -1 where none does (`worst_constellation`, a side, the map); shape (T,).
+    #: Channel that determines `one_fault_m`; -1 if it is not a channel (`worst_constellation`, a side, the map); shape
+    #: (T,).
     worst_one: Indices
-    worst_two: Indices  #: Channels that set `two_fault_m`; -1 where none do; shape (T, 2).
-    #: Letter of the constellation that sets `one_fault_m`; empty where none does; shape (T,).
+    worst_two: Indices  #: Channels that determine `two_fault_m`; -1 for none; shape (T, 2).
+    #: Letter of the constellation that determines `one_fault_m`; empty for none; shape (T,).
     worst_constellation: Strings
     unchecked_risk: Floats  #: Probability of the faults that are not hypotheses, subtracted from the risk; shape (T,).
     cause: Codes  #: `Cause`, shape (T,).
@@ -99,11 +101,11 @@ class RangeBounds(NamedTuple):
 
 
 class MapDeviation(NamedTuple):
-    """Information on the map's error across and up besides its sigmas."""
+    """Information on the map error across and up in addition to its sigmas."""
 
-    bias_m: ArrayLike = 0.0  #: Offset that is not within its sigma, shape (T, 2) or (2,).
-    #: Position of the antenna without the map, and its inverse covariance (0: unknown). With it a wrong map is a
-    #: hypothesis of prior `RiskBudget.map_prior`; shapes (T, 2) [m] [1/m^2].
+    bias_m: ArrayLike = 0.0  #: Offset not covered by the sigma, shape (T, 2) or (2,).
+    #: Antenna position without the map, and its inverse covariance (0 if unknown). If given, a wrong map is a
+    #: hypothesis with the prior `RiskBudget.map_prior`; shapes (T, 2) [m] [1/m^2].
     seen: tuple[Floats, Floats] | None = None
 
 
@@ -129,25 +131,25 @@ def protection_level(
     scale : array_like, shape (T,) or ()
         Noise scale: multiplies the sigmas of the ranges, not the map error.
     overbound : RangeBounds, optional
-        By default the sigma of each range is that of its weight times the scale, without bias.
+        By default the sigma of each range follows from its weight and the scale, without bias.
     sides : ndarray of bool, shape (T, S, M), optional
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or (), or ndarray of bool, shape (T, M)
-        Satellites that fault detection left out at this epoch (not: what the screens rejected before), as their number
+        Satellites excluded by fault detection at this epoch (without those that the screens rejected), as their number
         or as `RaimResult.excluded`.
 
     Raises
     ------
     ValueError
-        A noise scale that is not positive, systems that do not name each channel, or a satellite in the model that was
-        excluded: the positions are to be found again without it, as `exclude_faults` does.
+        The noise scale is not positive, `systems` does not name each channel, or the model contains an excluded
+        satellite: solve again without it, as `exclude_faults` does.
     """
     if model.interest != 1:
         raise ValueError("a level along the track needs a model on the line (linear_model)")
     risk, overbound, map_error = risk or RiskBudget(), overbound or RangeBounds(), map_error or MapDeviation()
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:
-        raise ValueError(f"systems names each channel: {channels} channels, got {len(systems)}")
+        raise ValueError(f"systems must name each channel: {channels} channels, got {len(systems)}")
     scale = _broadcast(np.asarray(scale, dtype=np.float64), (epochs,))
     if (scale <= 0).any():
         raise ValueError("the noise scale must be positive")
@@ -203,7 +205,7 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
-    """Return the epochs grouped by numbers of hypotheses: no block is wider than necessary."""
+    """Group the epochs by number of hypotheses, so that no block is wider than necessary."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
     used = model.used[rows].sum(axis=1)
@@ -217,7 +219,7 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
 
 
 class Errors(NamedTuple):
-    """Errors of ranges and map that `protection_level` is given; of shape (T, 0) for none."""
+    """Range and map errors given to `protection_level`; shape (T, 0) for none."""
 
     scale: Floats
     least_sigma_m: Floats
@@ -228,7 +230,7 @@ class Errors(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """Hypotheses of a block of epochs: fields of `Allocation`, and their offsets in the arrays of all."""
+    """Hypotheses of a block of epochs: fields of `Allocation`, and their offsets in the arrays of all hypotheses."""
 
     prior: Floats  # (T, M)
     members: Masks  # (T, B, M) satellites of each set of shared faults
@@ -236,8 +238,8 @@ class Asked(NamedTuple):
     shared_prior: Floats  # (T, B)
     order: Indices  # (T, B)
     k_false_alarm: Floats  # (T,)
-    first: Indices  # (B, MOST_TOGETHER + 1) place of the first hypothesis with so many satellites; -1: none
-    bounds: Indices  # (5,) first place of no fault, one fault, two, more; their number
+    first: Indices  # (B, MOST_TOGETHER + 1) index of the first hypothesis with this many satellites; -1 for none
+    bounds: Indices  # (5,) first index of no fault, one fault, two, more; total number
 
 
 class _Names(NamedTuple):
@@ -246,14 +248,14 @@ class _Names(NamedTuple):
     asked: Asked
     share: Floats  # (T, 4)
     letters: Strings  # after the channels: constellations, then the sides, a wrong map, and none
-    pairs: Indices  # (K, 2), the last of none
+    pairs: Indices  # (K, 2), the last entry for none
 
 
 def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: Errors) -> dict[str, NDArray[Any]]:
     """Return the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(model.used.sum(axis=1).max())
-    # a plan of few epochs is cached, with the data derived from it
+    # the allocation of few epochs is cached, with the data derived from it
     every = len(rows) == len(plan.beyond) <= FEW
     asked, share, letters, pairs = _names_of_few(plan, n) if every else _names(plan, rows, n)
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(model.arrays, of_block, asked)
@@ -286,7 +288,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
 
 
 def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: int) -> Codes:
-    """Return the cause (T,): the shared faults that have most of the probability (T, K) that nothing checks."""
+    """Return the cause (T,): the shared faults with most of the unchecked probability (T, K)."""
     spent, causes = [], []
     for shared, first in zip(plan.shared, asked.first.tolist(), strict=True):
         classes = [open_to_faults[:, at : at + math.comb(n, k)].sum(axis=1) for k, at in enumerate(first) if at >= 0]
@@ -303,7 +305,7 @@ def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: i
 
 @lru_cache(maxsize=256)
 def _places(kinds: tuple[int, ...], most: tuple[int, ...], n: int) -> tuple[Indices, Indices]:
-    """Return `Asked.first` and `Asked.bounds` of sets of shared faults with at most this many of n satellites."""
+    """Return `Asked.first` and `Asked.bounds` for sets of shared faults with at most this many of n satellites."""
     bounds, place = [], 0
     first = np.full((len(kinds), MOST_TOGETHER + 1), -1, dtype=np.intp)
     for kind in range(_OF_MORE + 1):
@@ -321,7 +323,7 @@ def _names_of_few(plan: Allocation, n: int) -> _Names:
 
 
 def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
-    """Return the hypotheses of some epochs, of n channels in use at most: none, then one fault, two, more."""
+    """Return the hypotheses of epochs with at most n used channels: no fault, one fault, two, more."""
     order = plan.order[rows]
     kinds = tuple(shared.kind for shared in plan.shared)
     first, bounds = _places(kinds, tuple(order.max(axis=0).tolist()), n)
@@ -337,7 +339,7 @@ def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:
-    """Return channels at adjacent positions, shape (T, k); -1 for -1."""
+    """Return the channels at compact indices, shape (T, k); -1 for -1."""
     return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 
@@ -354,7 +356,7 @@ class LevelStatus(IntEnum):
     AVAILABLE = 0
     #: The level is above the alarm limit or infinite, or the position is missing.
     UNAVAILABLE = 1
-    #: The ranges contradict each other: the level is invalid.
+    #: The ranges are inconsistent, so that the level is invalid.
     ALARM = 2
 
 

@@ -1,9 +1,9 @@
-"""Reliability: size of undetected faults, and their effect on the position.
+"""Reliability: size of undetectable faults, and their effect on the position.
 
-With noncentrality lambda the test misses a fault with the stated probability (P4). In the range of satellite i that is
-``sigma_i sqrt(lambda / r_ii)``, because only the fraction r_ii of its square enters the statistic. ``slope_i`` is the
-change of the position per unit of the statistic's root; the level is the largest slope times ``sigma0 sqrt(lambda)``
-(P4), and K sigma for the noise of the position.
+With noncentrality lambda the test misses a fault with the stated probability (P4). For the range of satellite i this is
+a bias of ``sigma_i sqrt(lambda / r_ii)``, because only the fraction r_ii of its square enters the statistic.
+``slope_i`` is the change of the position per unit of the statistic's root; the level is the largest slope times
+``sigma0 sqrt(lambda)`` (P4), and K sigma for the noise of the position.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.position_model import LinearModel, compact
 
-_NO_EFFECT: Final = 1e-6  #: Effect on the position, in its own sigmas, below which a satellite has none.
+#: Smallest effect of a satellite on the position, in position sigmas; a smaller effect counts as zero.
+_NO_EFFECT: Final = 1e-6
 _BLOCK_SIZE: Final = 40_000  #: Number of elements of a pair array of a block of epochs.
 
 
@@ -32,28 +33,28 @@ class Reliability:
     """Reliability of T epochs by M channels, for the chi-square test."""
 
     noncentrality: Floats  #: lambda of the epoch's degrees of freedom; NaN where not testable; shape (T,).
-    #: Range error missed with that probability; infinite unchecked, NaN if unused; shape (T, M).
+    #: Range error missed with the stated probability; infinite if unchecked, NaN if unused; shape (T, M).
     minimal_detectable_bias_m: Floats
-    #: Movement of the position for one unit of the root of the statistic; NaN where not used; shape (T, M).
+    #: Position error per unit of the statistic's root; NaN where not used; shape (T, M).
     slope_m: Floats
-    #: Largest such movement by errors of two satellites; NaN unless two faults are requested; shape (T,).
+    #: Largest slope for errors of two satellites; NaN unless two faults are requested; shape (T,).
     pair_slope_m: Floats
     worst: Indices  #: Channel of the largest slope; -1 without one; shape (T,).
     #: Standard deviation along the line; in space along the longest axis of the horizontal ellipse; shape (T,).
     position_sigma_m: Floats
-    #: Movement by a fault that the test misses with the stated probability: slope sqrt(lambda); shape (T,).
+    #: Position error by a fault that the test misses with the stated probability: slope sqrt(lambda); shape (T,).
     fault_level_m: Floats
-    noise_level_m: Floats  #: K sigma, shape (T,).
-    #: Their sum; infinite where a satellite is unchecked; NaN without a position; shape (T,).
+    noise_level_m: Floats  #: Noise part, K sigma, shape (T,).
+    #: Sum of the two; infinite where a satellite is unchecked; NaN without a position; shape (T,).
     protection_level_m: Floats
-    available: Masks  #: The protection level is finite, shape (T,).
-    alarm: Masks  #: It is not known to be within the alarm limit, shape (T,).
+    available: Masks  #: True where the protection level is finite, shape (T,).
+    alarm: Masks  #: True where the level is not known to be within the alarm limit, shape (T,).
 
 
 def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Reliability:
-    """Detectable biases, slopes and protection levels of the satellites that are used, of a model after exclusions.
+    """Compute detectable biases, slopes and protection levels of the used satellites of a model after exclusions.
 
-    The limits are those of the chi-square test in every mode. The noise scale, shape (T,) or (), is that of
+    The limits of the chi-square test are used in every mode. The noise scale, shape (T,) or (), is the argument of
     `detect`; it does not affect the map error in `position_sigma_m`.
     """
     limits = limits or RaimLimits()
@@ -76,7 +77,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
     if limits.faults == 2:
         pair = _pair_slopes(model, scale, sigma)
         largest = np.fmax(largest, pair)
-    # No redundancy: nothing is detected, whatever the size.
+    # Without redundancy no fault of any size is detected.
     fault = np.where(located & (model.freedom < 1), np.inf, largest * root)
     # K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane
     risk = limits.noise_risk
@@ -122,7 +123,7 @@ def _longest_axis(covariance: Floats) -> Floats:
 
 
 def _largest_eigenvalue(a: Floats, b: Floats, c: Floats) -> Floats:
-    """Of symmetric matrices ((a, b), (b, c))."""
+    """Return the largest eigenvalue of symmetric matrices ((a, b), (b, c))."""
     return np.asarray((a + c) / 2.0 + np.hypot((a - c) / 2.0, b))
 
 
@@ -176,7 +177,7 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
     largest = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
     squared = np.where(regular, largest / np.where(regular, determinant, 1.0), 0.0)
 
-    # Errors that no residual shows at all: (sqrt c, -+ sqrt a). Without effect on the position the pair adds nothing to
+    # Errors invisible in the residuals: (sqrt c, -+ sqrt a). Without effect on the position the pair adds nothing to
     # its single satellites.
     x, y = np.sqrt(np.maximum(c, 0.0)), -np.copysign(np.sqrt(np.maximum(a, 0.0)), b)
     hidden = np.linalg.norm(x[..., None] * first + y[..., None] * second, axis=2)

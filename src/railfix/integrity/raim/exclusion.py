@@ -1,7 +1,7 @@
 """Fault detection by the sum of squared residuals (P4: chi-square; P1 2.3(4): 100 m^2), and fault exclusion.
 
-Leaving out the satellites E is the same as giving each an unknown bias: their own errors are ``b_E = S_EE^-1 nu_E``,
-the WSSE falls by ``nu_E^T b_E``, the position moves by ``-Q B_E^T b_E``. So every satellite and pair is tried without
+Leaving out the satellites E is equivalent to an unknown bias for each: their errors are ``b_E = S_EE^-1 nu_E``, the
+WSSE falls by ``nu_E^T b_E``, the position moves by ``-Q B_E^T b_E``. Every satellite and pair is thus tested without
 solving again.
 """
 
@@ -29,27 +29,28 @@ class RaimLimits(Settings):
     """Limits of detection, exclusion and reliability."""
 
     mode: Literal["chi_square", "fixed"] = "chi_square"  #: False-alarm rate (P4), or P1's fixed limit.
-    #: Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own error must exceed the
-    #: noise at this probability (chi-square mode).
+    #: Probability that noise alone is detected as a fault; P4: 0.001. The error of an excluded satellite must exceed
+    #: the noise at this probability (chi-square mode).
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability of missing a fault of the minimal detectable size. P4 gives no value.
     missed_detection: float = Field(default=1e-3, gt=0, lt=1)
     #: Mode "fixed": limit on the sum of squared residuals, and on the square of an excluded satellite's error; P1 table
     #: 6 ("FDE 2 SAT, 100 m2").
     fixed_limit_m2: float = Field(default=100.0, gt=0)
-    #: Satellites excluded at an epoch at most: 0, 1 or 2 (P1 2.3(4): 2).
+    #: Largest number of satellites excluded at an epoch: 0, 1 or 2 (P1 2.3(4): 2).
     max_excluded: int = Field(default=2, ge=0, le=2)
-    min_redundancy: int = Field(default=1, ge=1)  #: Degrees of freedom left after an exclusion.
-    #: Probability that noise makes the true exclusion fit this much worse than another one. Chi-square, one degree of
-    #: freedom. Another exclusion of as many satellites that passes and fits nearly as well makes the epoch inseparable.
+    min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom after an exclusion.
+    #: Probability that noise makes the true exclusion fit worse than another one by the separation (chi-square, one
+    #: degree of freedom). If another exclusion of as many satellites passes and fits nearly as well, the epoch is
+    #: inseparable.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: Exclusions with positions nearer than this do not compete, as the position is the same in either case (for
-    #: example the two satellites of a separate clock). 0: they always do.
+    #: Exclusions whose positions are closer than this do not compete, as the position is the same in either case (for
+    #: example the two satellites of a separate clock). With 0 they always compete.
     same_position_m: float = Field(default=0.0, ge=0)
-    #: Two-sided probability that K sigma leaves to noise in the protection level; 1 gives K = 0, which is P4's ``HSlope
+    #: Two-sided probability of noise beyond K sigma in the protection level; 1 gives K = 0, which is P4's ``HSlope
     #: sigma0 sqrt(lambda)``.
     noise_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: Protection levels above it alarm. P4 takes an error within a car length, 20 m, as acceptable.
+    #: Alarm limit of the protection level. P4 accepts an error within a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0)
     faults: int = Field(default=1, ge=1, le=2)  #: Simultaneous faults that the protection level covers: 1 (P4) or 2.
 
@@ -61,25 +62,25 @@ class RaimLimits(Settings):
 
     @cached_property
     def separation(self) -> float:
-        """WSSE by which another exclusion must fit worse, in noise variances."""
+        """Minimum WSSE difference to another exclusion, in noise variances."""
         return float(scipy.special.chdtri(1, self.separation_risk))
 
     @cached_property
     def own_error(self) -> float:
-        """Square of an excluded satellite's own error over its sigma that noise does not reach."""
+        """Limit of the squared normalised error of an excluded satellite."""
         return float(scipy.special.chdtri(1, self.false_alarm))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Detection:
-    """Verdict on T epochs."""
+    """Result of fault detection for T epochs."""
 
     #: WSSE over the noise scale squared; fixed mode: sum of squares [m^2]; NaN without a position; shape (T,).
     statistic: Floats
     threshold: Floats  #: Threshold of the statistic; NaN where not testable; shape (T,).
     freedom: Integers  #: Degrees of freedom, shape (T,).
     detected: Masks  #: The statistic is at or over the threshold, shape (T,).
-    testable: Masks  #: At least one range is redundant, shape (T,).
+    testable: Masks  #: True where at least one range is redundant, shape (T,).
 
 
 def detect(
@@ -99,13 +100,13 @@ def detect(
     wsse : array_like, shape (T,)
         Weighted sum of squared residuals; NaN without a position.
     residual_m : array_like, shape (T, M) [m]
-        0 (or NaN) where not used; requested in fixed mode only. Those of a `LinearModel` allow for the map error, those
-        of a `Constrained` position do not: the same only where the map is taken as exact, as in P1 (a sigma of a
-        millimetre).
+        Residuals, 0 (or NaN) where not used; required in fixed mode only. Residuals of a `LinearModel` include the map
+        error, residuals of a `Constrained` position do not; they are equal only for an exact map, as in P1 (a sigma of
+        a millimetre).
     freedom : array_like of int, shape (T,)
         Ranges beyond the unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space - 3.
     scale : array_like, shape (T,) or ()
-        Standard deviation of this receiver's ranges over the sigmas of the weights. Not used in fixed mode.
+        Ratio of the receiver's range standard deviation to the sigmas of the weights. Not used in fixed mode.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -122,7 +123,7 @@ def detect(
 
 
 def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Return the threshold of the statistic by degrees of freedom, of any shape; NaN below 1.
+    """Return the threshold of the statistic for degrees of freedom of any shape; NaN below 1.
 
     P4: false alarm 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
     """
@@ -136,14 +137,14 @@ def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats
 
 @lru_cache(maxsize=64)
 def _chi_square_table(false_alarm: float, size: int) -> Floats:
-    """Return the chi-square thresholds of 0 (NaN) to size - 1 degrees of freedom."""
+    """Return the chi-square thresholds for 0 (NaN) to size - 1 degrees of freedom."""
     table = np.full(size, np.nan)
     table[1:] = scipy.special.chdtri(np.arange(1, size), false_alarm)
     table.flags.writeable = False
     return table
 
 
-_ROUNDING: Final = 1e-9  #: Fraction of a WSSE within which two count as equal.
+_ROUNDING: Final = 1e-9  #: Relative difference within which two WSSE count as equal.
 #: Number of elements of a subset array of a block of epochs: about the size of a core's cache.
 _BLOCK_SIZE: Final = 40_000
 
@@ -153,15 +154,15 @@ class Outcome(IntEnum):
 
     #: The residuals are within the noise.
     PASSED = 0
-    #: One satellite excluded; the rest passes.
+    #: One satellite is excluded, and the others pass.
     EXCLUDED_ONE = 1
-    #: Two satellites excluded; the rest passes.
+    #: Two satellites are excluded, and the others pass.
     EXCLUDED_TWO = 2
-    #: A fault, but another exclusion of as many satellites explains it as well: none is made.
+    #: A fault is detected, but another exclusion of as many satellites explains it as well, so that none is made.
     INSEPARABLE = 3
-    #: A fault, and no exclusion that is allowed passes.
+    #: A fault is detected, and no permitted exclusion passes.
     UNRESOLVED = 4
-    #: No redundant range, or no position.
+    #: There is no redundant range, or no position.
     UNTESTABLE = 5
 
 
@@ -170,21 +171,21 @@ class Exclusion:
     """Exclusions of T epochs by M channels."""
 
     outcome: Codes  #: `Outcome`, shape (T,).
-    excluded: Masks  #: Channels to leave out; none unless the outcome is EXCLUDED_ONE or EXCLUDED_TWO; shape (T, M).
-    #: Channels of the passing subset with the least statistic; -1 where none; INSEPARABLE too; shape (T, 2).
+    excluded: Masks  #: Channels to leave out; only with the outcomes EXCLUDED_ONE and EXCLUDED_TWO; shape (T, M).
+    #: Channels of the passing subset with the smallest statistic, also if INSEPARABLE; -1 for none; shape (T, 2).
     best: Indices
-    #: The next such subset of as many channels: the closest competing exclusion; -1 where none; shape (T, 2).
+    #: Closest competing exclusion: the next passing subset of as many channels; -1 for none; shape (T, 2).
     alternative: Indices
-    #: Error of the channels of `best` against the rest: + where the range is too long; NaN elsewhere; shape (T, M).
+    #: Error of the channels of `best` relative to the others, positive for a long range; NaN elsewhere; shape (T, M).
     own_error_m: Floats
-    #: Statistic of the rest without `best`; the statistic itself where no subset exists; shape (T,).
+    #: Statistic without `best`; the original statistic where no subset exists; shape (T,).
     statistic_after: Floats
-    #: Position change by leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 where none; shape (T,
+    #: Position change by leaving out `best`: along the line (k = 1), or east and north (k = 2); 0 for none; shape (T,
     #: k).
     position_change_m: Floats
     #: Distance between the positions without `best` and without `alternative`; NaN where either is missing; shape (T,).
     alternative_shift_m: Floats
-    detection: Detection  #: The test before any exclusion.
+    detection: Detection  #: Detection before any exclusion.
 
 
 @dataclass(frozen=True)
@@ -194,19 +195,18 @@ class _Trial:
     members: Indices  # (K, 1 or 2), indices in the compact arrays
     statistic: Floats
     wsse_drop: Floats
-    own: tuple[Floats, ...]  # own errors of each member [sigma]
-    allowed: Masks  # all members in use, checked by the rest, and each over the limit of own errors
+    own: tuple[Floats, ...]  # errors of the members [sigma]
+    allowed: Masks  # all members are used, checked by the others, and each error is over its limit
 
 
 def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Exclusion:
-    """Test, and where a fault is detected try every single satellite, then every pair.
+    """Detect faults, and try the exclusion of every single satellite, then of every pair.
 
-    A subset is excluded when the rest passes and has `min_redundancy` degrees of freedom left, and when each of its
-    satellites is in error against the rest: by more than noise of its sigma reaches (chi-square mode), by more than the
-    square root of the limit (fixed mode). A single exclusion is preferred to a pair; of several the one with the least
-    statistic. Where another subset of
-    the same size would be excluded as well and fits worse by no more than noise explains (`separation_risk`), the epoch
-    is inseparable. The noise scale, shape (T,) or (), is that of `detect`.
+    A subset is excluded if the other ranges pass with at least `min_redundancy` degrees of freedom, and if the error of
+    each of its satellites exceeds its noise (chi-square mode) or the square root of the limit (fixed mode). A single
+    exclusion is preferred to a pair, and of several exclusions the one with the smallest statistic. Where another
+    subset of the same size would be excluded as well and fits worse by no more than noise explains (`separation_risk`),
+    the epoch is inseparable. The noise scale, shape (T,) or (), is the argument of `detect`.
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape
@@ -226,7 +226,7 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     failing = np.flatnonzero(detection.detected)
     result.outcome[failing] = Outcome.UNRESOLVED
     used = np.count_nonzero(model.used[failing], axis=1)
-    # Epochs are grouped by numbers of satellites: no block is wider than necessary.
+    # Epochs are grouped by number of satellites, so that no block is wider than necessary.
     failing = failing[np.argsort(used, kind="stable")]
     widest = int(used.max(initial=1))
     size = max(1, _BLOCK_SIZE // (widest * widest))
@@ -237,7 +237,9 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
 
 
 def _exclude_block(result: Exclusion, epochs: Indices, model: LinearModel, scale: Floats, limits: RaimLimits) -> None:
-    """Singles for all epochs of a block, pairs for those that no single resolves; written into `result`."""
+    """Write into `result` the single exclusions of a block's epochs, and the pairs of epochs that no single exclusion
+    resolves.
+    """
     parts, wsse, freedom = compact(model), model.wsse, model.freedom
     for size in range(1, limits.max_excluded + 1):
         going = np.flatnonzero(
@@ -254,7 +256,7 @@ def _exclude_block(result: Exclusion, epochs: Indices, model: LinearModel, scale
 
 
 def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _Trial:
-    """Return each channel alone left out."""
+    """Return the trials that leave out one channel each."""
     n = parts.channel.shape[1]
     share = np.einsum("tii->ti", parts.projector)
     checked = parts.used & (share > LEAST_REDUNDANCY)
@@ -272,7 +274,7 @@ def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) ->
 
 
 def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _Trial:
-    """Return each pair of channels left out."""
+    """Return the trials that leave out each pair of channels."""
     n = parts.channel.shape[1]
     i, j = np.triu_indices(n, 1)
     flat = parts.projector.reshape(len(parts.projector), n * n)
@@ -289,7 +291,7 @@ def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _
     if limits.mode == "chi_square":
         variance = scale[:, None] ** 2
         statistic = (wsse[:, None] - drop) / variance
-        # The variance of the first own error is (S_EE^-1)_11 = c / determinant.
+        # The variance of the first error is (S_EE^-1)_11 = c / determinant.
         bound = limits.own_error * variance * inverse
         over = (own_one**2 > bound * c) & (own_two**2 > bound * a)
     else:
@@ -352,7 +354,7 @@ def _choose(
 
 
 def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
-    """Return the change of the position by each subset, shape (rows, K, k) [m]."""
+    """Return the position change by each subset, shape (rows, K, k) [m]."""
     moves = np.zeros((len(rows), len(trial.members), parts.gain_m.shape[2]))
     for k, own in enumerate(trial.own):
         moves -= parts.gain_m[rows][:, trial.members[:, k]] * own[rows][..., None]
@@ -360,7 +362,9 @@ def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
 
 
 def worst_channel(model: LinearModel) -> Indices:
-    """Channel whose removal lowers the weighted sum of squared residuals most, shape (T,); 0 where none is checked."""
+    """Return the channel whose removal lowers the weighted sum of squared residuals most, shape (T,); 0 where none is
+    checked.
+    """
     share = model.redundancy
     checked = model.used & (share > LEAST_REDUNDANCY)
     drop = np.where(checked, model.residual**2 / np.where(checked, share, 1.0), 0.0)

@@ -1,10 +1,10 @@
-"""One linear model for RAIM on the line and in space.
+"""Linear model for RAIM on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma, and the receiver clocks and the map
-error across and up, unknowns with a prior, are eliminated beforehand. The remainder is a residual projector ``S = I - R
-K R^T - B Q B^T`` (R: 1/sigma in the column of the satellite's clock, K: covariance of the clocks at a known position,
-B: design with the clocks eliminated, Q: its covariance), with ``nu = S y`` and ``WSSE = y^T S y``, chi-square
-distributed with `LinearModel.freedom` degrees of freedom.
+P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks, and the map error
+across and up as unknowns with a prior, are eliminated beforehand. The remainder is a residual projector ``S = I - R K
+R^T - B Q B^T`` (R: 1/sigma in the column of the satellite's clock, K: covariance of the clocks at a known position, B:
+design with the clocks eliminated, Q: its covariance), with ``nu = S y`` and ``WSSE = y^T S y``, chi-square distributed
+with `LinearModel.freedom` degrees of freedom.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from railfix.positioning.range_arrays import Ranges
 
 
 class ModelArrays(NamedTuple):
-    """Arrays of `LinearModel` in C order, as compiled functions take them."""
+    """Arrays of `LinearModel` in C order, as arguments of compiled functions."""
 
     root_weight: Floats
     clock: Indices
@@ -34,7 +34,7 @@ class ModelArrays(NamedTuple):
     misfit: Floats
 
 
-#: Arrays of `LinearModel` with an axis of epochs, the first.
+#: Arrays of `LinearModel` whose first axis is the epoch.
 _BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_m2", "misfit", "freedom")
 
 
@@ -49,24 +49,25 @@ class LinearModel:
     root_weight: Floats  #: 1/sigma of each range, 0 for unused ones; shape (T, M) [1/m].
     clock: Indices  #: Clock of each channel: index into the groups of the ranges; shape (M,).
     clock_covariance_m2: Floats  #: Covariance of the clocks at a known position (K), shape (T, G, G).
-    #: Change of the whitened range with the position, clocks eliminated (B); 0 for unused ones; shape (T, M, 3) [1/m].
+    #: Derivative of the whitened range by the position, clocks eliminated (B); 0 for unused ones; shape (T, M, 3)
+    #: [1/m].
     design: Floats
     #: Covariance of the position, prior included (Q); NaN where the ranges do not determine it; shape (T, 3, 3).
     covariance_m2: Floats
     prior: Floats  #: Prior information on the position: the map error across and up; shape (3, 3) [1/m^2].
     misfit: Floats  #: Whitened code - range at the position, up to a clock (y); 0 where not used; shape (T, M).
-    freedom: Integers  #: Ranges beyond the unknowns; may be negative; shape (T,).
-    interest: int  #: 1 on the line, 2 (horizontal) in space.
+    freedom: Integers  #: Degrees of freedom: ranges less unknowns; may be negative; shape (T,).
+    interest: int  #: Number of components of interest: 1 on the line, 2 (horizontal) in space.
 
     def __len__(self) -> int:
         return len(self.root_weight)
 
     def take(self, epochs: Masks | Indices) -> LinearModel:
-        """Return the model of some epochs, by mask or index."""
+        """Return the model of selected epochs, by mask or index."""
         return replace(self, **{name: getattr(self, name)[epochs] for name in _BY_EPOCH})
 
     def patch(self, epochs: Indices, part: LinearModel) -> LinearModel:
-        """Return the model with some epochs, by index, replaced by those of another."""
+        """Return the model with selected epochs, by index, replaced from another model."""
         if len(epochs) == len(self):
             return part
         changed = {}
@@ -77,7 +78,7 @@ class LinearModel:
 
     @cached_property
     def arrays(self) -> ModelArrays:
-        """Plain arrays of the model, without `freedom` and `interest`."""
+        """Arrays of the model, without `freedom` and `interest`."""
         return ModelArrays(*(np.ascontiguousarray(getattr(self, name)) for name in ModelArrays._fields))
 
     @property
@@ -106,32 +107,35 @@ class LinearModel:
 
     @property
     def redundancy(self) -> Floats:
-        """Diagonal of S: the fraction of its own error that a range has in its residual, shape (T, M).
+        """Redundancy numbers, the diagonal of S: fraction of a range's error that appears in its residual, shape (T,
+        M).
 
-        0 where not used, and where nothing checks the range.
+        0 for unused and for unchecked ranges.
         """
         return self._fitted[2]
 
     @cached_property
     def residual_m(self) -> Floats:
-        """Residuals of the fit, map error allowed for, shape (T, M) [m]; 0 where not used."""
+        """Residuals of the fit with the map error included, shape (T, M) [m]; 0 where not used."""
         return np.where(self.used, self.residual / np.where(self.used, self.root_weight, 1.0), 0.0)
 
     @cached_property
     def wsse(self) -> Floats:
-        """Weighted sum of squared residuals ``y^T S y``, map error and ties allowed for, shape (T,)."""
+        """Weighted sum of squared residuals ``y^T S y``, with map error and known clock offsets included, shape
+        (T,).
+        """
         return np.asarray(np.einsum("tm,tm->t", self.misfit, self.residual))
 
     @cached_property
     def gain_m(self) -> Floats:
-        """Change of the position with a whitened range, shape (T, M, interest) [m]."""
+        """Derivative of the position by a whitened range, shape (T, M, interest) [m]."""
         return np.asarray(self.design @ self.covariance_m2[:, :, : self.interest])
 
     def position_covariance_m2(self, scale: Floats) -> Floats:
         """Return the covariance of the components of interest, shape (T, interest, interest) [m^2].
 
-        `scale` multiplies the sigmas of the ranges (and ties), not the map error: of the covariance Q, ``Q P Q`` comes
-        from the prior P and ``Q - Q P Q`` from the ranges.
+        `scale` multiplies the sigmas of the ranges and clock offsets, not the map error: in the covariance Q, the part
+        ``Q P Q`` comes from the prior P, and ``Q - Q P Q`` from the ranges.
         """
         k = self.interest
         covariance = self.covariance_m2
@@ -141,18 +145,18 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact(RowArrays):
-    """Residuals and their projector of the used channels alone, adjacent: T epochs by n."""
+    """Residuals and projector of the used channels only, contiguous: T epochs by n."""
 
     channel: Indices  #: Channel of the model at each index, shape (T, n).
-    used: Masks  #: False at indices beyond the epoch's own channels, shape (T, n).
-    projector: Floats  #: S; 0 beyond; shape (T, n, n).
+    used: Masks  #: False at indices beyond the epoch's channels, shape (T, n).
+    projector: Floats  #: Projector S; 0 beyond the epoch's channels; shape (T, n, n).
     residual: Floats  #: Shape (T, n).
-    sigma_m: Floats  #: 0 beyond, shape (T, n).
+    sigma_m: Floats  #: 0 beyond the epoch's channels, shape (T, n).
     gain_m: Floats  #: Shape (T, n, interest).
 
 
 def compact(model: LinearModel) -> Compact:
-    """Return the residual projector over the channels in use, in their order; (T, n, n) of memory."""
+    """Return the residual projector of the used channels, in their order; it uses memory of (T, n, n)."""
     n = int(model.used.sum(axis=1).max(initial=0))
     channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
     used = np.take_along_axis(model.used, channel, axis=1)
@@ -172,20 +176,20 @@ def compact(model: LinearModel) -> Compact:
 
 
 def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices | None = None) -> LinearModel:
-    """Return the model of positions on the line: distance d unknown, map error a prior across and up (P1 2.2(3), P4).
+    """Return the model of positions on the line: unknown distance d, map error as a prior across and up (P1 2.2(3),
+    P4).
 
-    The prior is `sigma_plan_m` and `sigma_height_m` of the trajectory. The model is NaN in the epochs without a
-    position.
+    The prior uses `sigma_plan_m` and `sigma_height_m` of the trajectory. The model is NaN at epochs without a position.
 
     Parameters
     ----------
     ranges : Ranges
-        Of `railfix.positioning.weighted_ranges`.
+        Returned by `railfix.positioning.weighted_ranges`.
     line : Trajectory, SearchIndex or AntennaRows
     arc_m : ndarray, shape (T,) [m]
         Positions from these ranges (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
     section : ndarray of int, shape (T,), optional
-        Their sections (`Constrained.section`), needed for positions at points that two sections share.
+        Sections of the positions (`Constrained.section`), needed at points shared by two sections.
     """
     antennas = AntennaRows.on(line)
     at = antennas.segment_at(arc_m) if section is None else np.maximum(section, 0)
@@ -196,7 +200,7 @@ def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices 
 def update_model(
     model: LinearModel, ranges: Ranges, antennas: AntennaRows, position: Constrained, epochs: Indices
 ) -> LinearModel:
-    """Return the model with some rising epochs recomputed, from other ranges and positions."""
+    """Return the model with some epochs, in ascending order, recomputed from other ranges and positions."""
     for index, own in antennas.split(epochs):
         model = model.patch(
             own, linear_model(ranges.take(own), index, position.arc_m[own], section=position.section[own])
@@ -205,7 +209,7 @@ def update_model(
 
 
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:
-    """Whiten, take the clocks out, invert.
+    """Whiten the ranges, eliminate the clocks, and invert.
 
     `axes`, shape (T, 3, 3): unit vectors of the unknowns at positions (T, 3), NaN without; `prior`, shape (3, 3)
     [1/m^2].

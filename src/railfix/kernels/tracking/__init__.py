@@ -1,11 +1,11 @@
-"""Compiled recursion of `railfix.tracking.filter`: ordinary epochs one after the other, hypotheses side by side.
+"""Compiled recursion of `railfix.tracking.filter`: epochs in sequence, all hypotheses in parallel arrays.
 
 `railfix.kernels.tracking.layout` has the arrays and `railfix.kernels.tracking.index` their indices.
-`railfix.kernels.tracking.recursion.advance` returns at an epoch whose places have to be searched for, which is done
-between its prediction and its update.
+`railfix.kernels.tracking.recursion.advance` returns at an epoch that requires a position search; the search is done
+between the epoch's prediction and its update.
 
-One letter is an index: t of an epoch, h of a hypothesis, b of a source and its sub-filter, j of a measurement, k of a
-channel (of a term of a quantity where q is there, of an axis where c is there), q of a quantity, i of an unknown, g of
-a clock, v of a vertex, c of x, y, z; a and b of rows and columns of a matrix. Others are of the equations: x, P, F, Q,
-H, S, K, y, r, u, T, z as in docs/filter-equations.md.
+Single letters are indices: t epoch, h hypothesis, b source and its sub-filter, j measurement, k channel (term of a
+quantity next to q, axis next to c), q quantity, i unknown, g clock, v vertex, c component x, y, z; a and b rows and
+columns of a matrix. The letters x, P, F, Q, H, S, K, y, r, u, T, z are variables of the equations in
+docs/filter-equations.md.
 """

@@ -1,9 +1,9 @@
-"""Adaptation to the measurements: noise of phases and Dopplers, doubt, the map's lengths, faulty satellites.
+"""Adaptation to the measurements: phase and Doppler noise, doubt, length errors of the map, faulty satellites.
 
-The innovation of a code over its standard deviation has a mean near 0 over a minute, reflections included: they come
-and go. A clock record that is wrong, or a reflection that lasts, keeps its sign. The mean of the innovations, each
-clipped to a standard deviation, so that single large ones count little, distinguishes them: such a satellite's
-codes are left out (`is_faulty`).
+The normalised innovations of a satellite's codes have a mean near 0 over a minute, even with reflections, which come
+and go. A wrong clock record or a persistent reflection gives innovations of constant sign. The mean of the innovations
+shows such a fault, and the satellite's codes are left out (`is_faulty`). Each innovation is clipped to one standard
+deviation, so that single large innovations have little effect.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from railfix.kernels.tracking.update import Equations, Fit, mean_weights
 
 @inner
 def mean_square(rows: Rows, own: slice, found: Fit) -> float:
-    """Return the weighted mean square of the residuals of a kind over their variances; NaN of three or fewer."""
+    """Return the weighted mean square of one kind of residuals over their variances; NaN for three or fewer."""
     size, total = own.stop - own.start, 0.0
     for j in range(own.start, own.stop):
         total += found.weight[j] * (found.residual[j] ** 2 + found.fitted[j]) / rows.variance[j]
@@ -31,7 +31,7 @@ def mean_square(rows: Rows, own: slice, found: Fit) -> float:
 
 @inner
 def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
-    """Return the logarithm of a variance's scale after an epoch with some mean square; NaN leaves it."""
+    """Return the log scale of a variance updated by an epoch's mean square; NaN leaves it unchanged."""
     if not math.isnan(mean_square):
         log_scale += (1.0 - math.exp(-min(dt, 1.0) / constants.SCALE_S)) * math.log(mean_square)
     return min(max(log_scale, constants.LEAST_SCALE), constants.LARGEST_SCALE)
@@ -39,7 +39,7 @@ def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
 
 @inner
 def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
-    """Count how long motion and codes have had low weights, and filter the misfit of Dopplers and phases."""
+    """Update the duration of low weights of motion and of codes, and the filtered misfit of Dopplers and phases."""
     code, motion = mean_weights(rows, rows.variance, found.weight)
     if motion < constants.LOST_MOTION_WEIGHT:
         monitors.weak_motion_s += dt
@@ -58,9 +58,9 @@ def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
 
 @inner
 def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float) -> bool:
-    """Adapt the state to an epoch's fit; return whether another satellite's codes are left out from here on.
+    """Adapt the state to an epoch's fit; return whether a further satellite's codes are left out from this epoch on.
 
-    `shift` is that of `compute_code_shift` of the hypothesis reported.
+    `shift` is the result of `compute_code_shift` for the reported hypothesis.
     """
     monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
     of_dopplers, of_phases = mean_square(rows, rows.doppler, found), mean_square(rows, rows.phase, found)
@@ -85,20 +85,20 @@ def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation
 
 @inner
 def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
-    """Return a satellite's mean innovation after another one, over its standard deviation."""
+    """Return a satellite's mean normalised innovation, updated by another innovation."""
     share = 1.0 - math.exp(-min(code_s, 1.0) / constants.BIAS_MEMORY_S)
     return code_bias + share * (min(max(innovation, -constants.BIAS_MOST), constants.BIAS_MOST) - code_bias)
 
 
 @inner
 def is_faulty(code_bias: float) -> bool:
-    """Return whether a mean of innovations is that of a satellite whose codes are left out."""
+    """Return whether a mean innovation is so large that the satellite's codes are left out."""
     return bool(code_bias > constants.BIAS_FAULTY or code_bias < constants.BIAS_SHORT)
 
 
 @inner
 def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, weight: Floats) -> float:
-    """Return the shift of the place that the codes of an epoch imply, over its standard deviation; 0 with few codes.
+    """Return the normalised position shift that the codes of an epoch imply; 0 with too few codes.
 
     The score of the innovations v against a shift, ``h' S^-1 v / sqrt(h' S^-1 h)`` with h the coefficients of the arc
     length: standard normal and white over epochs where the model holds. `covariance`, shape (Q, Q), is H P H' of the
@@ -124,7 +124,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
 
 @inner
 def update_map_scale(monitors: Record, shift: float, dt: float, parameters: Record) -> None:
-    """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
+    """Update the running mean by an epoch's shift, and raise or lower the length error of the map."""
     dt = min(dt, 1.0)
     share = 1.0 - math.exp(-dt / constants.MAP_MISFIT_S)
     if abs(shift) > constants.STEP_SIGMAS:

@@ -19,12 +19,13 @@ def before_measurements(
 ) -> tuple[Floats, Floats]:
     """Carry the information of later epochs on the unknowns backward through an epoch's measurements.
 
-    Of one measurement with row h, innovation y and ``S = h' P h + r`` (G. J. Bierman, 1973)::
+    For one measurement with row h, innovation y and ``S = h' P h + r`` (G. J. Bierman, 1973)::
 
         l = h y / S + (I - h g' / S) l          L = h h' / S + (I - h g' / S) L (I - g h' / S)          g = P h
 
-    The measurements, shapes (M, N), (M,), (M,), are taken in the order of the filter, and backward from the last. P,
-    shape (N, N), is the covariance before them, `vector` and `matrix`, shapes (N,) and (N, N), are l and L after them.
+    The measurements, shapes (M, N), (M,), (M,), are in the order of the filter and are processed backward from the
+    last. P, shape (N, N), is the covariance before the measurements; `vector` and `matrix`, shapes (N,) and (N, N), are
+    l and L after them.
     """
     count, size = row.shape
     P, x, gain = P.copy(), np.zeros(size), np.empty(size)
@@ -48,7 +49,7 @@ def before_measurements(
 
 @kernel
 def transition_matrix(speed: float, epoch: Record, unknowns: int) -> Floats:
-    """Return F as a matrix, shape (N, N)."""
+    """Return the transition F as a matrix, shape (N, N)."""
     F, matrix = compute_transition(speed, epoch, unknowns), np.zeros((unknowns, unknowns))
     for i in range(unknowns):
         for k in range(3):

@@ -1,6 +1,6 @@
-"""Constants of the filter along the track that nobody tunes, each with its reason: compiled in.
+"""Fixed constants of the filter along the track, each with its reason; they are compiled in.
 
-`railfix.tracking.limits` has what a user may set.
+`railfix.tracking.limits` has the settings that a user may change.
 """
 
 from __future__ import annotations
@@ -9,215 +9,232 @@ import math
 from typing import Final
 
 # Prediction.
-#: Time and travel over which the multipath of a satellite's code changes: a reflector of a street or a station is
-#: passed within about 100 m; at rest the fringe of one 10 m away lasts about a minute.
+#: Time and travel over which the multipath of a satellite's code changes. A reflector in a street or a station is
+#: passed within about 100 m; at rest the fringe of a reflector 10 m away lasts about a minute.
 CODE_CORRELATION_S: Final = 60.0
 CODE_CORRELATION_M: Final = 100.0
 #: Correlation time of the displacement by orbits and ionosphere, `TrackingLimits.slow_code_m`.
 SLOW_CODE_S: Final = 7200.0
-#: Time-correlated error of the speed by Dopplers: its least size, its share of the speed (a reflected signal is
-#: shifted by up to the speed, at rest not at all) and its correlation time.
+#: Time-correlated error of the Doppler speed: its minimum, its fraction of the speed (the Doppler error of a reflected
+#: signal is at most the speed, and zero at rest), and its correlation time.
 DOPPLER_ERROR_MPS: Final = 0.01
 DOPPLER_ERROR_SHARE: Final = 0.02
 DOPPLER_CORRELATION_S: Final = 10.0
-#: Displacement in the square root of a second by slow errors of all phases: ionosphere, troposphere, orbits and
-#: clocks, 0.5 mm/s along the line for half an hour.
+#: Random walk of the displacement by slow errors of all phases, per square root of a second: ionosphere, troposphere,
+#: orbits and clocks, 0.5 mm/s along the line for half an hour.
 PHASE_WALK_M: Final = 0.03
-#: Change of the drift of the receiver's clock in the square root of a second: 1.7e-9 of the frequency, what quartz
-#: oscillators without an oven show when shaken.
+#: Random walk of the receiver clock's drift per square root of a second: 1.7e-9 of the frequency, as quartz oscillators
+#: without an oven show under vibration.
 CLOCK_WALK_MPS: Final = 0.5
-#: Change of the offset between two constellations in the square root of a second, and its first standard deviation.
+#: Random walk of the offset between two constellations per square root of a second, and its initial standard deviation.
 OFFSET_WALK_M: Final = 0.02
 OFFSET_PRIOR_M: Final = 30.0
-#: Least local error of the map across and up, and the length over which it changes. The map's stated accuracy
-#: counts where it is more, of heights the half.
+#: Smallest local error of the map across and up, and the length over which it changes. The map's stated accuracy is
+#: used where it is larger; for heights, half of it.
 MAP_ROUGHNESS_M: Final = 0.3
 MAP_CORRELATION_M: Final = 50.0
-MAP_SCALE_M: Final = 0.03  #: Error of a length along the map [m per square root of m].
-MAP_ABSOLUTE_M: Final = 500.0  #: Length over which the absolute error of the map changes; its sigma is the map's.
-CODE_CLOCK_SIGMA_M: Final = 1e3  #: Standard deviation of the clock of the codes about the median of an epoch [m].
-#: Random walks of the sensors' scales and offset in the square root of a second. A wheel of a car wandered over 2 %
-#: within half a minute at bends; an accelerometer's offset follows its temperature.
+MAP_SCALE_M: Final = 0.03  #: Random walk of a length along the map [m per square root of m].
+#: Length over which the absolute error of the map changes; its sigma is the map's stated accuracy.
+MAP_ABSOLUTE_M: Final = 500.0
+CODE_CLOCK_SIGMA_M: Final = 1e3  #: Prior standard deviation of the code clock about the median of an epoch [m].
+#: Random walks of the sensors' scale factors and offset, per square root of a second. A car's wheel scale factor
+#: changed by 2 % within half a minute in bends; an accelerometer's offset follows its temperature.
 WHEEL_WALK: Final = 5e-4
 FORCE_WALK_MPS2: Final = 1e-3
 RADAR_WALK: Final = 2e-4
-#: Share of the map's error of height that changes over `MAP_CORRELATION_M`; across it is the whole: heights of a survey
-#: or a terrain model are wrong over longer distances.
+#: Fraction of the map's height error that changes over `MAP_CORRELATION_M`. For the error across it is 1, because
+#: height errors of a survey or a terrain model extend over longer distances.
 HEIGHT_ROUGHNESS: Final = 0.5
-LEAST_STEP_M2: Final = 1e-6  #: Least variance of a step of the place [m2]; it keeps matrices regular.
+LEAST_STEP_M2: Final = 1e-6  #: Minimum variance of a position step [m2], which keeps matrices regular.
 
 # Equations.
-#: Slower than this ranges to ground units are not used [m/s]: the error of a standing range stays (P2 3.3).
+#: Ranges to ground units are not used below this speed [m/s], because their error does not change at rest (P2 3.3).
 STILL_MPS: Final = 0.3
-#: Slower than this a speed does not tell the direction [m/s]: four sigmas of what a wheel of one hertz leaves of it.
+#: Below this speed the direction is unknown [m/s]: four sigmas of the speed with a wheel sensor at 1 Hz.
 DIRECTION_MPS: Final = 1.0
-CHORD_M: Final = 0.5  #: Shorter than this the tangent is the direction of a displacement [m].
-#: Share of their own information below which phases or Dopplers say nothing that others do not.
+CHORD_M: Final = 0.5  #: For displacements shorter than this the tangent is used as their direction [m].
+#: Fraction of their own information below which phases or Dopplers add nothing to the other measurements.
 LEAST_PIVOT: Final = 1e-12
 
 # Clocks.
-STEPPED: Final = 5.0  #: A clock whose median innovation is beyond this many standard deviations has stepped.
-UNKNOWN_CLOCK: Final = 100.0  #: Standard deviation of the clock of phases and its drift after a step [m, m/s].
-FIRST_OFFSET_M2: Final = 1e-4  #: Variance of the offset of the first constellation from the clock of the codes [m2].
+STEPPED: Final = 5.0  #: A clock has stepped if its median innovation exceeds this many standard deviations.
+UNKNOWN_CLOCK: Final = 100.0  #: Standard deviation of the phase clock and its drift after a step [m, m/s].
+FIRST_OFFSET_M2: Final = 1e-4  #: Variance of the offset of the first constellation from the code clock [m2].
 
 # Reweighting.
-PASSES: Final = 4  #: Rounds of reweighting an epoch.
+PASSES: Final = 4  #: Rounds of reweighting per epoch.
 LEVEL_PASSES: Final = 3  #: Rounds of reweighting of the sub-filters.
-#: Mean weight of codes, or of phases and Dopplers, under which another start of the reweighting is tried.
+#: Mean weight of codes, or of phases and Dopplers, below which the reweighting is restarted from other weights.
 WEAK_FIT: Final = 0.7
-#: Variances of place and speed added for that start [m2, m2/s2].
+#: Variances of position and speed added for that restart [m2, m2/s2].
 FREEDOM_PLACE_M2: Final = 30.0**2
 FREEDOM_SPEED_M2PS2: Final = 10.0**2
-#: The equations are made again when a place has moved by more than this [m]: 26 000 km away a range bends by 2 cm
-#: over 1 km, the line by 1 m over 20 m in its sharpest curves.
+#: The equations are linearised again when the position has moved by more than this [m]. A range of 26 000 km deviates
+#: from its tangent by 2 cm over 1 km, the line by 1 m over 20 m in its sharpest curves.
 MOVED_M: Final = 2.0
 RELINEARISED: Final = 4
 
-# What is learnt of noise.
+# Estimation of the noise.
 SCALE_S: Final = 60.0  #: Time over which the scales of Dopplers and phases are adapted [s].
-#: Logarithms that the scales of their variances stay within.
+#: Bounds of the log scales of their variances.
 LEAST_SCALE: Final = -1.5
 LARGEST_SCALE: Final = 3.0
-#: Shares of an interval by which the counters of doubt in motion and in codes fall at an epoch without doubt: weights
-#: that alternate about the limit are a contradiction as well.
+#: Fractions of an interval by which the doubt timers of motion and of codes fall at an epoch without doubt. They are
+#: below 1, because weights that alternate about the limit are a contradiction as well.
 MOTION_LEAK: Final = 0.5
 CODE_LEAK: Final = 1.0
 
-# Satellites whose codes are wrong for long.
-#: Time constant of the mean innovation [s], what one innovation counts at most, and the means beyond which codes are
-#: left out: too long, and too short. Late codes of other satellites pull the clock, so that right ones seem too short.
+# Satellites with persistent code errors.
+#: Time constant of the mean innovation [s], bound of a single innovation, and the means beyond which codes are left
+#: out: too long, and too short. Late codes of other satellites pull the clock, so that correct codes appear too short.
 BIAS_MEMORY_S: Final = 60.0
 BIAS_MOST: Final = 1.0
 BIAS_FAULTY: Final = 0.35
 BIAS_SHORT: Final = -0.55
-#: Errors of a satellite's orbit, clock and ionosphere last for hours: a mean below this is no sign of a wrong map [m].
+#: Orbit, clock and ionospheric errors of a satellite last for hours; a mean innovation below this is no sign of a wrong
+#: map [m].
 NOMINAL_M: Final = 0.8
-#: With more satellites beyond `BIAS_FAULTY`, too long or too short, and one of them too short, there is no level: the
+#: No protection level is given if more satellites than this are beyond `BIAS_FAULTY` and one of them is too short: the
 #: map or a constellation is wrong, or reflections pull the clock.
 BIAS_SATELLITES: Final = 2
-BIAS_INFLATED: Final = 1e6  #: Factor on the variance of codes that are left out: innovations show when the fault ends.
-#: Standard deviation added to the place when a satellite is left out from here on: its codes have led it so far [m].
+#: Factor on the variance of codes that are left out; their innovations still show the end of the fault.
+BIAS_INFLATED: Final = 1e6
+#: Standard deviation added to the position when a satellite is left out, because its codes have affected the position
+#: so far [m].
 INFLATED_M: Final = 15.0
-INFLATED_SIGMAS: Final = 3.0  #: Not where all codes are off by more sigmas: they may have stepped together.
+#: Satellites are not left out where all codes are off by more sigmas than this: the codes may have stepped together.
+INFLATED_SIGMAS: Final = 3.0
 
-# Lengths of the map.
-#: Time over which codes are to contradict the length (`TrackingLimits.map_misfit_sigmas`), and within which a larger
-#: error of it is forgotten.
+# Length errors of the map.
+#: Time over which codes must contradict the length (`TrackingLimits.map_misfit_sigmas`), and time constant with which
+#: the increased length error decays.
 MAP_MISFIT_S: Final = 30.0
 MAP_MISFIT_KEPT_S: Final = 300.0
-MISFIT_CODES: Final = 4  #: Fewer codes of an epoch do not tell a shift from clocks.
-#: A single epoch counts with at most so many standard deviations; beyond `STEP_SIGMAS` it is a step of all codes and
-#: shows nothing of the map.
+MISFIT_CODES: Final = 4  #: With fewer codes in an epoch, a shift cannot be separated from the clocks.
+#: The shift of a single epoch is clipped to this many standard deviations. Beyond `STEP_SIGMAS` it is a step of all
+#: codes and says nothing about the map.
 MISFIT_CLIPPED: Final = 3.0
-#: Time constant of learning [s], and the largest logarithm: beyond 1.6 m in the square root of a metre nothing changes.
+#: Time constant of the adaptation [s], and upper bound of the logarithm: a length error above 1.6 m per square root of
+#: a metre makes no further difference.
 MISFIT_LEARNT_S: Final = 5.0
 MISFIT_LARGEST: Final = 8.0
 
 # Speeds.
-SPEED_SIGMAS: Final = 4.0  #: A measured speed is known to this many standard deviations.
+SPEED_SIGMAS: Final = 4.0  #: A measured speed bounds the true speed within this many standard deviations.
 
 # Branches.
-#: Least distance of two branches at which half of their difference is the map's: three times an error of 2 m.
+#: Smallest distance of two branches at which half of their difference is attributed to the map: three times an error of
+#: 2 m.
 MAP_BRANCH_M: Final = 6.0
-#: Standard deviation of an error that the codes have in common across the line: reflections off one side of a
-#: street.
+#: Standard deviation of the common code error across the line: reflections from one side of a street.
 CODE_COMMON_M: Final = 10.0
-#: Time and distance over which that error lasts.
+#: Correlation time and distance of that error.
 CODE_COMMON_S: Final = 120.0
 CODE_COMMON_TRAVEL_M: Final = 500.0
-#: Codes alone leave a branch this near at least this probability.
+#: Lower bound of the probability of a branch within this distance, if codes alone contradict it.
 BRANCH_FLOOR: Final = 1e-3
 BRANCH_FLOOR_M: Final = 30.0
-#: Hypotheses are dropped only after this much travel: before, motion does not separate branches.
+#: Hypotheses are dropped only after this travel, because motion does not separate branches earlier.
 DECIDED_TRAVEL_M: Final = 60.0
-#: Hypotheses below it are dropped: a hundredth of the risk of an independent error.
+#: Hypotheses with a lower probability are dropped: a hundredth of the risk of an independent error.
 LEAST_PROBABILITY: Final = 1e-11
-START_SIGMA_M: Final = 30.0  #: Standard deviation of a hypothesis when it begins.
-GAP_S: Final = 5.0  #: Time without measurements after which places are sought again.
-#: The track is lost when the mean weight of motion, or of codes, was below these for so long; 1 is the weight of an
-#: error of one standard deviation. Epochs above them count down.
+START_SIGMA_M: Final = 30.0  #: Initial position standard deviation of a hypothesis.
+GAP_S: Final = 5.0  #: Time without measurements after which the position is searched for again.
+#: The track is lost when the mean weight of motion, or of codes, has been below these limits for this long; an error of
+#: one standard deviation has the weight 1. The timer runs backward during epochs above the limits.
 LOST_MOTION_WEIGHT: Final = 0.45
 LOST_MOTION_S: Final = 6.0
 LOST_CODE_WEIGHT: Final = 0.5
 LOST_CODE_S: Final = 20.0
-#: Where motion contradicts the track, places so far (and twice) before and behind are tried.
+#: Where motion contradicts the track, positions at this distance (and twice as far) ahead and behind are tried.
 BEND_M: Final = 20.0
 EXPIRED_SIGMA_M: Final = 200.0  #: Largest standard deviation of a predicted position.
-#: How much more probable another place must be to be gone by: near-equal ones would take turns.
+#: Probability ratio that another hypothesis must exceed to be reported; without it, nearly equal hypotheses would
+#: alternate.
 SWITCH: Final = 3.0
-#: Among laps within so many `MAP_BRANCH_M` of each other, which nothing distinguishes for good, the filter goes by the
-#: one that codes have preferred lately: a mean of so many seconds, of odds whose logarithm is no larger than this.
+#: Laps within this many `MAP_BRANCH_M` of each other cannot be distinguished permanently. Among these the filter
+#: reports the lap that recent codes prefer: the mean over this time [s] of log odds that are clipped to this value.
 ALIKE: Final = 1.5
 RECENT_S: Final = 30.0
 RECENT_MOST: Final = 3.0
-#: Logarithm of the odds that a difference of one `MAP_BRANCH_M` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
+#: Largest log odds from a difference of one `MAP_BRANCH_M`: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
 MOST_ODDS: Final = 2.25
-#: Largest logarithm of the odds that motion gives in a second, or in an epoch: more is a reflection.
+#: Largest log odds from the motion of a second, or of an epoch; larger values are reflections.
 MOST_MOTION: Final = 5.0
-#: A hypothesis that leads although its probability was below this within the last seconds (its least logarithm rises
-#: by `LEAST_RISE` a second) has taken over from others that all failed: places are sought again. Not within the first
-#: seconds, when all are young.
+#: A leading hypothesis whose probability was recently below this value has taken over from others that all failed, so
+#: the position is searched for again. The minimum log probability recovers by `LEAST_RISE` per second. The rule does
+#: not apply in the first seconds, when all hypotheses are new.
 TAKEOVER: Final = -6.0
 LEAST_RISE: Final = 0.3
 TAKEOVER_AFTER_S: Final = 15.0
-#: Satellites with a phase or a Doppler, or codes, that an epoch's evidence needs: fewer fit any speed and place.
+#: Minimum numbers of satellites with phase or Doppler, and of codes, for an epoch's evidence: fewer fit any speed and
+#: position.
 MOTION_SATELLITES: Final = 4
-MOTION_M: Final = 3.0  #: Travel worth one of the logarithm of the odds by motion [m]: at rest tangents do not differ.
-#: Places beside are tried, and beyond an open end the track is lost, once motion has been contradicted for so long [s]:
-#: shorter it is a reflection, at any rate.
+MOTION_M: Final = 3.0  #: Travel that allows one unit of log odds from motion [m]; at rest the tangents do not differ.
+#: Time of contradicted motion [s] after which neighbouring positions are tried, and after which the track is lost
+#: beyond an open end. A shorter contradiction is a reflection.
 BESIDE_AFTER_S: Final = 0.9
 
-# Monitors of the place.
-#: A filter contradicted by its motion, or codes, for longer bounds nothing; mean weights are those of a lost track.
-#: A contradiction of single epochs is noise, which is in the standard deviation.
+# Monitors of the position.
+#: A filter contradicted by motion or codes for longer than this gives no bound; the limits of the mean weights are
+#: those of a lost track. Contradictions of single epochs are noise, which the standard deviation covers.
 LEVEL_DOUBT_S: Final = 3.0
 LEVEL_DOUBT_CODE_S: Final = 8.0
-#: After a start no level before a place has a probability of 0.99, at most so long; none for so long after the
-#: track was lost.
+#: After a start there is no protection level until a position has a probability of 0.99, or this time has passed; after
+#: a loss of track there is none for this time.
 LEVEL_START_S: Final = 15.0
-LEVEL_HOLD_S: Final = 5.0  #: A level comes back so long after the last contradiction.
-#: The velocity is compared with the line at the place and so many of its standard deviations, or metres, beside it.
+LEVEL_HOLD_S: Final = 5.0  #: Time from the last contradiction until the protection level is available again.
+#: The velocity is compared with the line at the position, and at this many position standard deviations, or metres,
+#: ahead and behind.
 REACH_SIGMAS: Final = 2.0
 REACH_M: Final = 3.0
-#: Errors of the velocity beside its covariance [m/s], and least of the line's direction as a share of the speed.
+#: Velocity error in addition to its covariance [m/s], and smallest error of the line's direction as a fraction of the
+#: speed.
 VELOCITY_FLOOR_MPS: Final = 0.15
 DIRECTION_SHARE: Final = 0.03
-#: A squared contradiction counts up to this, less this a second (cumulative sum, E. S. Page, 1954).
+#: Cumulative sum of squared contradictions (E. S. Page, 1954): bound of one square, and decrement per second.
 LARGEST_SQUARE: Final = 12.0
 ALLOWED_SQUARE: Final = 4.0
-#: Sums from which on the level is withheld, and the track is lost.
+#: Sums at which the protection level is withheld, and at which the track is lost.
 ACROSS_DOUBT: Final = 12.0
 ACROSS_LOST: Final = 30.0
-ACROSS_TAKEN: Final = 60.0  #: The sum after a takeover: more than a velocity across the line gives.
-#: Mean of the places that codes imply, over its standard deviation, and logarithm of the variance of lengths of the
-#: map, 6 times their error: beyond them codes contradict motion, by a step of all codes, a pull, or a wrong map.
+ACROSS_TAKEN: Final = 60.0  #: Sum that is set after a takeover: larger than a velocity across the line can give.
+#: Limits beyond which codes contradict motion, because of a step of all codes, a slow pull or a wrong map: normalised
+#: mean of the position shifts that codes imply, and log variance of the map's lengths (6 times the assumed error).
 DRIFT_SIGMAS: Final = 5.0
 DRIFT_LOG: Final = 2.0 * math.log(6.0)
-#: Dopplers and phases that do not agree with each other on a speed: their mean weight over `MOTION_FIT_S`, while no
-#: sensor on board measures the speed. A train beyond a bend that its place has not reached seems to stand.
+#: Limit of the mean weight of Dopplers and phases over `MOTION_FIT_S`, below which they do not agree on a speed; it
+#: applies while no sensor on board measures the speed. A train that has passed a bend ahead of its estimated position
+#: appears to stand still.
 MOTION_FIT: Final = 0.6
 MOTION_FIT_S: Final = 2.0
-#: A displacement of the map across, by the sub-filter that lets it be wrong, is real beyond so many of its standard
-#: deviations and metres.
+#: A lateral map displacement, estimated by the sub-filter for a wrong map, is significant beyond this many of its
+#: standard deviations and metres.
 BESIDE_SIGMAS: Final = 4.5
 BESIDE_M: Final = 8.0
-#: Young hypotheses bound nothing before one of them is this probable: the right place may not be among them yet.
+#: New hypotheses give no bound until one of them has this probability, because the true position may not be among them
+#: yet.
 YOUNG: Final = 0.99
 YOUNG_HOLD_S: Final = 1.0
-#: Codes that imply another place by more than so many standard deviations for so long [s] have stepped together.
+#: All codes have stepped together if they imply a shift of more than this many standard deviations for this long [s].
 STEP_SIGMAS: Final = 6.0
 STEP_S: Final = 3.0
-STEP_HOLD_S: Final = 300.0  #: No level for this long after a step of all codes [s]: the place is the codes' own.
+#: No protection level for this long after a step of all codes [s], because the position then depends on the codes
+#: alone.
+STEP_HOLD_S: Final = 300.0
 
-# Levels.
-SCALE_BOUND: Final = 0.02  #: Share of a distance without codes that may be wrong: a worn or wrongly entered wheel.
-#: A source that is not measured needs no sub-filter once it has left the filter: place and standard deviation differ
-#: by less than this share of the standard deviation.
+# Protection levels.
+#: Fraction of a distance without codes that may be in error: a worn wheel or a wrong diameter setting.
+SCALE_BOUND: Final = 0.02
+#: A source that is not measured needs no sub-filter once its effect has left the filter: position and standard
+#: deviation differ by less than this fraction of the standard deviation.
 JOINED: Final = 0.05
-#: Newton's steps for the level end when one is smaller than this [m], or after this many.
+#: The Newton iteration of the level ends at a step below this [m], or after this many steps.
 PRECISION_M: Final = 1e-7
 ROUNDS: Final = 60
-#: A pair of satellites that requires less than this share of the risk has it taken off, in place of a term of its own.
+#: The risk of a pair of satellites below this fraction of the total is subtracted, instead of adding a term for the
+#: pair.
 PAIR_SHARE: Final = 1e-3
-PAIR_LEFT: Final = 1e-3  #: Less than this share of what is known of the place, without both of a pair, is nothing.
-AHEAD: Final = 0.3  #: Satellites whose line of sight has at least this component along the track are ahead, or behind.
+#: If less than this fraction of the position information remains without a pair, the position counts as undetermined.
+PAIR_LEFT: Final = 1e-3
+AHEAD: Final = 0.3  #: Smallest component of the line of sight along the track for a satellite ahead or behind.

@@ -8,12 +8,13 @@ With u the unit vector from receiver to satellite, e the tangent, c and h the ax
     wheel   W (1 + k) = s - s' + q_a, radar alike;  force F = (v - v') / dt + g sin(gradient) + beta;  place = s
     balise  place = s - age v + age^2 a / 2;  range = |unit - antenna(s - age v, m_c, m_h)|
 
-s' and v' are those of the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
-of its constellation's code clock, w the time-correlated error of Dopplers, n the slow error of the codes, m the map's
-error, q the error of the map's displacement over the epoch (along, right, up: q_a, q_c, q_h), A the satellite's part of
-the range rate, slope what the speed adds to it, W the distance by the wheel, k its scale-factor error, beta the offset
-of the accelerometer. The phase's change has one direction g for both ends, that of the chord. With a direction
-for each end the phases would measure absolute place from the bend of the line, more sharply than the line is known.
+s' and v' are the arc length and speed of the previous epoch, x_i the satellite's correlated error in units of its
+sigma, o_g the offset of its constellation's code clock, w the time-correlated error of Dopplers, n the slow error of
+the codes, m the map's error, q the error of the map's displacement over the epoch (along, right, up: q_a, q_c, q_h), A
+the satellite's part of the range rate, slope what the speed adds to it, W the distance by the wheel, k its scale-factor
+error, beta the offset of the accelerometer. The phase change uses the direction g of the chord for both ends. With a
+direction for each end, the phases would measure the absolute position from the bend of the line more precisely than the
+line is known.
 """
 
 from __future__ import annotations
@@ -35,20 +36,21 @@ from railfix.kernels.tracking.update import Equations, find_quantity
 
 
 class Geometry(NamedTuple):
-    """Points and lines of sight that the equations of an epoch are made at."""
+    """Points and lines of sight at which the equations of an epoch are linearised."""
 
-    point: Floats  #: Now, ECEF [m]; shape (3,).
-    axes: Floats  #: Tangent, right, up there; shape (3, 3).
-    before: Floats  #: At the epoch before, ECEF [m]; shape (3,).
-    chord: Floats  #: Direction of the displacement since then, near rest the tangent; shape (3,).
+    point: Floats  #: Position at this epoch, ECEF [m]; shape (3,).
+    axes: Floats  #: Tangent, right and up at that position; shape (3, 3).
+    before: Floats  #: Position at the previous epoch, ECEF [m]; shape (3,).
+    #: Direction of the displacement since the previous epoch; the tangent when nearly at rest; shape (3,).
+    chord: Floats
     distance: Floats  #: Range of each channel with measurements [m]; shape (K,).
     sight: Floats  #: Unit vectors to the satellites, ECEF; shape (K, 3).
     along: Floats  #: Their components along the axes; shape (K, 3).
 
 
-#: Unknowns of the distance run since the epoch before: s - s' + q_a.
+#: Unknowns of the distance travelled since the previous epoch: s - s' + q_a.
 DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
-#: Quantities of the motion that are one unknown each.
+#: Motion quantities that are a single unknown each.
 OWN_UNKNOWNS = (
     (ix.M_CLOCK, ix.PHASE_CLOCK), (ix.M_RIGHT, ix.STEP_RIGHT), (ix.M_UP, ix.STEP_UP), (ix.M_DRIFT, ix.DRIFT),
 )  # fmt: skip
@@ -56,7 +58,7 @@ OWN_UNKNOWNS = (
 
 @inner
 def new_equations(rows: Rows) -> Equations:
-    """Return equations of an epoch's measurements, to be written."""
+    """Allocate the equations of an epoch's measurements."""
     size = rows.code.stop + ix.MOTION + rows.sensor.stop - rows.sensor.start
     count = len(rows.variance)
     return Equations(
@@ -71,9 +73,9 @@ def new_equations(rows: Rows) -> Equations:
 def linearise(
     given: Given, t: int, rows: Rows, x: Floats, at: tuple[float, float], wheel_sign: float, equations: Equations
 ) -> None:
-    """Write the equations of an epoch about the arc lengths `at`: now and at the epoch before [m].
+    """Write the equations of an epoch linearised at the arc lengths `at` of this epoch and the previous one [m].
 
-    The innovations are those of the mean x: what x is away from `at` is added to first order. `wheel_sign` is that of
+    The innovations refer to the mean x; its difference from `at` is added to first order. `wheel_sign` is the result of
     `find_wheel_sign`.
     """
     geometry = _compute_geometry(given, t, at)
@@ -86,13 +88,15 @@ def linearise(
 
 @inner
 def find_wheel_sign(x: Floats, direction: float) -> float:
-    """Return the sign of a wheel's distance without one: that of the speed, or of the last speed with a direction."""
+    """Return the sign for an unsigned wheel distance: the sign of the speed, or of the last speed with a known
+    direction.
+    """
     return math.copysign(1.0, x[ix.SPEED]) if abs(x[ix.SPEED]) > constants.DIRECTION_MPS else direction
 
 
 @inner
 def _compute_geometry(given: Given, t: int, at: tuple[float, float]) -> Geometry:
-    """Return points and lines of sight at two arc lengths: now and at the epoch before [m]."""
+    """Return points and lines of sight at the arc lengths of this epoch and the previous one [m]."""
     point, axes, before, unused = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     write_point(given.vertex, given.line[0], at[0], point, axes)
     write_point(given.vertex, given.line[0], at[1], before, unused)
@@ -113,10 +117,11 @@ def _compute_geometry(given: Given, t: int, at: tuple[float, float]) -> Geometry
 
 @inner
 def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equations: Equations) -> Floats:
-    """Write the six quantities of phases and Dopplers, from quantity `first` on; return those of the mean, shape (6,).
+    """Write the six quantities of phases and Dopplers, from index `first` on; return their values at the mean, shape
+    (6,).
 
-    Of the distance it is what the mean is away from the points at the arc lengths `at`. The error of a length of the
-    map belongs to it: phases measure the distance run, not that on the map.
+    The value of the distance is the offset of the mean from the points at the arc lengths `at`. It includes the map's
+    length error, because phases measure the distance travelled, not the distance on the map.
     """
     unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(ix.MOTION)
     unknown[first + ix.M_DISTANCE, :3], coefficient[first + ix.M_DISTANCE, :3] = DISTANCE, (1.0, -1.0, 1.0)
@@ -132,7 +137,7 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
 def _write_codes(
     given: Given, t: int, rows: Rows, x: Floats, geometry: Geometry, moved: float, equations: Equations
 ) -> None:
-    """Write the codes, each a row and a quantity of the same index; the mean is `moved` metres beyond the point."""
+    """Write the codes, each as a row and a quantity of the same index; the mean is `moved` metres beyond the point."""
     unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
@@ -154,7 +159,7 @@ def _write_codes(
 
 @inner
 def _write_motion_value(value: float, j: int, motion: Floats, equations: Equations) -> None:
-    """Write the innovation of a phase or Doppler: a value less what the motion of the mean explains."""
+    """Write the innovation of a phase or Doppler: the measured value less the prediction by the mean's motion."""
     for a in range(ix.MOTION):
         value -= equations.design[j, a] * motion[a]
     equations.value[j] = value
@@ -162,7 +167,7 @@ def _write_motion_value(value: float, j: int, motion: Floats, equations: Equatio
 
 @inner
 def _write_phases(given: Given, t: int, rows: Rows, geometry: Geometry, motion: Floats, equations: Equations) -> None:
-    """Write the changes of the phases; `motion` is that of `_write_motion_quantities`."""
+    """Write the phase changes; `motion` is the result of `_write_motion_quantities`."""
     design, before, chord = equations.design, geometry.before, geometry.chord
     for j in range(rows.phase.start, rows.phase.stop):
         k = rows.channel[j]
@@ -176,7 +181,7 @@ def _write_phases(given: Given, t: int, rows: Rows, geometry: Geometry, motion: 
 
 @inner
 def _write_dopplers(given: Given, t: int, rows: Rows, geometry: Geometry, motion: Floats, equations: Equations) -> None:
-    """Write the range rates by Doppler; `motion` is that of `_write_motion_quantities`."""
+    """Write the Doppler range rates; `motion` is the result of `_write_motion_quantities`."""
     dt, design, tangent, gradient = given.epoch[t].interval_s, equations.design, geometry.axes[0], np.empty(3)
     for j in range(rows.doppler.start, rows.doppler.stop):
         k = rows.channel[j]
@@ -189,10 +194,11 @@ def _write_dopplers(given: Given, t: int, rows: Rows, geometry: Geometry, motion
 
 @inner
 def write_range_rate(channel: Record, point: Floats, u: Floats, gradient: Floats) -> float:
-    """Return the satellite's part of the range rate [m/s], and write what each metre a second of the receiver adds.
+    """Return the satellite's part of the range rate [m/s], and write its gradient with respect to the receiver
+    velocity.
 
-    ``rate = (A + g . v) / (1 + A / c)`` with A by the satellite's velocity, u the unit vector to it, and the turning of
-    the earth in both; `point`, `u` and `gradient` have the shape (3,).
+    ``rate = (A + g . v) / (1 + A / c)`` with A from the satellite's velocity, u the unit vector to the satellite, and
+    the Earth's rotation in both; `point`, `u` and `gradient` have the shape (3,).
     """
     sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
     moving = u[0] * velocity[0] + u[1] * velocity[1] + u[2] * velocity[2]
@@ -205,7 +211,7 @@ def write_range_rate(channel: Record, point: Floats, u: Floats, gradient: Floats
 
 @inner
 def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: float, equations: Equations) -> None:
-    """Write the sensors."""
+    """Write the equations of the sensors."""
     dt, vertex, line, value = given.epoch[t].interval_s, given.vertex, given.line[0], equations.value
     for j in range(rows.sensor.start, rows.sensor.stop):
         column, q = rows.channel[j], find_quantity(rows, j)
@@ -231,7 +237,7 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: floa
 
 @inner
 def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations: Equations) -> float:
-    """Write the terms of a range to a ground unit; return the range at the mean [m]."""
+    """Write the equation of a range to a ground unit; return the range at the mean [m]."""
     sensor, point, axes = given.sensor[t, column], np.empty(3), np.empty((3, 3))
     age, lever = sensor.age_s, sensor.lever_m
     write_point(given.vertex, given.line[0], x[ix.ARC] - age * x[ix.SPEED] + lever[0], point, axes)

@@ -1,4 +1,4 @@
-"""Probabilities of hypotheses, and which of them go on."""
+"""Probabilities of hypotheses, and pruning."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def log_sum(values: Floats) -> float:
 
 @inner
 def clip_odds(odds: float, gained: float, reach: float) -> float:
-    """Return the logarithm of odds after a gain, no further than a reach unless they were before."""
+    """Return log odds after a gain, bounded by `reach` unless they exceeded it before."""
     return min(max(odds + gained, min(odds, -reach)), max(odds, reach))
 
 
@@ -30,24 +30,25 @@ def clip_odds(odds: float, gained: float, reach: float) -> float:
 def reweigh(
     parameters: Record, state: State, evidence: Floats, code_evidence: Floats, points: Floats, arc: Floats, dt: float
 ) -> None:
-    """Update the probabilities of branches, and the part of them that codes gave, by evidence of motion and codes.
+    """Update the branch probabilities, and their part due to codes, by the evidence of motion and codes.
 
-    With d the distance of a branch from the most probable one, the difference of the evidence counts by
-    ``d^2 / (d^2 + map_branch_m^2)``: branches within the error of the map differ in their ranges at every epoch alike.
+    With d the distance of a branch from the most probable one, the difference of the evidence is weighted by ``d^2 /
+    (d^2 + map_branch_m^2)``, because branches within the map error have the same range difference at every epoch.
 
-    Motion (Dopplers, phases, sensors) has errors of seconds: that of a second counts once, at any rate of epochs, and
-    by `MOST_MOTION` an epoch at most; its odds go no further than ``d^2 / (2 s^2)`` with s^2 = 2 (map_branch_m / 3)^2,
-    nor than one for `MOTION_M` of travel.
+    Errors of the motion (Dopplers, phases, sensors) are correlated over seconds. The evidence of a second therefore
+    counts once at any epoch rate, and by at most `MOST_MOTION` per epoch. Its log odds are bounded by ``d^2 / (2 s^2)``
+    with s^2 = 2 (map_branch_m / 3)^2, and by one per `MOTION_M` of travel.
 
-    Codes have errors in common to all satellites of one side of a street, for minutes. Their odds go no further than
-    ``n d^2 / (2 CODE_COMMON_M^2)``, what n independent epochs with such an error can say, n being 1 and one more in
-    `CODE_COMMON_S` or `CODE_COMMON_TRAVEL_M`; between branches that are closer than `BRANCH_FLOOR_M` now never below
-    `BRANCH_FLOOR`, whatever was gained while they were apart.
+    All satellites on one side of a street share code errors for minutes. The log odds of codes are bounded by ``n d^2 /
+    (2 CODE_COMMON_M^2)``, the information of n independent epochs with such an error; n is 1, plus one per
+    `CODE_COMMON_S` or `CODE_COMMON_TRAVEL_M`. The odds of a branch within `BRANCH_FLOOR_M` are never below
+    `BRANCH_FLOOR`, whatever the codes showed while the branches were further apart.
 
-    Between laps within `ALIKE` times map_branch_m what codes say now is kept as `log_recent`, for `find_leading` alone.
+    For laps within `ALIKE` times map_branch_m the recent evidence of codes is kept as `log_recent`; only `find_leading`
+    uses it.
 
-    `evidence` and `code_evidence`, shape (H,), are the logarithms of the evidence of the motion, and of the codes given
-    it; `points`, shape (H, 3), and `arc`, shape (H,), are the places [m].
+    `evidence` and `code_evidence`, shape (H,), are the log evidence of the motion, and of the codes given the motion;
+    `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].
     """
     hypothesis, monitors, count = state.hypothesis, state.monitors[0], len(evidence)
     travel = monitors.branch_m
@@ -82,7 +83,9 @@ def reweigh(
 
 @inner
 def find_leading(hypothesis: Records, count: int) -> int:
-    """Return the hypothesis to report: the first unless another is `SWITCH` as probable with what codes said lately."""
+    """Return the hypothesis to report: the first, unless another is `SWITCH` times as probable with the recent code
+    evidence.
+    """
     lead = hypothesis["log_probability"][:count] + hypothesis["log_recent"][:count]
     best = int(np.argmax(lead))
     return best if lead[best] - lead[0] > math.log(constants.SWITCH) else 0
@@ -90,9 +93,10 @@ def find_leading(hypothesis: Records, count: int) -> int:
 
 @inner
 def prune(parameters: Record, state: State) -> Indices:
-    """Order the hypotheses, merge twins, drop the improbable; return the earlier indices of those left.
+    """Sort the hypotheses, merge duplicates and drop improbable ones; return the previous indices of the remaining
+    hypotheses.
 
-    Improbable ones are dropped once the first has travelled far enough for motion to have distinguished them.
+    Improbable hypotheses are dropped once the first has travelled far enough for motion to distinguish them.
     """
     count = state.monitors[0].hypotheses
     order = np.argsort(-state.hypothesis["log_probability"][:count], kind="mergesort")
@@ -113,7 +117,9 @@ def prune(parameters: Record, state: State) -> Indices:
 
 @inner
 def _merge_twins(state: State, ranked: Indices) -> tuple[Indices, Floats]:
-    """Return the hypotheses without those within the standard deviations of a more probable one, and probabilities."""
+    """Return the hypotheses, and their probabilities, without those within the standard deviations of a more probable
+    hypothesis.
+    """
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     for k in ranked:
         twin, sigma = -1, math.sqrt(state.P[k, ix.ARC, ix.ARC])

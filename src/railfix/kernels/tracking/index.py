@@ -1,100 +1,100 @@
-"""Indices of the recursion's arrays: unknowns of the state, quantities of the motion, kinds, sensors and sources."""
+"""Indices of the recursion's arrays: state unknowns, motion quantities, kinds, sensors and sources."""
 
 from __future__ import annotations
 
 from enum import IntEnum
 from typing import Final
 
-# Unknowns of the state.
+# State unknowns.
 #: Arc length, speed, acceleration along the trajectory [m, m/s, m/s2].
 ARC, SPEED, ACCELERATION = 0, 1, 2
-#: Arc length at the epoch before [m].
+#: Arc length at the previous epoch [m].
 PREVIOUS_ARC: Final = 3
-#: Change of the clock of the carrier phases since the epoch before [m], and drift of that clock [m/s].
+#: Change of the phase clock since the previous epoch [m], and drift of that clock [m/s].
 PHASE_CLOCK, DRIFT = 4, 5
-#: Error of the map to the right and up [m].
+#: Map error to the right and up [m].
 MAP_RIGHT, MAP_UP = 6, 7
-#: Clock of the codes at this epoch [m].
+#: Code clock at this epoch [m].
 CODE_CLOCK: Final = 8
-#: Error of the map's displacement since the epoch before: right, up, along [m].
+#: Error of the map's displacement since the previous epoch: right, up, along [m].
 STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR = 9, 10, 11
-#: Wheel scale-factor error; + where the wheel's distance is too short; no unit.
+#: Wheel scale-factor error, positive if the wheel's distance is too short; no unit.
 WHEEL: Final = 12
 #: Offset of the accelerometer [m/s2].
 FORCE_OFFSET: Final = 13
-#: Radar scale-factor error; + where its speed is too low; no unit.
+#: Radar scale-factor error, positive if the radar's speed is too low; no unit.
 RADAR: Final = 14
-#: Time-correlated error of the speed by Dopplers [m/s].
+#: Time-correlated error of the Doppler speed [m/s].
 DOPPLER_SPEED: Final = 15
 #: Displacement along the line by code errors that last for minutes (orbits, ionosphere) [m].
 SLOW_CODE: Final = 16
-#: Speed at the epoch before [m/s].
+#: Speed at the previous epoch [m/s].
 PREVIOUS_SPEED: Final = 17
-#: Letters of the receiver clocks of codes, in the order of their offsets in the state.
+#: Letters of the code clocks, in the order of their offsets in the state.
 CLOCKS: Final = ("G", "E", "C", "R", "I")
 CLOCK_COUNT: Final = len(CLOCKS)
-#: Index of the first offset of the clocks, and of the first error of a satellite's codes, in its standard deviations.
+#: Index of the first clock offset, and of the first satellite code error, which is in units of its standard deviation.
 OFFSETS: Final = 18
 SATELLITES: Final = OFFSETS + CLOCK_COUNT
-#: Unknowns that start again at every epoch: clock of the codes, displacements of the map.
+#: Unknowns that restart at every epoch: code clock and map displacements.
 PER_EPOCH: Final = (CODE_CLOCK, STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR)
 
-#: Quantities that phases and Dopplers are sums of: distance, change of the phases' clock, displacement of the map to
-#: the right and up, speed, drift.
+#: Quantities whose sums are the phases and Dopplers: distance, change of the phase clock, map displacement to the right
+#: and up, speed, drift.
 M_DISTANCE, M_CLOCK, M_RIGHT, M_UP, M_SPEED, M_DRIFT = 0, 1, 2, 3, 4, 5
 MOTION: Final = 6
-#: Unknowns in a quantity at most; the last is its clock.
+#: Largest number of unknowns in a quantity; the last is its clock.
 TERMS: Final = 7
 CLOCK_TERM: Final = TERMS - 1
 
-#: Kinds of GNSS measurements in a channel.
+#: Kinds of GNSS measurements of a channel.
 CODE, PHASE, DOPPLER = 0, 1, 2
-#: Columns of sensors: wheel, radar, force, place, balises in turn, and one for each range to a ground unit.
+#: Sensor columns: wheel, radar, force, position, balises in turn, and one column per range to a ground unit.
 WHEEL_COLUMN, RADAR_COLUMN, FORCE_COLUMN, PLACE_COLUMN, RANGE_COLUMN = 0, 1, 2, 3, 6
-#: Kinds of sensors: the columns, all ranges together.
+#: Kinds of sensors: the columns, with all ranges as one kind.
 SENSORS: Final = 7
-#: Sources of sub-filters after the sensors: all Dopplers, all phases, codes of satellites ahead, behind, the map; and
-#: none, for all satellites in view.
+#: Sub-filter sources after the sensors: all Dopplers, all phases, codes of satellites ahead, codes of satellites
+#: behind, the map; and no source, for all satellites in view.
 OTHERS: Final = 6
 ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0, 1, 2, 3, 4, 5
-#: Why places have to be sought before an epoch, bits: the track is lost, there were no measurements for long, or motion
-#: contradicts the place.
+#: Bits of the reasons for a position search before an epoch: the track is lost, there were no measurements for a long
+#: time, or motion contradicts the position.
 LOST_TRACK, GAP, CONTRADICTED = 1, 2, 4
-#: Whether the first epoch of a call is predicted, and its places have been sought; the same where the track was lost.
+#: Flags of the first epoch of a call: predicted with the position search done; the same after a loss of track.
 NOT_SOUGHT, SOUGHT, SOUGHT_AS_LOST = 0, 1, 2
 
 
 class TrackStatus(IntEnum):
-    """What the filter says of an epoch."""
+    """Status of a filter epoch."""
 
-    #: One place, from measurements of this epoch.
+    #: One position, from measurements of this epoch.
     TRACKING = 0
-    #: Another place of the line is more probable than the risk; one of the most probable is given.
+    #: Another position on the line is more probable than the risk; one of the most probable positions is given.
     SEVERAL_BRANCHES = 1
-    #: Predicted: no measurement of this epoch, or none that is believed.
+    #: Predicted: the epoch has no measurement, or none that is accepted.
     COASTING = 2
-    #: Measurements contradict the track: places are sought over the whole line.
+    #: Measurements contradict the track: the whole line is searched for the position.
     LOST = 3
-    #: No place: predicted with more than 200 m of standard deviation.
+    #: No position: the predicted standard deviation exceeds 200 m.
     EXPIRED = 4
-    #: No place: no epoch so far had two codes more than unknowns.
+    #: No position: no epoch so far had two codes more than unknowns.
     NOT_STARTED = 5
-    #: No place: every position for 10 s contradicted the line.
+    #: No position: every position for 10 s contradicted the line.
     OFF_MAP = 6
-    #: One place, but 3-D positions of the last minutes lie beside or above the line, or another track of the network
+    #: One position, but 3-D positions of the last minutes are beside or above the line, or another track of the network
     #: is more probable than `track_risk`.
     MAP_OFFSET = 7
-    #: One place, but within the last 20 s its distance from the other antenna's was off by more than 5 m, or its speed
-    #: by more than 1.5 m/s, and four standard deviations.
+    #: One position, but within the last 20 s it differed from the other antenna's by more than 5 m, or its speed by
+    #: more than 1.5 m/s, and by more than four standard deviations.
     ANTENNAS_DISAGREE = 8
-    #: One place, but measurements, the velocity or a sub-filter contradict it: nothing bounds its error.
+    #: One position, but measurements, the velocity or a sub-filter contradict it: its error is not bounded.
     DOUBTFUL = 9
-    #: One place, but the signals may be those of a spoofer: nothing bounds its error.
+    #: One position, but the signals may be spoofed: its error is not bounded.
     SPOOFING_SUSPECTED = 10
 
     @property
     def text(self) -> str:
-        """The word written to files: ``several_branches``."""
+        """Status text written to files: ``several_branches``."""
         return self.name.lower()
 
 

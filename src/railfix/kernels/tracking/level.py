@@ -1,15 +1,16 @@
-"""Level of the filtered position by solution separation over the sub-filters, other branches and pairs of satellites.
+"""Protection level of the filtered position by solution separation over sub-filters, other branches and satellite
+pairs.
 
-With the place s and its standard deviation sigma, those of the sub-filters, Q the upper tail of the normal
-distribution and p_b the probability that source b is faulty or was so recently that the filter still remembers it, the
-level L solves::
+Let s be the position and sigma its standard deviation, s_b and sigma_b those of sub-filter b, Q the upper tail of the
+normal distribution, and p_b the probability that source b is faulty or that an earlier fault is still in the filter.
+The level L solves::
 
     2 Q(L / sigma) + sum over b of p_b [Q((L - |s - s_b|) / sigma_b) + Q((L + |s - s_b|) / sigma_b)] = risk
 
-of an independent error, other branches and pairs of satellites being such sources with the probabilities that they
-have. Every hypothesis thus spends what it needs instead of an equal share (the hypotheses of R. G. Brown and P. W.
-McBurney, 1988, the allocation of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396, over a filter instead of an
-epoch). The separation bounds the error, it is no test: robust filters can settle in different modes without a fault.
+of an independent error. Other branches and satellite pairs are further sources with their own probabilities. Every
+hypothesis thus uses the risk that it needs instead of an equal fraction (hypotheses of R. G. Brown and P. W. McBurney,
+1988, allocation of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396, here for a filter instead of an epoch). The
+separation bounds the error and is not a test, because robust filters can converge to different modes without a fault.
 """
 
 from __future__ import annotations
@@ -29,18 +30,20 @@ from railfix.kernels.tracking.subfilters import find_others
 
 
 class Alternatives(NamedTuple):
-    """Other places that the train may be at, with their probabilities; shapes (A,)."""
+    """Alternative positions of the train with their probabilities; shapes (A,)."""
 
-    along_m: Floats  #: Distance along the line; 0 for a branch that is no bound along the line.
+    along_m: Floats  #: Distance along the line; 0 for a branch that does not count along the line.
     straight_m: Floats  #: Straight distance.
-    forward_m: Floats  #: Part of the straight distance along the line there.
+    forward_m: Floats  #: Component of the straight distance along the line at the alternative.
     sigma_m: Floats
     probability: Floats
 
 
 @inner
 def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
-    """Return the hypotheses but the first, and the probability of those further along the line than a bound reaches."""
+    """Return all hypotheses except the first, and the probability of those further along the line than a level may
+    reach.
+    """
     others = slice(1, state.monitors[0].hypotheses)
     along = np.abs(state.x[others, ix.ARC] - state.x[0, ix.ARC])
     sigma = np.sqrt(state.P[others, ix.ARC, ix.ARC])
@@ -59,10 +62,10 @@ def find_branches(given: Given, state: State) -> tuple[Alternatives, float]:
 
 @inner
 def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple[float, float]:
-    """Return place and variance of a Gaussian with another prior sigma of the slow code error n.
+    """Return position and variance of a Gaussian for another prior sigma of the slow code error n.
 
-    The information at n changes by ``-d``, ``d = 1 / slow^2 - 1 / tilt^2``, so that the place is
-    ``s + P_sn d n / (1 - d P_nn)`` and its variance ``P_ss + P_sn^2 d / (1 - d P_nn)``.
+    The information on n changes by ``-d``, ``d = 1 / slow^2 - 1 / tilt^2``, so that the position is ``s + P_sn d n / (1
+    - d P_nn)`` and its variance ``P_ss + P_sn^2 d / (1 - d P_nn)``.
     """
     less = 1.0 / slow_m**2 - 1.0 / tilt_m**2
     gain = P[ix.ARC, ix.SLOW_CODE] * less / (1.0 - less * P[ix.SLOW_CODE, ix.SLOW_CODE])
@@ -71,7 +74,7 @@ def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple
 
 @inner
 def _find_subfilters(given: Given, state: State) -> Alternatives:
-    """Return the running sub-filters, and the filter where the ionosphere may be tilted."""
+    """Return the running sub-filters, and the filter itself for a tilted ionosphere."""
     first, size, most = len(state.hypothesis), 0, find_others(state) + ix.ALL_IN_VIEW
     away, sigma, probability = np.empty(most + 1), np.empty(most + 1), np.empty(most + 1)
     for b in range(most):
@@ -90,10 +93,10 @@ def _find_subfilters(given: Given, state: State) -> Alternatives:
 
 @inner
 def _cross(branches: Alternatives, subfilters: Alternatives, risk: float, level: float) -> tuple[Alternatives, float]:
-    """Return the places on other branches where a source is faulty, and the risk spent on those that need no term.
+    """Return the positions on other branches if a source is faulty, and the risk used by those that need no term.
 
-    A fault shifts the place on each branch along it as it shifts that on the first one. Without a term: those that
-    require less than the level so far.
+    A fault shifts the positions on all branches equally along the line. Positions that require less than the level so
+    far need no term.
     """
     most, size, spent = len(branches.sigma_m) * len(subfilters.sigma_m), 0, 0.0
     along, straight, sigma, probability = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
@@ -114,14 +117,14 @@ def _cross(branches: Alternatives, subfilters: Alternatives, risk: float, level:
 
 @inner
 def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, float]:
-    """Return the places without both satellites of a pair, and the risk spent on pairs that need no term.
+    """Return the positions without both satellites of a pair, and the risk used by pairs that need no term.
 
-    Information adds up: what is known of the place without both is the sum of what is known without each, less what
-    is known with all in view. The standard deviation is mostly within a tenth of that of a filter without both; with
-    few satellites it can be half of it.
+    Information is additive: the information on the position without both satellites is the sum of the information
+    without each, less the information with all in view. The standard deviation is mostly within a tenth of the value
+    from a filter without both; with few satellites it can be half of it.
 
-    Pairs without a term: those that require less than the level so far, and those without whose satellites nothing is
-    known, which nothing bounds.
+    Pairs need no term if they require less than the level so far, or if the position is undetermined without them, as
+    they are then unbounded.
     """
     source, first, satellites, spent, size = state.source, len(state.hypothesis), len(state.code_bias), 0.0, 0
     most = satellites * (satellites - 1) // 2
@@ -146,7 +149,7 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
                 spent += prior
                 continue
             distance = abs(shift[one] - whole_shift + shift[other]) / remaining
-            tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))  # on the far side it is less
+            tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))  # less on the far side
             if tail < constants.PAIR_SHARE * risk:
                 spent += tail
                 continue
@@ -157,7 +160,9 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
 
 @inner
 def find_unchecked(state: State) -> float:
-    """Return the probability of a fault common to a constellation in view without a sub-filter: the only one."""
+    """Return the probability of a constellation fault that no sub-filter covers: a fault of the only constellation in
+    view.
+    """
     source, satellites, total = state.source, len(state.code_bias), 0.0
     for g in range(ix.CLOCK_COUNT):
         in_view = source["running"][:satellites] & (source["clock"][:satellites] == g)
@@ -170,11 +175,12 @@ def find_unchecked(state: State) -> float:
 def write_level(given: Given, state: State, branches: Alternatives, far: float, result: Record) -> None:
     """Write the level of the first hypothesis and its parts.
 
-    Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
-    `constants.LEVEL_DOUBT_S`: it has settled somewhere else, or began where the fault of its source had led the
-    filter, and bounds nothing; and where pairs of satellites that nothing bounds are more probable than the risk. Along
-    the line it is infinite where another place of it, further away than a bound may reach, is more probable than the
-    risk; the straight distance is bounded with all branches and a map that lies aside.
+    The level is infinite without sub-filters, and where unbounded satellite pairs are more probable than the risk. It
+    is also infinite where a sub-filter has been contradicted by its measurements for longer than
+    `constants.LEVEL_DOUBT_S`: the sub-filter has converged to a wrong position, or began where the fault of its source
+    had led the filter. Along the line the level is infinite where another position on the line, further away than a
+    level may reach, is more probable than the risk. The straight distance includes all branches and a laterally
+    displaced map.
     """
     parameters, source, first, others = given.parameters[0], state.source, len(state.hypothesis), find_others(state)
     sigma = math.sqrt(state.P[0, ix.ARC, ix.ARC])
@@ -184,7 +190,8 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
         if source[b].running:
             contradicted = contradicted or source[b].contradicted_s > constants.LEVEL_DOUBT_S
             away = abs(state.x[first + b, ix.ARC] - state.x[0, ix.ARC])
-            if b < others + ix.CODES_AHEAD or b > others + ix.CODES_BEHIND:  # without half of the codes: apart by noise
+            # without half of the codes the separation is noise
+            if b < others + ix.CODES_AHEAD or b > others + ix.CODES_BEHIND:
                 apart = away if math.isnan(apart) else max(apart, away)
             start = max(start, away + source[b].k * math.sqrt(state.P[first + b, ix.ARC, ix.ARC]))
     result.level_noise_m, result.separation_m = noise, apart
@@ -212,7 +219,7 @@ def write_level(given: Given, state: State, branches: Alternatives, far: float, 
 
 @inner
 def join(one: Alternatives, other: Alternatives) -> Alternatives:
-    """Return the alternatives of both."""
+    """Return two sets of alternatives as one."""
     return Alternatives(
         np.concatenate((one.along_m, other.along_m)), np.concatenate((one.straight_m, other.straight_m)),
         np.concatenate((one.forward_m, other.forward_m)), np.concatenate((one.sigma_m, other.sigma_m)),
@@ -222,10 +229,10 @@ def join(one: Alternatives, other: Alternatives) -> Alternatives:
 
 @inner
 def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk: float, start: float) -> float:
-    """Return the level whose risk is spent by the place and all alternatives, some distances away, together.
+    """Return the level at which the position and all alternatives, at their distances, together use the risk.
 
-    Newton's steps of its logarithm within a bracket, from the largest that one hypothesis alone requires: they must
-    not begin where a branch makes it flat.
+    Newton iteration on the logarithm of the risk within a bracket, from the largest level that one hypothesis alone
+    requires; the iteration must not begin where a branch makes the risk flat.
     """
     level, own, probability = start, alternatives.sigma_m, alternatives.probability
     for a in range(len(own)):
@@ -258,7 +265,7 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
 
 @inner
 def bound_speed(parameters: Record, state: State, sigma: float) -> float:
-    """Return the bound of the error of the speed: what carries the level over the epochs until the next one."""
+    """Return the bound of the speed error, which propagates the level over the epochs until the next update."""
     bound, first = parameters.level_k_speed * sigma, len(state.hypothesis)
     for b in range(find_others(state) + ix.ALL_IN_VIEW):
         if state.source[b].running:

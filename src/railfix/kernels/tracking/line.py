@@ -13,7 +13,7 @@ from railfix.kernels.tracking.layout import Record, Records
 
 @inner
 def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
-    """Return the arc length on the line of a place beyond its end if closed (`railfix.tracking.line.Line.round_m`)."""
+    """Return the arc length on a closed line of a position beyond its end (`railfix.tracking.line.Line.round_m`)."""
     first, last = vertex[0].arc_m, vertex[-1].arc_m
     if arc > last and line.end_turn_m > 0.0:
         return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)
@@ -24,7 +24,7 @@ def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float:
-    """Return the arc length of a place that is nearest to another (`railfix.tracking.line.Line.nearest_m`)."""
+    """Return the arc length of a position, modulo laps, nearest to another (`railfix.tracking.line.Line.nearest_m`)."""
     inside = wrap_arc(vertex, line, to)
     nearest = place
     if line.end_turn_m > 0.0 and place >= vertex[-1].arc_m - line.end_turn_m:
@@ -38,7 +38,7 @@ def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float
 
 @inner
 def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: Floats) -> None:
-    """Write point [m] and axes (tangent, right, up) of the line at an arc length; shapes (3,), (3, 3)."""
+    """Write the point [m] and axes (tangent, right, up) of the line at an arc length; shapes (3,), (3, 3)."""
     arc = wrap_arc(vertex, line, arc)
     v = np.searchsorted(vertex["arc_m"][1:-1], arc, side="right")
     here, after = vertex[v], vertex[v + 1]
@@ -70,9 +70,11 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def excess_beyond_end(line: Record, arc: float, sigma: float) -> float:
-    """Return how far a place is beyond an open end [m], 0 within two of its standard deviations, which are noise.
+    """Return the distance of a position beyond an open end [m]; 0 within two of its standard deviations, which is
+    noise.
 
-    It goes on straight there: put back onto the end, it would stand while the train drives off the map.
+    Beyond the end the line is continued straight; a position held at the end would stand still while the train leaves
+    the map.
     """
     excess = abs(min(max(arc, line.start_m), line.end_m) - arc)
     return excess if excess > 2.0 * sigma else 0.0

@@ -1,7 +1,7 @@
-"""Monitors of the filter's place: velocity across the line, the open end of a map, a step of all codes.
+"""Monitors of the filter's position: velocity across the line, the open end of a map, a step of all codes.
 
-Where one of them contradicts the place its level is held back; where it lasts the track is lost, and places are sought
-over the whole line.
+Where a monitor contradicts the position, the protection level is withheld. If the contradiction persists, the track is
+lost and the whole line is searched.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from railfix.kernels.tracking.subfilters import find_others
 
 @inner
 def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
-    """Return the squared difference of the measured velocity from that along the line, over its variance; NaN without.
+    """Return the squared difference between measured velocity and velocity along the line, over its variance; NaN
+    without a velocity.
 
-    Along the line and across it, at the best of three places that the place's standard deviation allows.
+    The difference is taken along and across the line, at the best of three positions within the position's standard
+    deviation.
     """
     epoch, line, x, P = given.epoch[t], given.line[0], state.x[h], state.P[h]
     velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance
@@ -44,10 +46,10 @@ def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
 
 @inner
 def update_monitors(state: State, square: float, shift: float, beyond_m: float, dt: float, code_s: float) -> None:
-    """Take the contradictions of an epoch into the state.
+    """Update the monitors by the contradictions of an epoch.
 
-    `square` is `compute_contradiction` of the hypothesis reported, `shift` the one that its codes imply, `beyond_m` how
-    far its place is beyond an open end of the line, `code_s` the time that the codes stand for.
+    For the reported hypothesis, `square` is the result of `compute_contradiction`, `shift` the shift implied by codes,
+    `beyond_m` the distance beyond an open end of the line; `code_s` is the time interval of the codes.
     """
     monitors = state.monitors[0]
     if not math.isnan(square):
@@ -75,7 +77,7 @@ def update_monitors(state: State, square: float, shift: float, beyond_m: float, 
 
 @inner
 def _is_doubtful(monitors: Record) -> bool:
-    """Return whether codes, motion or the velocity across the line contradict the place."""
+    """Return whether codes, motion or the velocity across the line contradict the position."""
     return bool(
         monitors.weak_code_s > constants.LEVEL_DOUBT_CODE_S
         or monitors.weak_motion_s > constants.LEVEL_DOUBT_S
@@ -86,7 +88,9 @@ def _is_doubtful(monitors: Record) -> bool:
 
 @inner
 def _is_contradicted_by_subfilter(state: State) -> bool:
-    """Return whether a sub-filter is contradicted by its measurements, or that of the map lies aside."""
+    """Return whether measurements contradict a sub-filter, or the sub-filter for a wrong map shows a lateral
+    displacement.
+    """
     if (state.source["running"] & (state.source["contradicted_s"] > constants.LEVEL_DOUBT_S)).any():
         return True
     wrong = find_others(state) + ix.WRONG_MAP

@@ -1,8 +1,8 @@
 """The filter along the track, epoch by epoch.
 
-An epoch reads: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt and monitor, correct
-the sub-filters, prune, level and status. Places are sought outside (`railfix.tracking.search`), between the prediction
-of an epoch and what follows it.
+The steps of an epoch are: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt and monitor,
+correct the sub-filters, prune, level and status. The position search (`railfix.tracking.search`) is outside the
+recursion, between the prediction of an epoch and its update.
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ from railfix.kernels.tracking.update import (
 
 @inner
 def _find_search_reasons(given: Given, t: int, state: State) -> int:
-    """Return why places have to be sought before an epoch: bits of `index.LOST_TRACK` and those after it, or 0."""
+    """Return the reasons for a position search before an epoch, as bits from `index.LOST_TRACK` on; 0 if none is
+    needed.
+    """
     epoch, parameters, monitors = given.epoch[t], given.parameters[0], state.monitors[0]
     lost = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
     lost = lost or monitors.across >= constants.ACROSS_LOST
@@ -53,7 +55,7 @@ def _find_search_reasons(given: Given, t: int, state: State) -> int:
 
 @inner
 def _reset_code_errors(given: Given, t: int, state: State) -> None:
-    """Make the code errors of satellites that come into view independent of all else."""
+    """Make the code errors of satellites that come into view independent of all other unknowns."""
     for i in range(given.fresh.shape[1]):
         if given.fresh[t, i]:
             state.code_bias[i] = 0.0
@@ -64,7 +66,7 @@ def _reset_code_errors(given: Given, t: int, state: State) -> None:
 
 @inner
 def _wrap_closed_line(given: Given, state: State) -> None:
-    """Let places beyond an end of a closed line go on where it closes."""
+    """Wrap positions beyond an end of a closed line."""
     for h in range(state.monitors[0].hypotheses):
         back = wrap_arc(given.vertex, given.line[0], state.x[h, ix.ARC]) - state.x[h, ix.ARC]
         if back != 0.0:
@@ -88,7 +90,7 @@ def _predict_all(given: Given, t: int, state: State) -> None:
 
 @inner
 def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) -> Correction:
-    """Return the correction of a predicted hypothesis up to its innovations."""
+    """Start the correction of a predicted hypothesis: equations and innovations."""
     x, P, equations = state.x[h].copy(), state.P[h].copy(), new_equations(rows)
     restarted = np.zeros(len(x), dtype=np.bool_)
     sign = find_wheel_sign(x, state.monitors[0].direction)
@@ -103,9 +105,9 @@ def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) ->
 
 @inner
 def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple[list[Correction], float]:
-    """Return the corrections of all hypotheses, and the shift that codes imply for the one reported so far.
+    """Return the corrections of all hypotheses, and the shift implied by codes for the hypothesis reported so far.
 
-    The equations are made again about the corrected place while it moves by more than `MOVED_M`.
+    The equations are linearised again at the corrected position while it moves by more than `MOVED_M`.
     """
     count = state.monitors[0].hypotheses
     corrections = [_start_correction(given, t, state, rows, h) for h in range(count)]
@@ -136,7 +138,7 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
 
 @inner
 def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction) -> float:
-    """Correct a hypothesis again with equations about the corrected place; return how far it moves from there [m]."""
+    """Correct a hypothesis again, linearised at the corrected position; return the further position change [m]."""
     arc, sign = one.x[ix.ARC], find_wheel_sign(one.x_prior, state.monitors[0].direction)
     linearise(given, t, rows, one.x_prior, (arc, one.x[ix.PREVIOUS_ARC]), sign, one.equations)
     covariance, without_clock = predict_quantities(one.P_prior, one.equations)
@@ -149,7 +151,7 @@ def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction
 
 @inner
 def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction]) -> None:
-    """Update the probabilities of several hypotheses by the evidence of an epoch."""
+    """Update the hypothesis probabilities by the evidence of an epoch."""
     count = len(corrections)
     motion, code, arc = np.empty(count), np.empty(count), np.empty(count)
     points, axes = np.empty((count, 3)), np.empty((3, 3))
@@ -162,7 +164,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
 
 @inner
 def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float) -> int:
-    """Take over corrected hypotheses, adapt and monitor, and correct the sub-filters; return the leading hypothesis."""
+    """Store the corrected hypotheses, adapt and monitor, and correct the sub-filters; return the leading hypothesis."""
     monitors = state.monitors[0]
     for h, one in enumerate(corrections):
         state.x[h], state.P[h] = one.x, one.P
@@ -177,7 +179,7 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
     excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leads)
-    if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have led the place so far
+    if excluded and abs(shift) < constants.INFLATED_SIGMAS:  # its codes have affected the position so far
         state.P[:, ix.ARC, ix.ARC] += constants.INFLATED_M**2
     square = compute_contradiction(given, t, state, leads)
     beyond_m = excess_beyond_end(given.line[0], best.x[ix.ARC], math.sqrt(best.P[ix.ARC, ix.ARC]))
@@ -187,7 +189,7 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
 
 @inner
 def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, results: Results) -> None:
-    """Write innovations and weights of the measurements; where they are not believed none of them counts."""
+    """Write innovations and weights of the measurements; all weights are 0 if the measurements are not accepted."""
     result, weight = results.epoch[t], one.fit.weight
     factor = 1.0 if believed else 0.0
     code, motion = mean_weights(rows, rows.variance, weight)
@@ -211,7 +213,7 @@ def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> Non
     """Write the record of the corrections for the smoother."""
     for h, one in enumerate(corrections):
         codes, count, equations = rows.code.stop, len(rows.variance), one.equations
-        H = np.zeros((len(equations.unknown), len(one.x)))  # of the quantities
+        H = np.zeros((len(equations.unknown), len(one.x)))  # measurement matrix of the quantities
         for q in range(len(H)):
             for k in range(ix.TERMS):
                 H[q, equations.unknown[q, k]] += equations.coefficient[q, k]
@@ -226,7 +228,7 @@ def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> Non
 
 @inner
 def _finish(given: Given, t: int, leads: int, state: State, trace: Trace) -> None:
-    """Count direction, time and distance on the branches, and prune the hypotheses."""
+    """Update direction, time and distance on the branches, and prune the hypotheses."""
     monitors, parameters, dt = state.monitors[0], given.parameters[0], given.epoch[t].interval_s
     speed = state.x[leads, ix.SPEED]
     if abs(speed) > constants.DIRECTION_MPS:
@@ -247,7 +249,7 @@ def _finish(given: Given, t: int, leads: int, state: State, trace: Trace) -> Non
 
 @inner
 def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
-    """Write place, speed, level and status; `status` is that of an epoch without doubt and other branches."""
+    """Write position, speed, level and status; `status` is the status without doubt and other branches."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
@@ -286,10 +288,10 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
 
 @inner
 def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: Trace, lost: bool) -> None:
-    """Do an epoch whose state is predicted."""
+    """Process an epoch whose state has been predicted."""
     monitors, dt, leads = state.monitors[0], given.epoch[t].interval_s, 0
     rows = choose_measurements(given, t, state)
-    believed = len(rows.variance) > 0  # of an epoch without measurements the prediction is all there is
+    believed = len(rows.variance) > 0  # without measurements only the prediction remains
     if believed:
         corrections, shift = _correct_hypotheses(given, t, state, rows)
         if len(corrections) > 1:
@@ -306,7 +308,7 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
         _write_measurements(t, rows, corrections[leads], believed, results)
     else:
         narrow_speed_range(given.parameters[0], monitors, rows, 0.0, math.inf, dt)
-    if not believed:  # the prediction goes on
+    if not believed:  # the prediction continues
         leads = find_leading(state.hypothesis, monitors.hypotheses)
         monitors.level_hold_s = max(monitors.level_hold_s - dt, 0.0)
     monitors.distance_since_code_m += abs(state.x[leads, ix.SPEED]) * dt
@@ -321,10 +323,11 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
 def advance(
     given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], sought: int
 ) -> tuple[int, int]:
-    """Do the epochs of a span; return the first in which places have to be sought, and why, or its end and 0.
+    """Process a span of epochs; return the first epoch that requires a position search with its reasons, or the end of
+    the span and 0.
 
-    That epoch is left predicted; a call for it alone with `index.SOUGHT` does the rest of it. An epoch that begins anew
-    is returned with 0.
+    That epoch is left predicted; a call for it alone with `index.SOUGHT` completes it. An epoch with a restart is
+    returned with 0.
     """
     for t in range(span[0], span[1]):
         if sought == ix.NOT_SOUGHT:

@@ -1,8 +1,8 @@
-"""Sub-filters of the level, each without one source of measurements.
+"""Sub-filters of the protection level, each without one source of measurements.
 
 Each runs the same recursion without one source (a satellite, a constellation, a sensor, all Dopplers, all phases, the
-codes of all satellites ahead or behind) or with a map that may be wrong, from its own start: a fault, however long it
-has lasted and whatever it has left in the state, is not in it.
+codes of all satellites ahead or behind) or with a possibly wrong map. It has its own state from its start on, so that a
+fault of the excluded source has never entered it.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from railfix.kernels.tracking.update import (
 
 @inner
 def find_others(state: State) -> int:
-    """Return the index of the first source after the sensors, negative where levels are off."""
+    """Return the index of the first source after the sensors; negative if levels are off."""
     return len(state.source) - ix.OTHERS
 
 
 @inner
 def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
-    """Return the sources among an epoch's measurements, shape (B,); a constellation where there are several."""
+    """Return which sources are among an epoch's measurements, shape (B,); constellations only if there are several."""
     needed, satellites, others = np.zeros(len(state.source), dtype=np.bool_), len(state.code_bias), find_others(state)
     constellations = 0
     for j in range(rows.code.start, rows.code.stop):
@@ -63,12 +63,13 @@ def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
 
 @inner
 def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Correction, leads: int) -> None:
-    """Correct all sub-filters, which are predicted to the epoch already; `leads`: the leading hypothesis, `best`.
+    """Correct all sub-filters, already predicted to the epoch; `leads` is the correction of the leading hypothesis
+    `best`.
 
-    Each has equations of its own about its place: where the line bends between the two those of the filter do not
-    hold. One that its own measurements contradict has settled somewhere else and restarts. The filter itself is one
-    without a source that it has not absorbed. Where all restart, so does one with all satellites in view, until it
-    has become the filter: pairs are compared with it.
+    Each sub-filter has its own equations, because those of the filter do not apply where the line bends between the two
+    positions. A sub-filter that its own measurements contradict has converged to a wrong position and restarts. For a
+    source that the filter has not absorbed, the filter itself is the sub-filter. If all restart, a sub-filter with all
+    satellites in view restarts too, as the reference of the pairs, until it equals the filter.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
     all_in_view = find_others(state) + ix.ALL_IN_VIEW
@@ -77,7 +78,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     needed[all_in_view] = not before
     absorbed = np.zeros(len(source), dtype=np.bool_)
     for k in range(satellites):
-        if given.within_memory[t, k]:  # without a sub-filter before, the hypothesis has absorbed what it remembers
+        if given.within_memory[t, k]:  # without a sub-filter so far, the hypothesis has absorbed the source
             absorbed[satellites + source[k].clock] = True
             needed[k] = needed[k] or not before
     sign = find_wheel_sign(best.x_prior, state.monitors[0].direction)
@@ -115,7 +116,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
 
 @inner
 def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
-    """Return whether a sub-filter has become the filter: place and sigma within `JOINED`."""
+    """Return whether a sub-filter equals the filter: position and sigma within `JOINED`."""
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
     near = abs(x[ix.ARC] - best.x_prior[ix.ARC]) < constants.JOINED * sigma
     return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ix.ARC, ix.ARC])
@@ -123,9 +124,9 @@ def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
 
 @inner
 def _has_diverged(clock: int, P: Floats, variance: Floats) -> bool:
-    """Return whether a sub-filter without a constellation, `clock` in `CLOCKS`, has nothing left to measure.
+    """Return whether a sub-filter without a constellation, `clock` in `CLOCKS`, has no measurements left.
 
-    Its place is as uncertain as at a start: it bounds nothing (`railfix.kernels.tracking.level.find_unchecked`).
+    Its position is as uncertain as at a start, so it gives no bound (`railfix.kernels.tracking.level.find_unchecked`).
     """
     lost = 0 <= clock < ix.CLOCK_COUNT and math.sqrt(P[ix.ARC, ix.ARC]) > constants.START_SIGMA_M
     return lost and not np.isfinite(variance).any()
@@ -133,7 +134,7 @@ def _has_diverged(clock: int, P: Floats, variance: Floats) -> bool:
 
 @inner
 def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -> None:
-    """Begin a sub-filter with the state of the filter, or with nothing known but the place."""
+    """Begin a sub-filter with the state of the filter, or with the position only."""
     row = len(state.hypothesis) + b
     x, P = state.x[row], state.P[row]
     state.source[b].running, state.source[b].contradicted_s = True, 0.0
@@ -151,9 +152,11 @@ def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -
 
 @inner
 def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
-    """Rotate the displacement of a map that may be wrong with the line: across in a bend it is along after it.
+    """Rotate the displacement of a possibly wrong map with the line: a lateral displacement in a bend is along the line
+    after it.
 
-    It is in the distance on the map, not in that of the phases. What was along before is not known.
+    It affects the distance on the map, not the distance of the phases. The previous component along the line is
+    unknown.
     """
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     write_point(given.vertex, given.line[0], x[ix.ARC], point, axes)
@@ -171,8 +174,8 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
 def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equations: Equations) -> Floats:
     """Return the variances of the measurements for a sub-filter, infinite for those of its source, shape (M,).
 
-    Nothing is taken out of the Gaussian: a measurement of infinite variance is not used. `equations` are those of the
-    leading hypothesis; their coefficients of the arc length tell which satellites are ahead.
+    The Gaussian itself is not changed: a measurement of infinite variance is not used. `equations` belong to the
+    leading hypothesis; the sign of their arc-length coefficients distinguishes satellites ahead from satellites behind.
     """
     satellites, others, variance = len(state.code_bias), find_others(state), rows.variance.copy()
     if b < satellites + ix.CLOCK_COUNT:
@@ -191,7 +194,7 @@ def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equa
     elif b in (others + ix.CODES_AHEAD, others + ix.CODES_BEHIND):
         side = 1.0 if b == others + ix.CODES_AHEAD else -1.0
         for j in range(rows.code.start, rows.code.stop):
-            if side * equations.coefficient[j, 0] < -constants.AHEAD:  # moving ahead shortens its range
+            if side * equations.coefficient[j, 0] < -constants.AHEAD:  # moving forward shortens its range
                 variance[j] = math.inf
     return variance
 
@@ -219,12 +222,12 @@ def _correct(
 
 @inner
 def _update_contradiction(given: Given, t: int, rows: Rows, state: State, b: int, variance: Floats, found: Fit) -> None:
-    """Count how long the measurements of a sub-filter have contradicted it by low weights."""
+    """Update the time for which low weights have contradicted a sub-filter."""
     one = state.source[b]
     code, motion = mean_weights(rows, variance, found.weight)
     if code < constants.LOST_CODE_WEIGHT or motion < constants.LOST_MOTION_WEIGHT:
         one.contradicted_s += given.epoch[t].interval_s
     elif rows.code.stop > 0:
         one.contradicted_s = 0.0
-    if not math.isfinite(state.x[len(state.hypothesis) + b, ix.ARC]):  # it restarts, and bounds nothing before
+    if not math.isfinite(state.x[len(state.hypothesis) + b, ix.ARC]):  # it restarts, and gives no bound until then
         one.contradicted_s = constants.LOST_MOTION_S + constants.LEVEL_DOUBT_S

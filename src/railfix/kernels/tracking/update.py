@@ -1,18 +1,19 @@
-r"""Correction of Gaussians by the measurements of an epoch, one after the other, with Student's t errors.
+r"""Sequential correction of Gaussians by the measurements of an epoch, with Student's t errors.
 
-A Gaussian x ~ N(x, P) sees an epoch through Q quantities ``q = H x``: each code, six of the motion that all phases and
-Dopplers share, each sensor. A code or a sensor measures its quantity, a phase or a Doppler a sum of the six::
+The measurements of an epoch depend on a Gaussian x ~ N(x, P) through Q quantities ``q = H x``: one per code, six of the
+motion that all phases and Dopplers share, one per sensor. A code or a sensor measures its quantity, a phase or a
+Doppler a sum of the six::
 
     code, sensor      y_j = q_j + e_j                phase, Doppler    y_j = design_j q_motion + e_j
 
-with e_j ~ N(0, r_j / w_j). The weights w of Student's t follow from the residuals and the weights in turn: rounds of
-reweighting. Three things keep that cheap without an inverse of any matrix:
+with e_j ~ N(0, r_j / w_j). The weights w of Student's t follow from the residuals, and the residuals from the weights,
+in rounds of reweighting. Three properties keep this cheap, and no matrix is inverted:
 
-- the rounds correct the Gaussian of the quantities, N(0, H P H'), and not that of the state;
+- the rounds correct the Gaussian of the quantities, N(0, H P H'), instead of the state;
 - at given weights all phases and Dopplers are equivalent to six rows ``T q_motion = z + N(0, I)`` (`compress`);
 - a Gaussian is corrected by one measurement after the other, each by a division (`correct`).
 
-Named tuples of views carry what belongs to one Gaussian: `Equations` what is measured, `Fit` what is found.
+Named tuples of array views belong to one Gaussian: `Equations` has the measurements, `Fit` the results.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Equations(NamedTuple):
     #: Quantity q is the sum of ``coefficient[q, k] x[unknown[q, k]]``, its clock last; shapes (Q, TERMS).
     unknown: Indices
     coefficient: Floats
-    #: Coefficients of phases and Dopplers over the six quantities of the motion; 0 for others; shape (M, MOTION).
+    #: Coefficients of phases and Dopplers for the six motion quantities; 0 for other rows; shape (M, MOTION).
     design: Floats
     value: Floats  #: Innovations y [m, m/s, units of the sensors]; shape (M,).
 
@@ -43,27 +44,27 @@ class Equations(NamedTuple):
 class Fit(NamedTuple):
     """Fit of one Gaussian to an epoch's measurements; shapes (M,), the last two (1,)."""
 
-    #: Of Student's t, no unit; 1 at an error of one standard deviation, but less for a code that is late.
+    #: Weight by Student's t, no unit; 1 at an error of one standard deviation, less for a late code.
     weight: Floats
-    residual: Floats  #: Innovation less what the corrected quantities explain, in its unit.
-    fitted: Floats  #: Variance of what they explain, in its unit squared.
+    residual: Floats  #: Innovation less its prediction from the corrected quantities, in its unit.
+    fitted: Floats  #: Variance of that prediction, in its unit squared.
     log_determinant: Floats  #: ``log det(I + R^-1 H P H')``.
     distance: Floats  #: ``q' (H P H')^-1 q`` of the corrected mean q of the quantities.
 
 
 class Correction(NamedTuple):
-    """One hypothesis through the correction of an epoch: N unknowns, M measurements."""
+    """Correction of one hypothesis at an epoch: N unknowns, M measurements."""
 
-    #: Predicted mean and covariance, with the clocks of the epoch started; shapes (N,), (N, N).
+    #: Predicted mean and covariance after the start of the epoch's clocks; shapes (N,), (N, N).
     x_prior: Floats
     P_prior: Floats
     equations: Equations
-    #: Covariance of the quantities before the measurements, and its diagonal without clocks; shapes (Q, Q), (Q,).
+    #: Covariance of the quantities before the measurements, and its diagonal without the clocks; shapes (Q, Q), (Q,).
     covariance: Floats
     without_clock: Floats
     fit: Fit
-    innovation: Floats  #: About the predicted mean; shape (M,).
-    restarted: Masks  #: Unknowns that have restarted at this epoch: clocks; shape (N,).
+    innovation: Floats  #: Innovations at the predicted mean; shape (M,).
+    restarted: Masks  #: Unknowns (clocks) that restarted at this epoch; shape (N,).
     #: Corrected mean and covariance; shapes (N,), (N, N).
     x: Floats
     P: Floats
@@ -71,26 +72,26 @@ class Correction(NamedTuple):
 
 @inner
 def find_row(rows: Rows, q: int) -> int:
-    """Return the row that measures a quantity alone: that of a code or a sensor. The six of the motion have none."""
+    """Return the row of a code's or sensor's quantity. The six motion quantities have no row of their own."""
     return q if q < rows.code.stop else q - rows.code.stop - ix.MOTION + rows.sensor.start
 
 
 @inner
 def find_quantity(rows: Rows, j: int) -> int:
-    """Return the quantity of a code or a sensor by its row: codes first, then the six of the motion, then sensors."""
+    """Return the quantity of a code or sensor row: codes first, then the six motion quantities, then sensors."""
     return j if j < rows.code.stop else j - rows.sensor.start + rows.code.stop + ix.MOTION
 
 
 @inner
 def new_fit(rows: Rows) -> Fit:
-    """Return the fit of an epoch's measurements, to be written."""
+    """Allocate the fit of an epoch's measurements."""
     count = len(rows.variance)
     return Fit(np.ones(count), np.zeros(count), np.zeros(count), np.zeros(1), np.zeros(1))
 
 
 @inner
 def add_row(target: Floats, factor: float, matrix: Floats, i: int) -> None:
-    """Add a multiple of row i of a matrix to a vector; a view of the row would cost more than the sum."""
+    """Add a multiple of row i of a matrix to a vector, without a view of the row, which costs more than the sum."""
     for a in range(len(target)):
         target[a] += factor * matrix[i, a]
 
@@ -114,7 +115,7 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
 
 @inner
 def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]:
-    """Return the covariance H P H' of the quantities, and its diagonal without their clocks; shapes (Q, Q), (Q,)."""
+    """Return the covariance H P H' of the quantities, and its diagonal without the clocks; shapes (Q, Q), (Q,)."""
     unknown, coefficient = equations.unknown, equations.coefficient
     size = len(unknown)
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))
@@ -137,8 +138,8 @@ def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]
 def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats, T: Floats, z: Floats) -> None:
     """Write the six rows ``T q_motion = z + N(0, I)`` that are equivalent to all phases and Dopplers at their weights.
 
-    ``T' T`` is the Cholesky factorisation of their normal matrix, T an upper triangle; a row of what is not measured
-    is 0.
+    ``T' T`` is the Cholesky factorisation of their normal matrix, T an upper triangle; rows of unmeasured quantities
+    are 0.
     """
     design, value = equations.design, equations.value
     diagonal = np.empty(ix.MOTION)
@@ -169,14 +170,14 @@ def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats,
 
 @inner
 def compute_weight(rows: Rows, square: float, late: bool) -> float:
-    """Return the weight of a measurement by its square over its variance: `railfix.tracking.limits.Tails`."""
+    """Return the weight of a measurement from its normalised square (`railfix.tracking.limits.Tails`)."""
     own = rows.late_degrees if late else rows.degrees
     return float((rows.degrees + 1.0) / rows.degrees * own / (own + square))
 
 
 @inner
 def median(values: Floats) -> float:
-    """Return the median of values; NaN of none."""
+    """Return the median of values; NaN without values."""
     return float(np.median(values)) if len(values) else math.nan
 
 
@@ -184,10 +185,11 @@ def median(values: Floats) -> float:
 def write_first_weights(
     rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
-    """Write the weights of the innovations, of GNSS less the median of their kind, by their variance without the clock.
+    """Write the initial weights from the innovations over their variances without the clock; GNSS innovations less the
+    median of their kind.
 
-    The clocks begin at every epoch nearly unknown: with their prior in it the variance of an innovation would hide
-    every outlier.
+    The clocks are nearly unknown at the start of every epoch; a variance that included their prior would hide every
+    outlier.
     """
     covariance, without_clock = expected
     design, value, codes = equations.design, equations.value, rows.code.stop
@@ -213,7 +215,7 @@ def write_first_weights(
 
 @inner
 def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Correct the quantities, ``N(0, covariance)``, at the weights of `found`; write the rest of it."""
+    """Correct the quantities, ``N(0, covariance)``, with the weights of `found`; write its other fields."""
     size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
     mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
     T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
@@ -279,9 +281,9 @@ def write_weights(rows: Rows, variance: Floats, found: Fit) -> None:
 
 @inner
 def reweight(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Fit and reweight in turn, `PASSES` fits beginning with the weights of `found`.
+    """Alternate `PASSES` fits and reweightings, starting from the weights of `found`.
 
-    `found` keeps the weights of the last fit, and the residuals that it left.
+    `found` keeps the weights and the residuals of the last fit.
     """
     fit(rows, equations, covariance, variance, found)
     for _ in range(constants.PASSES - 1):
@@ -291,7 +293,7 @@ def reweight(rows: Rows, equations: Equations, covariance: Floats, variance: Flo
 
 @inner
 def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Floats, x: Floats, P: Floats) -> None:
-    """Correct the state by all measurements of finite variance at their weights, one after the other."""
+    """Correct the state sequentially by all measurements of finite variance with their weights."""
     codes, value = rows.code.stop, equations.value
     change, g, gain = np.zeros(len(x)), np.empty(len(x)), np.empty(len(x))
     T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
@@ -320,7 +322,7 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
 
 @inner
 def _project(equations: Equations, q: int, vector: Floats) -> float:
-    """Return ``h' vector`` of a quantity h."""
+    """Return ``h' vector`` for a quantity h."""
     total = 0.0
     for k in range(ix.TERMS):
         total += equations.coefficient[q, k] * vector[equations.unknown[q, k]]
@@ -329,7 +331,7 @@ def _project(equations: Equations, q: int, vector: Floats) -> float:
 
 @inner
 def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: Floats, g: Floats) -> float:
-    """Add a multiple of ``P h`` of a quantity h to g; return the same multiple of ``h' mean``."""
+    """Add a multiple of ``P h`` for a quantity h to g; return the same multiple of ``h' mean``."""
     total = 0.0
     for k in range(ix.TERMS):
         f = factor * equations.coefficient[q, k]
@@ -341,7 +343,7 @@ def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: 
 
 @inner
 def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
-    """Return the logarithm of the evidence of the measurements of finite variance, by Laplace with Student's t."""
+    """Return the log evidence of the measurements of finite variance, by Laplace's method with Student's t."""
     usual, density = rows.degrees, 0.0
     for j in range(len(rows.variance)):
         own = rows.late_degrees if j < rows.code.stop and found.residual[j] > 0.0 else usual
@@ -351,7 +353,7 @@ def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
 
 @inner
 def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, float]:
-    """Return the mean weight of codes, and of phases and Dopplers, of finite variance; NaN without any."""
+    """Return the mean weights of codes, and of phases and Dopplers, of finite variance; NaN without any."""
     code, motion, codes, motions = 0.0, 0.0, 0, 0
     for j in range(rows.doppler.stop):
         if variance[j] < math.inf:
@@ -364,9 +366,9 @@ def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, f
 
 @inner
 def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
-    """Return the logarithms of the evidence of all measurements but the codes, and of the codes beside them.
+    """Return the log evidence of all measurements except the codes, and of the codes given the others.
 
-    0 for too few of them: they fit any speed and place.
+    It is 0 with too few measurements, which fit any speed and position.
     """
     joint = compute_log_evidence(rows, rows.variance, one.fit)
     without_codes, found = rows.variance.copy(), new_fit(rows)
@@ -383,7 +385,7 @@ def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
 
 @inner
 def refit_inflated_prior(rows: Rows, one: Correction) -> None:
-    """Fit again with weights from innovations with place and speed set free; keep the fit with more evidence."""
+    """Fit again with initial weights for inflated position and speed variances; keep the fit with more evidence."""
     inflated, found = one.P_prior.copy(), new_fit(rows)
     inflated[ix.ARC, ix.ARC] += constants.FREEDOM_PLACE_M2
     inflated[ix.SPEED, ix.SPEED] += constants.FREEDOM_SPEED_M2PS2

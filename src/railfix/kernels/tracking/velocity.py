@@ -1,7 +1,7 @@
-"""Velocities of the antenna without the line, by changes of the carrier phase or by Dopplers.
+"""Antenna velocities without the line, from carrier-phase changes or Dopplers.
 
-Least squares of velocity and clock with Student's t errors, for a train that climbs at most some per cent. Where the
-velocity points across the line, the place, the branch or the map is wrong.
+Least squares for velocity and clock with Student's t errors, for a train on gradients of at most a few per cent. If the
+velocity points across the line, the position, the branch or the map is wrong.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from railfix.kernels.tracking.update import correct, median
 CLIMB_MPS = 0.3
 #: Loose prior for conditioning: standard deviation of the velocity, and of the clock about the median [m/s].
 PRIOR_MPS = 1e3
-#: Degrees of freedom of the errors, rounds of reweighting, rows beyond the unknowns that are needed, and least mean
-#: weight: with less the measurements do not agree with each other.
+#: Degrees of freedom of the errors, rounds of reweighting, required redundancy, and smallest mean weight, below which
+#: the measurements do not agree with each other.
 DEGREES = 4.0
 PASSES = 8
 REDUNDANT = 2
@@ -32,11 +32,12 @@ AGREEING = 0.9
 
 @kernel
 def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: Floats) -> None:
-    """Write the velocities of epochs with their covariances and ages: by phases, or by Dopplers where those give none.
+    """Write the velocities of epochs with covariances and ages: from phases, or from Dopplers where phases give none.
 
-    The velocity is NaN where the measurements are too few, or do not agree. By phases it holds half of the interval
-    before the epoch. `epoch` and `channel` are `EPOCH` and `CHANNEL`, shapes (T,) and (T, K); `near_ecef_m`, shape
-    (T, 3), is a position right to some hundred metres, NaN where there is none; `up`, shape (T, 3), the vertical there.
+    The velocity is NaN where the measurements are too few or do not agree. A velocity from phases applies half an
+    interval before the epoch. `epoch` and `channel` are `EPOCH` and `CHANNEL`, shapes (T,) and (T, K); `near_ecef_m`,
+    shape (T, 3), is a position accurate to some hundred metres, NaN if unknown; `up`, shape (T, 3), is the vertical at
+    the position.
     """
     epochs, channels = channel.shape
     h, y, r, u = np.empty((channels + 1, 4)), np.empty(channels + 1), np.empty(channels + 1), np.empty(3)
@@ -68,11 +69,11 @@ def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: 
 
 @inner
 def fit_velocity(h: Floats, y: Floats, r: Floats, count: int, up: Floats, velocity: Floats, covariance: Floats) -> bool:
-    """Fit velocity and clock to measurements ``y = h . v + clock``; return whether they are enough and agree.
+    """Fit velocity and clock to measurements ``y = h . v + clock``; return whether they are sufficient and consistent.
 
-    h, y, r, shapes (M, 4), (M,), (M,), are coefficients, values [m/s] and variances, the first `count` of them; the
-    median is taken off y, and a vertical velocity of 0 is put behind them. `velocity`, shape (3,), is written, and
-    `covariance`, shape (3, 3), which is larger where the residuals are.
+    h, y, r, shapes (M, 4), (M,), (M,), are coefficients, values [m/s] and variances, of which the first `count` are
+    used. The median is subtracted from y, and a vertical velocity of 0 is appended. `velocity`, shape (3,), and
+    `covariance`, shape (3, 3), which is scaled with the residuals, are written.
     """
     if count - 3 < REDUNDANT:
         return False

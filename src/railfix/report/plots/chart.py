@@ -240,8 +240,8 @@ def nice_step(rough: float) -> float:
     return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
 
 
-#: Largest number of points in a layer of a chart.
-POINTS: Final = 6000
+#: Largest number of points in a layer of a chart: more than two per pixel of a wide chart in a page [1150 pixels].
+POINTS: Final = 3000
 _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
 
