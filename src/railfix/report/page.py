@@ -113,7 +113,7 @@ def provenance(run: ReportedRun) -> list[Block]:
 
 
 def settings(run: ReportedRun) -> list[Block]:
-    """Return requested settings and those used."""
+    """Return the requested and the used settings."""
     asked = flat_settings(run.record.get("settings_asked") or {})
     used = flat_settings(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
@@ -176,7 +176,7 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value)
 
 
-#: Fewest epochs of the sky plot of an antenna.
+#: Minimum number of epochs of an antenna's sky plot.
 _LEAST_SKY: Final = 200
 
 
@@ -219,7 +219,9 @@ def write_page(
 def report_page(
     runs: Sequence[ReportedRun], evaluation: Evaluation | None, *, background: Sequence[Floats] = (), title: str = ""
 ) -> str:
-    """HTML of the report; `background`: longitude and latitude of lines below the plan, each of shape (P, 2) [deg]."""
+    """Return the HTML of the report; `background` has lines below the plan as longitude and latitude, each of shape (P,
+    2) [deg].
+    """
     numbers = counter()
     antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
     # with many antennas each gets a smaller chart
@@ -236,7 +238,7 @@ def report_page(
 
 
 def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list[Block]:
-    """Return the table of all runs, and what the page lacks."""
+    """Return the table of all runs, and sentences on missing parts of the page."""
     blocks: list[Block] = [summary(runs, evaluation)]
     if evaluation is None:
         blocks.append(Absent(NO_REFERENCE))
@@ -269,7 +271,7 @@ def _run(
     sky: int,
     background: Sequence[Floats],
 ) -> dict[str, Any]:
-    """Return everything on one run, as the template takes it."""
+    """Return the template's values for one run."""
     anchor, first = f"run{number}", run.folder.antennas[0]
     errors: list[Folded] = []
     if evaluation is not None:
