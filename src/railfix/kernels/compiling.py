@@ -69,6 +69,16 @@ def inner(function: Function) -> Function:
     return cast(Function, numba.njit(**OPTIONS)(function))
 
 
+def inlined(function: Function) -> Function:
+    """Compile a small function of an inner loop into its callers (`inline` of numba).
+
+    A call counts the references to each array that is handed over, which takes longer than the function itself.
+    """
+    if is_plain():
+        return function
+    return cast(Function, numba.njit(inline="always", **OPTIONS)(function))
+
+
 @cache
 def _files(package: Path, module: str) -> set[Path]:
     """Return the files of a module of this package, or of all modules of a subpackage, and of all their imports."""

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.kernels.compiling import inner
+from railfix.kernels.compiling import inlined, inner
 from railfix.kernels.tracking import constants
 from railfix.kernels.tracking import index as ix
 from railfix.kernels.tracking.layout import Rows
@@ -70,13 +70,13 @@ class Correction(NamedTuple):
     P: Floats
 
 
-@inner
+@inlined
 def find_row(rows: Rows, q: int) -> int:
     """Return the row of a code's or sensor's quantity. The six motion quantities have no row of their own."""
     return q if q < rows.code.stop else q - rows.code.stop - ix.MOTION + rows.sensor.start
 
 
-@inner
+@inlined
 def find_quantity(rows: Rows, j: int) -> int:
     """Return the quantity of a code or sensor row: codes first, then the six motion quantities, then sensors."""
     return j if j < rows.code.stop else j - rows.sensor.start + rows.code.stop + ix.MOTION
@@ -89,14 +89,14 @@ def new_fit(rows: Rows) -> Fit:
     return Fit(np.ones(count), np.zeros(count), np.zeros(count), np.zeros(1), np.zeros(1))
 
 
-@inner
+@inlined
 def add_row(target: Floats, factor: float, matrix: Floats, i: int) -> None:
     """Add a multiple of row i of a matrix to a vector, without a view of the row, which costs more than the sum."""
     for a in range(len(target)):
         target[a] += factor * matrix[i, a]
 
 
-@inner
+@inlined
 def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float, gain: Floats) -> None:
     """Correct a Gaussian by one measurement: ``K = g / S``, ``x + K y``, ``P - K g'``.
 
@@ -320,7 +320,7 @@ def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Fl
         x[a] += change[a]
 
 
-@inner
+@inlined
 def _project(equations: Equations, q: int, vector: Floats) -> float:
     """Return ``h' vector`` for a quantity h."""
     total = 0.0
@@ -329,7 +329,7 @@ def _project(equations: Equations, q: int, vector: Floats) -> float:
     return total
 
 
-@inner
+@inlined
 def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: Floats, g: Floats) -> float:
     """Add a multiple of ``P h`` for a quantity h to g; return the same multiple of ``h' mean``."""
     total = 0.0
