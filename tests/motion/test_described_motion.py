@@ -39,7 +39,7 @@ def _shown(case: Motion, limits: SlipLimits, body: np.ndarray | None, *, line: b
     changed = np.flatnonzero(np.diff(found.state, prepend=-1))
     for k in np.union1d(changed, np.arange(0, len(case.time_s), 50)):
         values = (found.speed_mps, found.distance_m, 1e3 * found.smooth, 1e3 * found.pitch, 1e3 * found.gyro_bias_radps)
-        numbers = " ".join(f"{value[k]:.3f}" for value in values)
+        numbers = " ".join(f"{round(float(value[k]), 3) + 0.0:.3f}" for value in values)
         yield f"  {case.time_s[k]:.2f} s {MotionState(found.state[k]).name} {numbers}"
 
 
@@ -87,12 +87,13 @@ def _features(_: Path) -> Iterator[Iterable[str]]:
             along = np.arange(-60.0, 60.5, 1.0)
             ripple = 2e-4 * np.cos(along * 1.7)
             own = LineSeries(
-                arc_m=along, gradient=np.interp(place + along, arc, gradient) + ripple, curvature_1pm=1e-4 * np.sin(along)
+                arc_m=along, gradient=np.interp(place + along, arc, gradient) + ripple,
+                curvature_1pm=1e-4 * np.sin(along),
             )  # fmt: skip
             for sigma_m, noise in ((8.0, 2e-4), (2.0, 1e-3), (0.375, 2e-4)):
                 found = locate(own, line, 300.0, sigma_m, quantity="gradient", noise=(noise, 1e-4))
-                yield [f"{sharp:g} {place:g} {sigma_m:g} {noise:g}: {found.verdict} {found.arc_m:.4f} {found.sigma_m:.4f} "
-                       f"{found.reason}"]  # fmt: skip
+                case = f"{sharp:g} {place:g} {sigma_m:g} {noise:g}"
+                yield [f"{case}: {found.verdict} {found.arc_m:.4f} {found.sigma_m:.4f} {found.reason}"]
     series = line_series(bent_line())
     yield [*describe(series), *(f"{f.quantity} {f.arc_m:.3f} {1e3 * f.change:.4f}" for f in map_features(series))]
 
