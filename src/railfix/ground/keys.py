@@ -84,6 +84,11 @@ def read_revoked(folder: Path) -> Revoked:
         raise InputFileError(path, f"cannot be read ({error})") from None
 
 
+def ending_sentence(name: str, ends: datetime) -> str:
+    """Return that a certificate ends soon, and the remedy."""
+    return f"the certificate {name} ends on {ends.date().isoformat()}; renew it (railfix ground keys --renew)"
+
+
 def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
     """Return the certificates of an end, and of the authority, that end within `WARNING_DAYS`, a sentence each."""
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
@@ -92,8 +97,7 @@ def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list
         # of an authority that was renewed the newest counts
         newest = max(x509.load_pem_x509_certificates((folder / file).read_bytes()), key=lambda c: c.not_valid_after_utc)
         if newest.not_valid_after_utc <= limit:
-            day = newest.not_valid_after_utc.date().isoformat()
-            found.append(f"the certificate {file} ends on {day}; renew it (railfix ground keys --renew)")
+            found.append(ending_sentence(file, newest.not_valid_after_utc))
     return found
 
 

@@ -21,7 +21,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.settings import Settings
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat, draw_session
-from railfix.ground.keys import WARNING_DAYS, Revoked, list_ending, read_revoked
+from railfix.ground.keys import WARNING_DAYS, Revoked, ending_sentence, list_ending, read_revoked
 from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen
 
 #: Results that are kept: an hour of ten frames a second.
@@ -350,8 +350,7 @@ class CentreLinks:
         self._stack = AsyncExitStack()
         self.alarm: str | None = None
         self._revoked = Revoked()
-        #: Certificates of trains that expire soon, by name, and those of the centre, one sentence each.
-        self._ending: dict[str, str] = {}
+        self._ending: list[str] = []  #: Certificates that expire soon, one sentence each.
 
     async def start(self) -> None:
         """Listen.
@@ -378,7 +377,7 @@ class CentreLinks:
 
     def alarms(self) -> list[str]:
         """Return the faults of the certificates, one sentence each."""
-        return [*([] if self.alarm is None else [self.alarm]), *self._ending.values()]
+        return [*([] if self.alarm is None else [self.alarm]), *self._ending]
 
     def threats(self) -> Counter[Threat]:
         """Return the number of rejected frames of all trains."""
@@ -410,13 +409,9 @@ class CentreLinks:
     def _note_ending(self) -> None:
         """List the certificates that expire within `WARNING_DAYS`: of the centre, and of connected trains."""
         limit = datetime.now(UTC) + timedelta(days=WARNING_DAYS)
-        peers = [protocol.peer for protocol in self._peers.values() if protocol.peer is not None]
-        self._ending = {text: text for text in list_ending(self._keys, "centre")} | {
-            peer.name: f"the certificate of {peer.name} ends on {peer.ends.date().isoformat()}; renew it (railfix "
-            "ground keys --renew)"
-            for peer in peers
-            if peer.ends <= limit
-        }
+        peers = {protocol.peer: None for protocol in self._peers.values() if protocol.peer is not None}
+        soon = [ending_sentence(f"of {peer.name}", peer.ends) for peer in peers if peer.ends <= limit]
+        self._ending = [*list_ending(self._keys, "centre"), *soon]
 
     def _masquerade(self) -> None:
         self.masquerades += 1

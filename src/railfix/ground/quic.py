@@ -63,7 +63,6 @@ class Handshakes:
 
     def __init__(self) -> None:
         self._open: dict[str, dict[LinkProtocol, None]] = {}
-        self.ended = 0  #: Handshakes that were ended so.
 
     def begin(self, protocol: LinkProtocol, peer: str) -> None:
         """Note the first packet of a connection."""
@@ -72,7 +71,6 @@ class Handshakes:
         if len(mine) > MOST_HANDSHAKES:
             oldest = next(iter(mine))
             del mine[oldest]
-            self.ended += 1
             oldest.close()
 
     def end(self, protocol: LinkProtocol) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import polars as pl
@@ -32,9 +32,6 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import UNMAPPED_PRIOR, Network
 from railfix.track.network_match import Matched, PlanLog, match, plan_log
 from railfix.track.network_route import find_route, left_out_note
-
-if TYPE_CHECKING:
-    from railfix.run.processor_setup import BaseLog
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
@@ -306,6 +303,15 @@ class RouteOfLog:
         )
 
 
+class BaseObservations(Protocol):
+    """Observations of a base station in order of time (`railfix.run.processor_setup.BaseLog`)."""
+
+    ecef_m: Floats  #: Position of the station; shape (3,).
+
+    def until(self, time: np.datetime64) -> Observations | None:
+        """Return the epochs up to a time that have not been returned before."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LogPositions:
     """Conventional positions of a log once per second, from which an unknown line is found."""
@@ -317,7 +323,9 @@ class LogPositions:
     time: np.datetime64 | None  #: Epoch of frames; None without a navigation record.
     reading: TrackReading
     antenna_up_m: float | None = None  #: Height of the antenna above the rails; None where no vehicle is given [m].
-    open_base: Callable[[], BaseLog | None] = lambda: None  #: Open the log of a base station; None without one.
+    open_base: Callable[[], BaseObservations | None] = lambda: (
+        None
+    )  #: Open the log of a base station; None without one.
 
     @cached_property
     def positions(self) -> PositionLog:

@@ -78,6 +78,7 @@ def decimate_epochs(
     taken = (before[1:] > before[:-1]).nonzero()[0]
     value, variance = _columns(sensors, len(epochs))
     # Row 0 is the remainder of the previous chunk, row t + 1 epoch t; a selected row ends an interval.
+    # With the epochs 1 and 3 of five selected, rows 0 to 2 and 3 to 4 are intervals, and row 5 remains.
     goes_on = np.ones((len(epochs) + 1, len(epochs.channel)), dtype=np.bool_)
     if since.unbroken is not None:
         goes_on[0] = [name in since.unbroken for name in epochs.channel.tolist()]
